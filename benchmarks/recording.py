@@ -31,13 +31,14 @@ from estimate import (  # type: ignore[import-not-found]  # a script next to thi
 from crosscue.datasets.simulated.drive import DriveSettings, vehicle_text
 from crosscue.detectors import rle
 from crosscue.detectors.base import Choice
+from crosscue.detectors.images import Encoded
 from crosscue.eval.pipeline.detect import detect_drive
 from crosscue.eval.pipeline.replay import estimate_run
 from crosscue.eval.recording import save
 from crosscue.eval.runs.folder import RunFolder, create, open_run
 from crosscue.eval.runs.stored_images import camera_of, read_pictures
 from crosscue.eval.runs.tables.stored_frames import stored_frames
-from crosscue.replay.base import EVERYTHING, Block, Images
+from crosscue.replay.base import EVERYTHING
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import parse
 
@@ -72,10 +73,9 @@ def picture_bytes(run: RunFolder) -> int:
     """Return the total bytes of all JPEGs."""
     total = 0
 
-    def add(block: Block) -> None:
+    def add(t_ns: int, encoded: Encoded) -> None:
         nonlocal total
-        assert isinstance(block.rows, Images)
-        total += int((block.rows.bytes_.stop - block.rows.bytes_.start).sum())
+        total += len(encoded.content)
 
     camera = camera_of(run)
     assert camera is not None
@@ -88,12 +88,10 @@ def frame_by_frame(run: RunFolder, path: Path) -> None:
     recording = rr.RecordingStream("naive")
     recording.save(path)
 
-    def picture(block: Block) -> None:
-        assert isinstance(block.rows, Images)
-        for i, t_ns in enumerate(block.log_ns.tolist()):
-            recording.set_time("drive", timestamp=np.datetime64(t_ns, "ns"))
-            content = bytes(block.rows.bytes_.payload(i))
-            recording.log("camera", rr.EncodedImage(contents=content, media_type="image/jpeg"))
+    def picture(t_ns: int, encoded: Encoded) -> None:
+        recording.set_time("drive", timestamp=np.datetime64(t_ns, "ns"))
+        content = bytes(encoded.content)
+        recording.log("camera", rr.EncodedImage(contents=content, media_type="image/jpeg"))
 
     camera = camera_of(run)
     assert camera is not None

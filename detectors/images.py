@@ -16,6 +16,8 @@ from crosscue.replay.base import (
     DEFAULT_LIMITS,
     Bytes,
     Images,
+    Ledger,
+    LogError,
     LogFormatError,
     LogTooLargeError,
     read_at_most,
@@ -28,6 +30,8 @@ from .base import View
 
 MAX_PIXELS: Final = 64_000_000
 """Size of the largest picture that is decoded: 192 MB in colour."""
+NOT_DECODED: Final = "picture not decoded"
+"""Reason of a dropped row: damaged, too large, or empty; the detail says which."""
 _REDUCTIONS: Final = (8, 4, 2)
 """Factors by which a JPEG decoder can reduce a picture while decoding."""
 
@@ -98,6 +102,26 @@ def size_of(picture: Encoded) -> tuple[int, int]:
     return size
 
 
+def check(picture: Encoded) -> tuple[int, int]:
+    """Return width and height of a picture, and check without decoding that it is complete.
+
+    Raises:
+        LogFormatError: The picture is empty, damaged, truncated or of an unsupported coding.
+        LogTooLargeError: As ``size_of``.
+    """
+    if not len(picture.content):
+        raise LogFormatError("empty picture")
+    size = size_of(picture)
+    if picture.layout is None and (why := damage_of(bytes(picture.content), picture.coding)):
+        raise LogFormatError(f"{picture.coding} {why}")
+    return size
+
+
+def lose(ledger: Ledger, topic: str, t_ns: int, error: LogError) -> None:
+    """Drop a picture of a log that cannot be used; its command processes the others."""
+    ledger.spoil(topic, NOT_DECODED, 1, f"at {t_ns} ns: {error}", t_ns)
+
+
 WHOLE: Final = View()
 
 
@@ -115,13 +139,9 @@ def decode(
         LogFormatError: The picture is damaged, truncated or of an unsupported coding.
         LogTooLargeError: As ``size_of``.
     """
-    if not len(picture.content):
-        raise LogFormatError("empty picture")
-    size = size_of(picture)
+    size = check(picture)
     if picture.layout is not None:
         return _raw(picture, picture.layout, view, depth_bits), size
-    if why := damage_of(bytes(picture.content), picture.coding):
-        raise LogFormatError(f"{picture.coding} {why}")
     by = reduction(size[0], view) if picture.coding == "jpeg" else 1
     return _compressed(picture, size, by, view, depth_bits), size
 

@@ -10,7 +10,7 @@ from typing import Final
 from crosscue.replay.base import Block, Bytes, CrosscueError, Images, LogError, UsageError, one_line
 
 from .base import Detections, Detector, Found, Frame, View, fault_of, reportable
-from .images import Encoded, decode, encoded, reduction, size_of
+from .images import NOT_DECODED, Encoded, decode, encoded, reduction, size_of
 from .ranging.lens import VERSION, with_lenses
 from .result_cache import ResultCache, picture_key
 
@@ -136,8 +136,7 @@ class Runner:
                     prepared.pixels[scale] = pixels
                     self.counts.decoded += 1
         except LogError as error:
-            reason = "empty picture" if not len(prepared.picture.content) else "picture not decoded"
-            self.on_skip(prepared.t_ns, reason, str(error))
+            self.on_skip(prepared.t_ns, NOT_DECODED, str(error))
             return False
         return True
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.datasets.truth.annotations import Picture, Thing
-from crosscue.detectors.images import Encoded, decode, size_of
+from crosscue.detectors.images import Encoded, check, decode
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.runs.stored_images import camera_of, pictures_at
 from crosscue.eval.runs.tables.stored_frames import stored_frames
-from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, spelled, write_bytes
+from crosscue.replay.base import DEFAULT_LIMITS, Limits, spelled, write_bytes
 
 ENDINGS: Final = {"jpeg": ".jpg", "png": ".png"}
 """Encodings that every tool reads; others are converted to PNG, which is lossless."""
@@ -97,10 +97,7 @@ def export_run(
     written: dict[int, Picture] = {}
 
     def on_picture(t_ns: int, picture: Encoded) -> None:
-        try:
-            content, ending, size = _content(picture)
-        except CrosscueError:
-            return
+        content, ending, size = _content(picture)
         # Truth and labels use log time.
         at_ns = log_ns.get(t_ns, t_ns)
         name = f"{found.name}_{at_ns}ns{ending}"
@@ -150,7 +147,7 @@ def _log_times(run: RunFolder) -> Mapping[int, int]:
 def _content(picture: Encoded) -> tuple[bytes, str, tuple[int, int]]:
     """Return a picture's file content, file ending and size in pixels."""
     if picture.coding in ENDINGS:
-        return bytes(picture.content), ENDINGS[picture.coding], size_of(picture)
+        return bytes(picture.content), ENDINGS[picture.coding], check(picture)
     import cv2
 
     pixels, size = decode(picture)

@@ -51,11 +51,7 @@ def draw_pictures(run: RunFolder, times: Iterable[int], keep: Keep) -> str:
             regions = partial(_regions, run, places.get(t_ns))
             frame = found.get(t_ns)
             results = () if frame is None else frame.found
-            try:
-                canvas = draw_frame(picture, results, cues.get(t_ns, {}), regions, WIDTH_PX)
-            except CrosscueError:
-                # The page of a picture that cannot be decoded states that it is missing.
-                return
+            canvas = draw_frame(picture, results, cues.get(t_ns, {}), regions, WIDTH_PX)
             keep(t_ns, _jpeg(canvas, WIDTH_PX), _jpeg(canvas, SMALL_PX))
 
         pictures_at(camera, wanted, on_picture)

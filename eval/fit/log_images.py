@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from crosscue.datasets.truth.annotations import LogPictures
-from crosscue.detectors.images import encoded, size_of
+from crosscue.detectors.images import check, encoded, lose
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     EVERYTHING,
-    Block,
-    Images,
+    EmptyResultError,
     Int64s,
     Ledger,
     Limits,
@@ -33,8 +32,12 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT_LIMITS) -> LogPictures:
     """Return times and size of the pictures of a log's only camera; warn about dropped rows.
 
+    The size is that of the first usable picture. The times include unusable pictures, so that
+    numbers of frames stay right.
+
     Raises:
-        LogError: The log or its first picture cannot be read.
+        EmptyResultError: The log has no usable picture.
+        LogError: The log cannot be read.
         VehicleError: The log has no camera, or several.
     """
     with open_log(path, limits) as log, unless_damaged([log]):
@@ -47,22 +50,19 @@ def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT_LIMITS) 
         size: tuple[int, int] | None = None
         for block, pictures in pictures_of(log, 0, topic, vehicle, ledger, EVERYTHING):
             times.append(block.log_ns)
-            size = size or _size_of(block, pictures, f"{path}: {topic.name}")
+            for row, t_ns in enumerate(block.log_ns.tolist()):
+                try:
+                    found = check(encoded(pictures, row))
+                    size = size or found
+                except LogError as error:
+                    lose(ledger, topic.name, t_ns, error)
         warn_of(ledger)
         if size is None:
-            raise LogError(f"{path}: {topic.name}: not one picture; annotations need them")
+            raise EmptyResultError(
+                f"{path}: {topic.name}: no usable picture; annotations need pictures"
+            )
         names = picture_names(log)
     return LogPictures(str(path), np.unique(np.concatenate(times)), size, names)
-
-
-def _size_of(block: Block, pictures: Images, where: str) -> tuple[int, int]:
-    """Return the size of the first picture, which the annotations must match."""
-    try:
-        return size_of(encoded(pictures, 0))
-    except LogError as error:
-        raise type(error)(
-            f"{where}: first picture, at {block.log_ns[0]}ns: {error}; annotations need its size"
-        ) from None
 
 
 @dataclass(frozen=True, slots=True)

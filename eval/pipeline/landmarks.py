@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Final
 
-from crosscue.detectors.images import Encoded
+from crosscue.detectors.images import Encoded, lose
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.localization.landmarks.features import CameraGeometry, Features, Matcher, make_matcher
@@ -19,8 +18,6 @@ from crosscue.localization.landmarks.update import LandmarkSearch, LandmarkSetti
 from crosscue.localization.pose_track import ACCEPTED
 from crosscue.replay.base import Block, Images, Int64s, Ledger, LogError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle
-
-UNDECODABLE: Final = "picture does not decode"
 
 
 def landmark_settings(vehicle: Vehicle) -> LandmarkSettings:
@@ -142,7 +139,7 @@ class LandmarkStage:
         try:
             return self.search.matcher.describe(grey_of(frame.picture))
         except LogError as error:
-            self.ledger.spoil(frame.topic, UNDECODABLE, 1, str(error), frame.t_ns)
+            lose(self.ledger, frame.topic, frame.t_ns, error)
             return None
 
 

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from crosscue.detectors.images import Encoded
 from crosscue.eval.runs.folder import DriveManifest, RunFolder
 from crosscue.eval.runs.moments import part_of
 from crosscue.eval.runs.stored_images import StoredCamera, camera_of, read_pictures
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges
-from crosscue.replay.base import Block, Floats, door, spelled, write_whole
+from crosscue.replay.base import Floats, door, spelled, write_whole
 
 from .part import WHOLE, Part
 
@@ -150,16 +151,15 @@ def _within(
     return truth, ranges
 
 
-def _read_part(stored: StoredCamera, part: Part, on_pictures: Callable[[Block], None]) -> None:
-    """Read every picture in the part's time span."""
+def _read_part(stored: StoredCamera, part: Part, on_picture: Callable[[int, Encoded], None]) -> int:
+    """Read every picture in the part's time span; return the number of unusable ones."""
 
-    def inside(block: Block) -> None:
-        rows = (block.log_ns >= part.start_ns) & (block.log_ns <= part.end_ns)
-        if rows.any():
-            on_pictures(block if rows.all() else block.take(rows))
+    def inside(t_ns: int, picture: Encoded) -> None:
+        if part.start_ns <= t_ns <= part.end_ns:
+            on_picture(t_ns, picture)
 
     span_ns = None if part.is_whole else (part.start_ns, part.end_ns)
-    read_pictures(stored, inside, span_ns)
+    return read_pictures(stored, inside, span_ns)
 
 
 def _log_marks(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import rerun as rr
 
-from crosscue.detectors.images import Encoded, decode, encoded
-from crosscue.replay.base import Block, Images, LogError
+from crosscue.detectors.images import Encoded, check, decode
+from crosscue.replay.base import LogFormatError
 
 from .columns import DriveTime
 
@@ -22,47 +22,43 @@ QUALITY: Final = 90
 
 def log_pictures(
     recording: rr.RecordingStream,
-    read_pictures: Callable[[Callable[[Block], None]], None],
+    read_pictures: Callable[[Callable[[int, Encoded], None]], int],
     time: DriveTime,
 ) -> int:
-    """Send all pictures that can be decoded; return the number of others.
+    """Send all usable pictures; return the number of others.
 
     Raises:
         LogError: The log cannot be opened.
     """
     sink = _Sink(recording, time)
-    read_pictures(sink.add)
-    return sink.left_out
+    lost = read_pictures(sink.add)
+    sink.send()
+    return lost
 
 
 @dataclass(slots=True)
 class _Sink:
     recording: rr.RecordingStream
     time: DriveTime
-    left_out: int = 0
+    held: list[tuple[int, bytes, str]] = field(default_factory=list)
+    size_bytes: int = 0
 
-    def add(self, block: Block) -> None:
-        """Send a block's pictures, a few megabytes at a time."""
-        images = block.rows
-        assert isinstance(images, Images)
-        held: list[tuple[int, bytes, str]] = []
-        size = 0
-        for i, coding in enumerate(images.coding):
-            is_stored = coding in PASSED_THROUGH
-            content = bytes(images.bytes_.payload(i)) if is_stored else shown(encoded(images, i))
-            if content is None:
-                self.left_out += 1
-                continue
-            kind = f"image/{coding}" if is_stored else "image/jpeg"
-            held.append((int(block.log_ns[i]), content, kind))
-            size += len(content)
-            if size > BATCH_BYTES:
-                self._send(held)
-                held, size = [], 0
-        if held:
-            self._send(held)
+    def add(self, t_ns: int, picture: Encoded) -> None:
+        """Send a picture together with others, a few megabytes at a time."""
+        is_stored = picture.coding in PASSED_THROUGH
+        if is_stored:
+            check(picture)
+        content = bytes(picture.content) if is_stored else shown(picture)
+        self.held.append((t_ns, content, f"image/{picture.coding if is_stored else 'jpeg'}"))
+        self.size_bytes += len(content)
+        if self.size_bytes > BATCH_BYTES:
+            self.send()
 
-    def _send(self, held: list[tuple[int, bytes, str]]) -> None:
+    def send(self) -> None:
+        """Send the pictures held."""
+        held, self.held, self.size_bytes = self.held, [], 0
+        if not held:
+            return
         self.recording.send_columns(
             ENTITY,
             indexes=self.time.column([t_ns for t_ns, _, _ in held]),
@@ -75,13 +71,16 @@ class _Sink:
         self.recording.flush()
 
 
-def shown(picture: Encoded) -> bytes | None:
-    """Return a picture as JPEG, or None if it cannot be decoded."""
+def shown(picture: Encoded) -> bytes:
+    """Return a picture as JPEG.
+
+    Raises:
+        LogFormatError: The picture is damaged, truncated or of an unsupported coding.
+        LogTooLargeError: The picture exceeds the maximum number of pixels.
+    """
     import cv2
 
-    try:
-        pixels, _ = decode(picture)
-    except LogError:
-        return None
-    ok, jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    return jpeg.tobytes() if ok else None
+    ok, jpeg = cv2.imencode(".jpg", decode(picture)[0], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    if not ok:
+        raise LogFormatError(f"{picture.coding} picture cannot be shown as JPEG")
+    return jpeg.tobytes()

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.detectors.images import Encoded, encoded
+from crosscue.detectors.images import Encoded, encoded, lose
 from crosscue.eval.runs.folder import DetectManifest, RunFolder
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
@@ -17,6 +17,7 @@ from crosscue.replay.base import (
     Images,
     Ledger,
     Limits,
+    LogError,
     RunError,
     Selection,
     Topic,
@@ -113,36 +114,53 @@ def pictures_at(
 ) -> None:
     """Pass the pictures with exactly these times in the run's tables to ``on_picture``.
 
+    As in ``read_pictures``, it raises an error for a picture that cannot be used.
+
     Raises:
         LogError: The log cannot be opened.
     """
-    wanted = np.array(sorted(times), np.int64)
+    wanted = frozenset(times)
 
-    def keep(block: Block) -> None:
-        assert isinstance(block.rows, Images)
-        for i in np.flatnonzero(np.isin(block.log_ns, wanted)).tolist():
-            on_picture(int(block.log_ns[i]), encoded(block.rows, i))
+    def keep(t_ns: int, picture: Encoded) -> None:
+        if t_ns in wanted:
+            on_picture(t_ns, picture)
 
-    if len(wanted):
-        read_pictures(camera, keep, (int(wanted[0]), int(wanted[-1])))
+    if wanted:
+        read_pictures(camera, keep, (min(wanted), max(wanted)))
 
 
 def read_pictures(
     camera: StoredCamera,
-    on_pictures: Callable[[Block], None],
+    on_picture: Callable[[int, Encoded], None],
     span_ns: tuple[int, int] | None = None,
-) -> None:
-    """Pass every block of pictures to ``on_pictures``, and warn about dropped rows.
+) -> int:
+    """Pass every picture to ``on_picture``, and warn about dropped rows.
 
     Args:
         camera: Source of the pictures.
-        on_pictures: Called with blocks of ``Images`` with times as in the run's tables.
+        on_picture: Called with the time, as in the run's tables, and the picture. If it raises a
+            ``LogError``, the picture is dropped.
         span_ns: Time span to read, with some pictures before and after it; None for all.
+
+    Returns:
+        The number of pictures that ``on_picture`` could not use.
 
     Raises:
         LogError: The log cannot be opened.
     """
-    ledger = Ledger(str(camera.log))
+    ledger, lost = Ledger(str(camera.log)), 0
+
+    def on_pictures(block: Block) -> None:
+        nonlocal lost
+        assert isinstance(block.rows, Images)
+        for row, t_ns in enumerate(block.log_ns.tolist()):
+            try:
+                on_picture(t_ns, encoded(block.rows, row))
+            except LogError as error:
+                log_ns = int(camera.time.log_times(np.array([t_ns]))[0])
+                lose(ledger, block.topic, log_ns, error)
+                lost += 1
+
     extractor = Extractor(
         Plan((Source(0, camera.topic, ()),), {}),
         Vehicle(version=1),
@@ -162,3 +180,4 @@ def read_pictures(
             for _ in extractor(block):
                 pass
     warn_of(ledger)
+    return lost

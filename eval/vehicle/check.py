@@ -9,14 +9,14 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.detectors.images import decode, encoded
+from crosscue.detectors.images import decode, encoded, lose
 from crosscue.replay.base import (
     Bytes,
     Floats,
     Int64s,
     Ledger,
     Log,
-    LogFormatError,
+    LogError,
     Selection,
     Topic,
     name_of,
@@ -333,13 +333,16 @@ def _picture(
     for block, rows in pictures_of(log, number, topic, vehicle, ledger, selection):
         for row, t_ns in enumerate(block.log_ns.tolist()):
             if shown is not None and (middle_ns is None or t_ns > middle_ns):
+                warn_of(ledger)
                 return shown
             if shown is None or middle_ns is not None:
                 try:
                     pixels, _ = decode(encoded(rows, row), depth_bits=depth)
-                except LogFormatError:
+                except LogError as error:
+                    lose(ledger, topic.name, t_ns, error)
                     continue
                 shown = Shown(topic.name, t_ns, pixels)
+    warn_of(ledger)
     return shown
 
 

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.detectors.base import View
-from crosscue.detectors.images import decode, encoded
+from crosscue.detectors.images import decode, encoded, lose
 from crosscue.detectors.ranging.travel_direction import Travel, travel_between
 from crosscue.replay.base import (
     EVERYTHING,
@@ -18,7 +18,9 @@ from crosscue.replay.base import (
     Images,
     Ledger,
     Log,
-    LogFormatError,
+    LogError,
+    name_of,
+    warn_of,
 )
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.vehicle.drafting.camera import Intrinsics, Measured
@@ -69,14 +71,14 @@ def estimate_mounting(
         lacks = "focal_px" if intrinsics is None else "the vehicle's speed"
         return Estimate(None, None, 0, f"pitch and yaw not estimated: needs {lacks}")
     number = next(i for i, topic in enumerate(log.topics) if topic.name == camera)
-    first = next(_grey(log, number), None)
+    first = next(_grey(log, number, Ledger("")), None)
     focal_px, center_px, _, size_px = intrinsics
     known = Camera(focal_px=focal_px, center_px=center_px, size_px=size_px)
     if first is not None and (why := known.mismatch(first[2])) is not None:
         return Estimate(None, None, 0, f"pitch and yaw not estimated: {why}")
-    seen, bends = 0, 0
+    seen, bends, ledger = 0, 0, Ledger(name_of(log))
     found: list[Travel] = []
-    for before, after, way_m, focal_px, center_px in _pairs(log, number, intrinsics, speed):
+    for before, after, way_m, focal_px, center_px in _pairs(log, number, intrinsics, speed, ledger):
         seen += 1
         travel = travel_between(before, after, focal_px, center_px)
         if travel is None:
@@ -87,6 +89,7 @@ def estimate_mounting(
         found.append(travel)
         if len(found) == PAIRS:
             break
+    warn_of(ledger)
     if len(found) < MIN_PAIRS:
         return Estimate(
             None,
@@ -113,13 +116,13 @@ def _measured(angles_rad: Floats) -> Measured:
 
 
 def _pairs(
-    log: Log, number: int, intrinsics: Intrinsics, speed: Series
+    log: Log, number: int, intrinsics: Intrinsics, speed: Series, ledger: Ledger
 ) -> Iterator[tuple[Bytes, Bytes, float, float, tuple[float, float]]]:
     """Yield pairs of pictures about ``APART_M`` apart, with distance, focal length and centre."""
     way_m = _way_m(speed)
     waiting: deque[tuple[float, Bytes]] = deque()
     first_ns: int | None = None
-    for t_ns, grey, size_px in _grey(log, number):
+    for t_ns, grey, size_px in _grey(log, number, ledger):
         first_ns = t_ns if first_ns is None else first_ns
         if t_ns - first_ns > LOOKED_AT_NS:
             return
@@ -144,18 +147,19 @@ def _way_m(speed: Series) -> Floats:
     return np.concatenate([[0.0], np.cumsum(np.abs(steps))])
 
 
-def _grey(log: Log, number: int) -> Iterator[tuple[int, Bytes, tuple[int, int]]]:
+def _grey(log: Log, number: int, ledger: Ledger) -> Iterator[tuple[int, Bytes, tuple[int, int]]]:
     """Yield undamaged pictures in order of time, small and grey, with their full size."""
     import cv2
 
     view = View(is_grey=True, min_width_px=WIDTH_PX)
-    pictures = pictures_of(log, 0, log.topics[number], Vehicle(version=1), Ledger(""), EVERYTHING)
+    pictures = pictures_of(log, 0, log.topics[number], Vehicle(version=1), ledger, EVERYTHING)
     for block, rows in pictures:
         assert isinstance(rows, Images)
         for row, t_ns in enumerate(block.log_ns.tolist()):
             try:
                 pixels, size_px = decode(encoded(rows, row), view)
-            except LogFormatError:
+            except LogError as error:
+                lose(ledger, block.topic, t_ns, error)
                 continue
             if pixels.shape[1] > WIDTH_PX:
                 height = round(pixels.shape[0] * WIDTH_PX / pixels.shape[1])

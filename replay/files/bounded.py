@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
 PIECE_BYTES: Final = 1 << 20
 
@@ -17,13 +17,24 @@ def read_at_most(path: Path, max_bytes: int) -> bytes | None:
     Raises:
         OSError: The file cannot be read.
     """
-    pieces, room = [], max_bytes
     with path.open("rb") as file:
-        # A file with a correct size is read in one piece, which avoids a copy.
-        step = max(PIECE_BYTES, os.fstat(file.fileno()).st_size)
-        while piece := file.read(min(step, room + 1)):
-            room -= len(piece)
-            if room < 0:
-                return None
-            pieces.append(piece)
+        return read_pieces(file, max_bytes)
+
+
+def read_pieces(file: IO[bytes], max_bytes: int) -> bytes | None:
+    """Return the rest of an open file, or None if it is larger than ``max_bytes``.
+
+    Memory is allocated for the content, not for the limit.
+    """
+    size = os.fstat(file.fileno()).st_size
+    if size > max_bytes:
+        return None
+    # A file with a correct size is read in one piece, which avoids a copy.
+    pieces = [file.read(size)]
+    room = max_bytes - len(pieces[0])
+    while piece := file.read(min(PIECE_BYTES, room + 1)):
+        room -= len(piece)
+        if room < 0:
+            return None
+        pieces.append(piece)
     return b"".join(pieces)

@@ -14,6 +14,8 @@ import stat
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final
 
+from .bounded import read_pieces
+
 if TYPE_CHECKING:
     import pyarrow as pa
 
@@ -64,9 +66,8 @@ def read(path: Path, max_bytes: int = SMALL_BYTES) -> bytes:
         OSError: As for ``opened``, or it is larger than ``max_bytes``.
     """
     with os.fdopen(opened(path), "rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        content = b"" if size > max_bytes else file.read(max_bytes + 1)
-    if max(size, len(content)) > max_bytes:
+        content = read_pieces(file, max_bytes)
+    if content is None:
         raise OSError(errno.EFBIG, f"over {max_bytes / (1 << 20):g} MiB", str(path))
     return content
 

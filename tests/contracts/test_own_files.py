@@ -233,3 +233,30 @@ def test_nothing_opens_file_of_ours_past_the_door() -> None:
     assert {name for name in opening if not name.startswith(tuple(PAST_THE_DOOR))} == set()
     unused = {one for one in PAST_THE_DOOR if not any(name.startswith(one) for name in opening)}
     assert unused == set()
+
+
+READS: Final = """
+import sys
+from pathlib import Path
+from crosscue.replay.base import door, read_at_most
+path = Path(sys.argv[1])
+print(len(door.read(path, 4 << 30)), len(read_at_most(path, 4 << 30)))
+"""
+
+
+def test_small_file_is_read_with_a_limit_larger_than_the_memory(tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_bytes(bytes(3 << 20))
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+
+    done = subprocess.run(
+        [sys.executable, "-c", READS, str(tmp_path / "manifest.json")],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        preexec_fn=limited,
+        check=False,
+    )
+
+    assert (done.stdout, done.stderr) == (f"{3 << 20} {3 << 20}\n", "")

@@ -179,7 +179,7 @@ def test_stored_pictures_are_checked_against_seal(tmp_path: Path) -> None:
     (log / "frame_3.png").write_bytes((log / "frame_4.png").read_bytes())
 
     with losses_heard() as warned:
-        read_pictures(camera, lambda _: None)
+        read_pictures(camera, lambda t_ns, picture: None)
 
     assert warned
     assert "frame_3.png" in "".join(warned)

@@ -7,7 +7,7 @@ it, so that detections do not depend on times, which the clock changes.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -111,6 +111,19 @@ def distance_m(t_ns: Int64s) -> Floats:
     return left
 
 
+def grey_pictures(numbers: Int64s) -> Images:
+    """Return pictures whose grey level is the number of the frame."""
+    grey = [np.full(SIZE[::-1], number, np.uint8) for number in numbers]
+    return png_pictures([cv2.imencode(".png", picture)[1].tobytes() for picture in grey])
+
+
+def png_pictures(coded: Sequence[bytes]) -> Images:
+    """Return a block of encoded pictures."""
+    edges = np.cumsum([0, *map(len, coded)])
+    messages = Messages(np.frombuffer(b"".join(coded), np.uint8), edges[:-1], edges[1:])
+    return Images(messages, ("png",) * len(coded))
+
+
 def write_drive(
     folder: Path,
     clock: Clock,
@@ -118,6 +131,7 @@ def write_drive(
     rows_a_block: int = 7,
     name: str = "drive.mcap",
     topics: Sequence[Topic] = (BUS, CAMERA),
+    pictures: Callable[[Int64s], Images] = grey_pictures,
 ) -> Path:
     """Write log, vehicle file and truth, and return the path of the log."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -132,7 +146,7 @@ def write_drive(
             if BUS in topics:
                 writer.write(Block(BUS.name, at, _wheels(len(at))))
             if CAMERA in topics:
-                writer.write(Block(CAMERA.name, at, _pictures(rows[part])))
+                writer.write(Block(CAMERA.name, at, pictures(rows[part])))
     shutil.copyfile(dbc_path(), folder / "simulated_car.dbc")
     (folder / "car.toml").write_text(VEHICLE, encoding="utf-8")
     _write_truth(folder, true_ns)
@@ -161,14 +175,6 @@ def _wheels(n: int) -> CanFrames:
     no = np.zeros(n, np.bool_)
     identifier, length = np.full(n, 176, np.uint32), np.full(n, payload.shape[1], np.uint8)
     return CanFrames(identifier, no, np.full(n, DATA, np.uint8), length, payload, no)
-
-
-def _pictures(numbers: Sequence[int] | Int64s) -> Images:
-    grey = [np.full(SIZE[::-1], number, np.uint8) for number in numbers]
-    coded = [cv2.imencode(".png", picture)[1].ravel() for picture in grey]
-    edges = np.cumsum([0, *map(len, coded)])
-    messages = Messages(np.concatenate(coded), edges[:-1], edges[1:])
-    return Images(messages, ("png",) * len(coded))
 
 
 def _write_truth(folder: Path, true_ns: Int64s) -> None:

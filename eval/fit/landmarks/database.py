@@ -14,9 +14,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.datasets.truth.tum import heading_rad
-from crosscue.detectors.images import Encoded
+from crosscue.detectors.images import Encoded, lose
 from crosscue.eval.logs.log import Log as Drive
-from crosscue.eval.pipeline.landmarks import UNDECODABLE
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.pose.score import load_truth, mounting_of
 from crosscue.localization.angles import interpolate_angle
@@ -161,9 +160,9 @@ def frames_of(drive: Drive, vehicle: Vehicle) -> Iterator[tuple[Iterator[Frame],
 
 
 def drop_picture(ledgers: Sequence[Ledger], frame: Frame, error: LogError) -> None:
-    """Drop a picture that does not decode, in the one ledger that has counted its topic."""
+    """Drop a picture that cannot be used, in the one ledger that has counted its topic."""
     ledger = next(one for one in ledgers if frame.topic in one.accounts)
-    ledger.spoil(frame.topic, UNDECODABLE, 1, str(error), frame.t_ns)
+    lose(ledger, frame.topic, frame.t_ns, error)
 
 
 def add_from_log(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from crosscue.datasets.truth.objects import OBJECTS_FILE
-from crosscue.detectors.images import Encoded, encoded
+from crosscue.detectors.images import encoded, lose
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
-from crosscue.eval.fit.signs.labels import Boxes, Labelled, coco_boxes
+from crosscue.eval.fit.signs.labels import Boxes, Labelled, coco_boxes, read_text
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
     EVERYTHING,
@@ -17,9 +18,7 @@ from crosscue.replay.base import (
     AnnotationError,
     Ledger,
     Limits,
-    Log,
     MissingTopicError,
-    read_at_most,
     warn_of,
 )
 from crosscue.replay.logs.opening import open_log, unless_damaged
@@ -45,21 +44,8 @@ def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[La
 
 
 def _boxes(path: Path) -> dict[int, Boxes]:
-    try:
-        content = read_at_most(path, MAX_BYTES)
-        if content is None:
-            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
-        text = content.decode("utf-8")
-    except OSError as error:
-        raise AnnotationError(
-            f"{path}: {error.strerror}; expected labels of the drive's signs"
-        ) from None
-    except UnicodeDecodeError:
-        raise AnnotationError(
-            f"{path}: is not text; expected labels of the drive's signs"
-        ) from None
     found: dict[int, Boxes] = {}
-    for image, boxes in coco_boxes(text, path):
+    for image, boxes in coco_boxes(read_text(path, MAX_BYTES), path):
         if not isinstance(image.get("t_ns"), int):
             raise AnnotationError(f"{path}: images without t_ns; crosscue truth import adds them")
         found[image["t_ns"]] = boxes
@@ -69,19 +55,17 @@ def _boxes(path: Path) -> dict[int, Boxes]:
 def _pictures(drive: DriveInput, boxes: dict[int, Boxes], limits: Limits) -> Iterator[Labelled]:
     vehicle = load(drive.vehicle) if drive.vehicle else Vehicle(version=1)
     with open_log(Path(drive.logs[0]), limits) as log:
-        for t_ns, picture in _camera(log, vehicle):
-            if t_ns in boxes:
-                name = f"{log.path} at {t_ns}"
-                yield Labelled(name, picture, boxes[t_ns])
-
-
-def _camera(log: Log, vehicle: Vehicle) -> Iterator[tuple[int, Encoded]]:
-    with unless_damaged([log]):
-        camera = camera_of([(0, topic) for topic in log.topics], vehicle)
-        if camera is None:
-            raise MissingTopicError(f"{log.path}: no camera in the log; signs need its pictures")
-    ledger = Ledger(str(log.path))
-    for block, pictures in pictures_of(log, 0, camera[1], vehicle, ledger, EVERYTHING):
-        for i, t_ns in enumerate(block.log_ns.tolist()):
-            yield t_ns, encoded(pictures, i)
-    warn_of(ledger)
+        with unless_damaged([log]):
+            camera = camera_of([(0, topic) for topic in log.topics], vehicle)
+            if camera is None:
+                raise MissingTopicError(
+                    f"{log.path}: no camera in the log; signs need its pictures"
+                )
+        ledger = Ledger(str(log.path))
+        for block, pictures in pictures_of(log, 0, camera[1], vehicle, ledger, EVERYTHING):
+            for i, t_ns in enumerate(block.log_ns.tolist()):
+                if t_ns in boxes:
+                    name, picture = f"{log.path} at {t_ns}", encoded(pictures, i)
+                    drop = partial(lose, ledger, block.topic, t_ns)
+                    yield Labelled(name, picture, boxes[t_ns], drop)
+        warn_of(ledger)

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from crosscue.detectors.images import Encoded
-from crosscue.replay.base import MIB, AnnotationError, EmptyResultError, json_tree, read_at_most
+from crosscue.replay.base import (
+    MIB,
+    AnnotationError,
+    EmptyResultError,
+    LogError,
+    json_tree,
+    read_at_most,
+)
 
 COLUMNS: Final = ("picture", "label", "x0", "y0", "x1", "y1")
 MAX_BYTES: Final = 64 * MIB
@@ -27,11 +35,13 @@ class Labelled:
         name: Readable name, for messages.
         picture: Content of the picture, or its path.
         boxes: Boxes of its signs.
+        lose: Called if a picture of a log cannot be used; None for a file, which must be readable.
     """
 
     name: str
     picture: Path | Encoded
     boxes: Boxes
+    lose: Callable[[LogError], None] | None = None
 
 
 def read_labels(path: Path) -> list[Labelled]:
@@ -40,15 +50,20 @@ def read_labels(path: Path) -> list[Labelled]:
     Raises:
         AnnotationError: The file does not exist or is invalid; the message names the line.
     """
-    text = _text(path)
+    text = read_text(path)
     return _of_coco(text, path) if path.suffix == ".json" else _of_csv(text, path)
 
 
-def _text(path: Path) -> str:
+def read_text(path: Path, max_bytes: int = MAX_BYTES) -> str:
+    """Read a file of labels.
+
+    Raises:
+        AnnotationError: It cannot be read, is larger than ``max_bytes``, or is not text.
+    """
     try:
-        content = read_at_most(path, MAX_BYTES)
+        content = read_at_most(path, max_bytes)
         if content is None:
-            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
+            raise AnnotationError(f"{path}: over {max_bytes // MIB} MiB; split it")
         return content.decode("utf-8")
     except OSError as error:
         raise AnnotationError(f"{path}: {error.strerror}; {_WANTED}") from None

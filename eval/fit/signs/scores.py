@@ -69,6 +69,9 @@ def _judged(one: Labelled, detector: Detector, rules: Rules) -> Judged:
     except OSError as error:
         raise LogError(f"{one.name}: {error.strerror}; check the picture column") from None
     except LogError as error:
+        if one.lose is not None:
+            one.lose(error)
+            return together([])
         raise type(error)(f"{one.name}: {error}; repair the picture or leave it out") from None
     width, height = size
     found = detector([Frame(0, one.name, pixels, size)])[0]

@@ -347,7 +347,7 @@ def test_undecodable_picture_is_counted_as_dropped(tmp_path: Path) -> None:
     assert list(stage.times_ns()) == [0, 500_000_000]
     assert stage.update(belief_at(0), 0.0) is None
     assert stage.update(belief_at(500_000_000), 5.0) is None
-    assert ledger.accounts["cam"].dropped == {"picture does not decode": 1}
+    assert ledger.accounts["cam"].dropped == {"picture not decoded": 1}
     assert ledger.accounts["cam"].used == 1
     assert stage.counts()["undecodable"] == 1
     assert stage.counts()["candidates"] == 1

@@ -24,6 +24,7 @@ from crosscue.eval.recording.marks import road_lines
 from crosscue.eval.recording.notes import inert
 from crosscue.eval.recording.plan import log_landmarks
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
+from crosscue.replay.base import LogError
 from support.scene_run import FRAMES, LABEL, TOPIC, scene_run, write_pictures
 from support.scoring import at, good_truth, truth_folder
 
@@ -148,11 +149,11 @@ def test_unsupported_picture_encodings_become_jpeg() -> None:
 
     jpeg = shown(Encoded("raw", memoryview(pixels.tobytes()), layout))
 
-    assert jpeg is not None
     again = cv2.imdecode(np.frombuffer(jpeg, np.uint8), 1)
     assert again is not None
     assert np.abs(again.astype(int) - pixels).max() < 12
-    assert shown(Encoded("raw", memoryview(b"too short"), layout)) is None
+    with pytest.raises(LogError, match="fewer bytes"):
+        shown(Encoded("raw", memoryview(b"too short"), layout))
 
 
 def test_view_refuses_to_replace_another_file(
