@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from crosscue.detectors.registry import Choice
+from crosscue.detectors.base import Choice
 from crosscue.eval.batch.jobs import in_turn
 from crosscue.eval.cli import run
 from crosscue.eval.studies import simulated_drives
