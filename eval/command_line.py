@@ -293,7 +293,7 @@ def _option_of(annotation: Any) -> tuple[Option, Any]:
         elif typing.get_origin(annotation) in (typing.Union, types.UnionType):
             members = [one for one in typing.get_args(annotation) if one is not type(None)]
             marked = [one for one in members if typing.get_origin(one) is Annotated]
-            words = [one for one in members if one in (Path, float, int, str)]
+            words = [one for one in members if one in (Path, float, int, str) or _is_list(one)]
             annotation = (marked or words or members)[0]
         else:
             return option, annotation
@@ -304,9 +304,15 @@ def _items(kind: Any) -> tuple[Any, str | int | None]:
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple and Ellipsis not in inner:
         return inner[0], len(inner)
-    if origin in (tuple, list) or (isinstance(origin, type) and issubclass(origin, Sequence)):
+    if _is_list(kind):
         return _option_of(inner[0])[1], "+"
     return kind, None
+
+
+def _is_list(kind: Any) -> bool:
+    """Return whether a type is a sequence of words."""
+    origin = typing.get_origin(kind)
+    return isinstance(origin, type) and issubclass(origin, Sequence)
 
 
 @cache

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Annotated, ClassVar, Final
 
 from crosscue.eval.failures.order import ranked
 from crosscue.eval.failures.record import Failure, read_failures
@@ -16,24 +16,28 @@ from crosscue.eval.recording.view import save_recording
 from crosscue.eval.runs import owned
 from crosscue.replay.base import (
     DEFAULT_LIMITS,
+    CrosscueError,
     EmptyResultError,
-    Limits,
     OutputError,
     UsageError,
     cannot_write,
     visible,
 )
+from crosscue.replay.limits import LimitsGiven
 from crosscue.replay.processes import in_processes
+from crosscue.replay.progress import Progress, emit
+from crosscue.results import HIDDEN, Result
+from crosscue.verb import Option, keywords
 
-from .failures import ENDINGS, Failures, failures
+from .search import ENDINGS, Failures, FailureSettings, search
 
 PRINTED: Final = 3
 """Number of reasons for missing pictures to print."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Site:
-    """A static site of failures; its repr is the output of ``crosscue browse``.
+class Site(Result):
+    """A static site of failures; its text is the output of ``crosscue browse``.
 
     Attributes:
         index: First page of the site.
@@ -49,69 +53,74 @@ class Site:
     pictures: int
     without_picture: int
     reasons: tuple[str, ...]
-    found: Failures | None
+    found: Failures | None = field(metadata=HIDDEN)
+
+    also: ClassVar = {"failed": "failed"}
 
     @property
     def is_whole(self) -> bool:
         """True if every run could be examined."""
         return self.found is None or not self.found.failed
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue browse``."""
-        return {
-            "index": str(self.index),
-            "failures": self.failures,
-            "pictures": self.pictures,
-            "without_picture": self.without_picture,
-            "reasons": list(self.reasons),
-            "failed": {}
-            if self.found is None
-            else {str(path): str(error) for path, error in self.found.failed.items()},
-        }
+    @property
+    def exit_status(self) -> int:
+        """3 when a run could not be examined, else 0."""
+        return 0 if self.is_whole else 3
 
-    def __repr__(self) -> str:
-        lines = [f"failures   {self.failures:,}, {self.pictures:,} pictures"]
+    @property
+    def failed(self) -> Mapping[Path, CrosscueError]:
+        """Errors of the runs that could not be examined."""
+        return {} if self.found is None else self.found.failed
+
+    def lines(self) -> Iterator[str]:
+        """Yield counts, reasons of missing pictures, and the page to open."""
+        yield f"failures   {self.failures:,}, {self.pictures:,} pictures"
         if self.without_picture:
-            lines.append(f"           {self.without_picture:,} failures without a picture")
-        lines += [f"           {visible(why)}" for why in self.reasons[:PRINTED]]
+            yield f"           {self.without_picture:,} failures without a picture"
+        yield from (f"           {visible(why)}" for why in self.reasons[:PRINTED])
         if len(self.reasons) > PRINTED:
-            lines.append(f"           and {len(self.reasons) - PRINTED:,} more reasons (--json)")
-        if self.found is not None:
-            lines += [f"left out   {visible(str(error))}" for error in self.found.failed.values()]
-        lines.append(f"open       {visible(str(self.index.resolve()))}")
-        return "\n".join(lines)
+            yield f"           and {len(self.reasons) - PRINTED:,} more reasons (--json)"
+        yield from (f"left out   {visible(str(error))}" for error in self.failed.values())
+        yield f"open       {visible(str(self.index.resolve()))}"
 
 
-def browse(
-    runs: Sequence[Path | str] | Path | str,
-    output: Path | str,
-    *,
-    truth: Path | str | None = None,
-    top: int | None = None,
-    threshold: float = 0.9,
-    any_log: bool = False,
-    logs: Path | str | None = None,
-    limits: Limits = DEFAULT_LIMITS,
-    has_recordings: bool = False,
-    overwrite: bool = False,
-    workers: int = 1,
-    on_runs: Callable[[int, int], None] = lambda done, of: None,
-) -> Site:
-    """Write failures as a static site: pages, pictures and charts that need no server.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BrowseSettings(FailureSettings):
+    """Settings of a site of failures.
 
-    Args:
-        runs: As in ``failures``; or a table that ``failures`` wrote.
-        output: Folder of the site, new or empty.
-        truth: As in ``failures``.
-        top: As in ``failures``.
-        threshold: As in ``failures``.
-        any_log: As in ``failures``.
-        logs: Folder that the runs' logs have moved to.
+    Attributes:
+        logs: Folder that the run's logs have moved to; they are recognised by content.
         limits: Limits for reading the logs.
         has_recordings: Also write a recording of each failure, of some megabytes each.
-        overwrite: Replace an earlier site.
-        workers: Number of runs to draw in parallel.
-        on_runs: Called with the number of runs drawn, and their total.
+        overwrite: Replace an existing site.
+    """
+
+    logs: Annotated[Path | str | None, Option(metavar="DIR")] = None
+    limits: LimitsGiven = DEFAULT_LIMITS
+    has_recordings: bool = False
+    overwrite: bool = False
+
+
+@keywords(BrowseSettings, 2)
+def browse(
+    runs: Annotated[Sequence[str | Path] | Path | str, Option(metavar="RUN")],
+    output: Path | str,
+    settings: BrowseSettings,
+) -> Site:
+    """Write failures as a static site with pictures and filters.
+
+    It needs no server. RUN is a run folder, a folder of runs, or a table from crosscue failures.
+    Open index.html in a browser. Each failure is shown with its picture (with boxes, masks and
+    regions), the belief around that time, and the command that opens Rerun at that time.
+
+    Examples:
+        crosscue browse runs -o site
+        crosscue browse worst.parquet -o site --recordings
+
+    Args:
+        runs: Run folders, folders of them, or a table.
+        output: Folder of the site.
+        settings: What to show.
 
     Raises:
         UsageError: A value is out of range, or a table is combined with other runs.
@@ -119,10 +128,10 @@ def browse(
         UsageError: ``overwrite`` would delete files that an earlier call did not write.
         OutputError: The folder is not empty, or cannot be written.
     """
-    folder = Path(output)
-    _check_place(folder, overwrite)
-    moved = moved_to(logs)
-    chosen, found = _given(runs, truth, top, threshold, any_log, workers)
+    folder, has_recordings = Path(output), settings.has_recordings
+    _check_place(folder, settings.overwrite)
+    moved = moved_to(settings.logs)
+    chosen, found = _given(runs, settings)
     if not chosen:
         raise EmptyResultError(f"{folder}: no failure to show; nothing was written")
     entries = entries_of(chosen)
@@ -131,16 +140,16 @@ def browse(
         shutil.rmtree(made, ignore_errors=True)
         for part in ("f", "p", "t", "by", *(["r"] if has_recordings else [])):
             (made / part).mkdir(parents=True)
-        work = RunWork(made, len(entries), moved, has_recordings, limits)
+        work = RunWork(made, len(entries), moved, has_recordings, settings.limits)
         groups, pictures, reasons = by_run(entries), frozenset[str](), []
-        for done, (written, why) in enumerate(in_processes(work, groups, workers), 1):
+        for done, (written, why) in enumerate(in_processes(work, groups, settings.workers), 1):
             pictures |= written
             reasons += [why] if why else []
-            on_runs(done, len(groups))
+            emit(Progress("drawing", done, len(groups), "runs"))
         if has_recordings:
             for one in entries:
                 path = made / "r" / f"{one.number:05d}.rrd"
-                run = open_run(one.failure.run, moved, limits=limits)
+                run = open_run(one.failure.run, moved, limits=settings.limits)
                 save_recording(run, path, at=f"{one.failure.t_ns}ns")
         write_lists(made, entries, pictures)
         owned.replace_folder(made, folder, owned.of_list(folder / MARKER))
@@ -168,25 +177,13 @@ def _check_place(folder: Path, overwrite: bool) -> None:
 
 
 def _given(
-    runs: Sequence[Path | str] | Path | str,
-    truth: Path | str | None,
-    top: int | None,
-    threshold: float,
-    any_log: bool,
-    workers: int,
+    runs: Sequence[Path | str] | Path | str, settings: FailureSettings
 ) -> tuple[tuple[Failure, ...], Failures | None]:
     """Return the failures of runs or of a table, and, for runs, how they were found."""
     given = [Path(one) for one in ([runs] if isinstance(runs, Path | str) else runs)]
     if any(one.suffix in ENDINGS for one in given):
-        if len(given) > 1 or top is not None:
+        if len(given) > 1 or settings.top is not None:
             raise UsageError(f"{given[0]}: expected either runs, or one table without --top")
         return ranked(read_failures(given[0])), None
-    found = failures(
-        [str(one) for one in given],
-        truth=truth,
-        top=top,
-        threshold=threshold,
-        any_log=any_log,
-        workers=workers,
-    )
+    found = search(given, settings)
     return ranked(found.failures), found

@@ -6,11 +6,11 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
 from crosscue.datasets.labels.table import LABEL_FORMATS, read_labels
 from crosscue.datasets.truth.annotations import Annotations, Picture, meanings
@@ -25,7 +25,6 @@ from crosscue.replay.base import (
     AnnotationError,
     CrosscueError,
     EmptyResultError,
-    Limits,
     OutputError,
     SchemaError,
     UsageError,
@@ -35,14 +34,18 @@ from crosscue.replay.base import (
     unspelled,
     visible,
 )
+from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.progress import Progress, emit
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
+from crosscue.results import Result
+from crosscue.verb import Option
 
 INDEX: Final = "crosscue_export.json"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class ExportedLabels:
-    """Pictures exported for a labelling tool; its repr is the output of ``crosscue export``.
+class ExportedLabels(Result):
+    """Pictures exported for a labelling tool; its text is the output of ``crosscue export``.
 
     Attributes:
         file: File or folder to import into the tool.
@@ -62,52 +65,50 @@ class ExportedLabels:
     left_out: Mapping[str, int]
     failed: Mapping[str, CrosscueError]
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue export``."""
-        return {
-            "file": str(self.file),
-            "format": self.format,
-            "pictures": self.pictures,
-            "boxes": self.boxes,
-            "labels": list(self.labels),
-            "left_out": dict(self.left_out),
-            "failed": {run: str(error) for run, error in self.failed.items()},
-        }
+    @property
+    def exit_status(self) -> int:
+        """3 when a run could not be read, else 0."""
+        return 3 if self.failed else 0
 
-    def __repr__(self) -> str:
+    def lines(self) -> Iterator[str]:
+        """Yield counts, classes, what was left out, and the file to import."""
         title = LABEL_FORMATS[self.format].title
-        lines = [
-            f"pictures   {self.pictures:,} with {self.boxes:,} boxes to correct, for {title}",
-            f"classes    {visible(', '.join(self.labels))}",
-            *(f"left out   {count:,} {visible(why)}" for why, count in self.left_out.items()),
-            *(f"left out   {visible(str(error))}" for error in self.failed.values()),
-            f"written to {visible(str(self.file))}",
-        ]
-        return "\n".join(lines)
+        yield f"pictures   {self.pictures:,} with {self.boxes:,} boxes to correct, for {title}"
+        yield f"classes    {visible(', '.join(self.labels))}"
+        yield from (f"left out   {count:,} {visible(why)}" for why, count in self.left_out.items())
+        yield from (f"left out   {visible(str(error))}" for error in self.failed.values())
+        yield f"written to {visible(str(self.file))}"
 
 
 def export(
-    failures: Sequence[Failure] | Path | str,
+    failures: Annotated[Path | str | Sequence[Failure], Option(metavar="FAILURES")],
     output: Path | str,
-    to: str = "coco",
+    to: Literal["coco", "cvat", "yolo", "fiftyone", "labelstudio"] = "coco",
     *,
     classes: Sequence[str] = (),
-    logs: Path | str | None = None,
-    limits: Limits = DEFAULT_LIMITS,
+    logs: Annotated[Path | str | None, Option(metavar="DIR")] = None,
+    limits: LimitsGiven = DEFAULT_LIMITS,
     overwrite: bool = False,
-    on_runs: Callable[[int, int], None] = lambda done, of: None,
 ) -> ExportedLabels:
-    """Export the pictures of failures for labelling, with detections as pre-labels.
+    """Export pictures of failures for a labelling tool.
+
+    The detections in them are pre-labels: correct them before you use them as labels. FAILURES is a
+    table from crosscue failures -o. Each frame is exported once, with its picture as recorded. File
+    names contain drive and time, which crosscue truth import --export uses to find the frames
+    again.
+
+    Examples:
+        crosscue failures runs --top 10 -o worst.parquet
+        crosscue export worst.parquet --to cvat -o labelling
 
     Args:
-        failures: A table that ``failures`` wrote, or failures.
-        output: Output folder, new or empty.
-        to: ``coco``, ``cvat``, ``yolo``, ``fiftyone`` or ``labelstudio``.
-        classes: Labels to choose from; default: the labels that the runs' cues use.
-        logs: Folder that the runs' logs have moved to.
+        failures: Table of failures.
+        output: Folder of the export.
+        to: Format.
+        classes: Labels to choose from (default: the labels that the runs' cues use).
+        logs: Folder that the run's logs have moved to; they are recognised by content.
         limits: Limits for reading the logs.
         overwrite: Replace an earlier export.
-        on_runs: Called with the number of runs exported, and their total.
 
     Raises:
         UsageError: The format is not supported.
@@ -117,7 +118,7 @@ def export(
         OutputError: The folder is not empty, or cannot be written.
     """
     if to not in LABEL_FORMATS:
-        raise UsageError(f"--to {to}: expected one of {', '.join(LABEL_FORMATS)}")
+        raise UsageError(f"to: {to}, expected one of {', '.join(LABEL_FORMATS)}")
     given = isinstance(failures, Path | str)
     chosen = read_failures(Path(failures)) if isinstance(failures, Path | str) else failures
     where = str(failures) if given else "failures"
@@ -142,7 +143,7 @@ def export(
                 raise
             except CrosscueError as error:
                 failed[run] = error
-            on_runs(done, len(by_run))
+            emit(Progress("exporting", done, len(by_run), "runs"))
         found = _together(where, runs)
         if not found.pictures:
             if failed:
@@ -192,8 +193,8 @@ def _together(where: str, runs: Sequence[ExportedRun]) -> Annotations:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class ImportedLabels:
-    """Corrected labels by drive; its repr is the output of ``crosscue truth import --export``.
+class ImportedLabels(Result):
+    """Corrected labels by drive; its text is the output of ``crosscue truth import --export``.
 
     Attributes:
         coco: COCO file with all pictures, for training and fitting.
@@ -209,28 +210,21 @@ class ImportedLabels:
     missing: int
     ignored: Mapping[str, int]
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue truth import --export``."""
-        return {
-            "coco": str(self.coco),
-            "images": str(self.images),
-            "drives": {name: one.as_dict() for name, one in self.drives.items()},
-            "missing": self.missing,
-            "ignored": dict(self.ignored),
-        }
-
-    def __repr__(self) -> str:
+    def lines(self) -> Iterator[str]:
+        """Yield counts, what is missing or ignored, and the files that were written."""
         pictures = sum(one.pictures for one in self.drives.values())
         things = sum(one.things for one in self.drives.values())
-        lines = [f"pictures   {pictures:,} with {things:,} objects, of {len(self.drives):,} drives"]
+        yield f"pictures   {pictures:,} with {things:,} objects, of {len(self.drives):,} drives"
         if self.missing:
-            lines.append(
-                f"missing    {self.missing:,} exported pictures are not in the annotations"
-            )
-        lines += [f"ignored    {count:,} {visible(kind)}" for kind, count in self.ignored.items()]
-        lines += [f"truth      {visible(str(one.truth))}" for one in self.drives.values()]
-        lines.append(f"to train   --data {visible(str(self.coco))} --images {self.images}")
-        return "\n".join(lines)
+            yield f"missing    {self.missing:,} exported pictures are not in the annotations"
+        yield from (f"ignored    {count:,} {visible(kind)}" for kind, count in self.ignored.items())
+        yield from (f"truth      {visible(str(one.truth))}" for one in self.drives.values())
+        yield f"to train   --data {visible(str(self.coco))} --images {self.images}"
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the files, the truth of each drive, and what was not imported."""
+        drives = {name: one.as_dict() for name, one in self.drives.items()}
+        return {**Result.as_dict(self), "drives": drives}
 
 
 def import_labels(
@@ -243,7 +237,7 @@ def import_labels(
     add: bool = False,
     overwrite: bool = False,
     kind: str | None = None,
-    limits: Limits = DEFAULT_LIMITS,
+    limits: LimitsGiven = DEFAULT_LIMITS,
 ) -> ImportedLabels:
     """Import corrected labels of an export: truth and objects of each drive, and one COCO file.
 

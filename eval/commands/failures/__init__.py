@@ -1,1 +1,0 @@
-"""Commands that find, show and export failures of runs."""

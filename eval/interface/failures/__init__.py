@@ -1,1 +1,0 @@
-"""Find failures of runs, browse them, and export them for labelling."""
