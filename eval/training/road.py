@@ -101,7 +101,7 @@ def train_road(
     settings: RoadTrainingSettings,
     output: Annotated[Path | str | None, Option(metavar="OUT.safetensors")] = None,
     *,
-    measure: Annotated[Path | str | None, Option(metavar="NETWORK")] = None,
+    measure: Annotated[str | Path | None, Option(metavar="NETWORK")] = None,
     resume: bool = False,
     overwrite: bool = False,
 ) -> TrainedRoad:

@@ -84,6 +84,7 @@ PRINTS_NO_RESULT: Final = {"completion"}
 
 NAMED_BY_COMMAND: Final = {
     "--output",
+    "--classes",
     "--data",
     "--init",
     "--runs",
