@@ -19,6 +19,11 @@ from .segmentation import drivable
 
 _LINE: Final = 100
 _DECODE: Final = 'decode = "full"  # as scripts around networks do; "reduced" is faster'
+_POSE_CLASSES: Final[Mapping[object, int]] = {"yolov5": 52, "yolov8": 52}
+"""Number of classes for which a pose export without metadata is taken.
+
+Its columns are a box, a score (in YOLOv7 also a class) and 17 points with x, y and visibility.
+"""
 _NOTHING: Final = ("background", "bg")
 """Names of a background class, which no detection has."""
 
@@ -137,6 +142,11 @@ def _classes(
     if count == len(COCO_90) + 1 and not is_road:
         assumed.append("the 91 classes are COCO's numbers, 0 unused")
         return ("unused 0", *COCO_90)
+    if guess.settings["kind"] in _POSE_CLASSES and count == _POSE_CLASSES[guess.settings["kind"]]:
+        raise UsageError(
+            f"{path}: {guess.reasons[0]}, as those of a network for poses (a person's box and 17 "
+            "points); export a network that detects boxes, or name the classes: --class-names FILE"
+        )
     raise UsageError(
         f"{path}: {count or 'its'} classes without names; name them in their order, such as "
         f"--classes {'road,curb,mark' if is_road else 'car,truck'}, or one per line in "

@@ -79,6 +79,10 @@ def read_state_dict(content: bytes, where: str) -> StateDict:
 
 
 _SAVE: Final = "save tensors only: torch.save(model.state_dict(), FILE)"
+_SAVE_OR_EXPORT: Final = f"{_SAVE}, or export the network to ONNX"
+_EXPORT: Final = "export the network to ONNX with the project that wrote it"
+_PROJECTS: Final = frozenset({"models", "ultralytics", "yolox", "super_gradients", "transformers"})
+"""Packages of networks that are not torchvision's, so that their tensors alone are of no use."""
 
 
 def _safetensors(content: bytes, where: str) -> Mapping[str, Tensor]:
@@ -104,9 +108,10 @@ def _torch(content: bytes, where: str) -> Any:
         raise
     except Exception as error:
         if found := re.search(r"GLOBAL ([\w.]+)", str(error)):
+            is_theirs = found[1].partition(".")[0] in _PROJECTS
             raise VehicleError(
                 f"{where}: holds code or objects other than tensors ({found[1]}), and reading them "
-                f"can run a program; {_SAVE}, or export the network to ONNX"
+                f"can run a program; {_EXPORT if is_theirs else _SAVE_OR_EXPORT}"
             ) from None
         why = one_line(error, 120)
         raise VehicleError(f"{where}: not a complete weights file: {why}; {_SAVE}") from None

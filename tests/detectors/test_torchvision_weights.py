@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import sys
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any, get_args
 
 import numpy as np
@@ -240,6 +242,27 @@ def test_unsupported_weights_are_refused_on_one_line(
     assert message in error
     assert error.count("\n") == 1
     assert sorted(one.name for one in tmp_path.iterdir()) == ["my.pth"]
+
+
+def test_pickled_network_of_another_project_gets_the_one_hint_that_helps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As yolov5n.pt: an object of the module models.yolo, whose tensors alone are of no use."""
+    project = ModuleType("models.yolo")
+    built = type("DetectionModel", (), {"__module__": project.__name__})
+    monkeypatch.setitem(sys.modules, "models", ModuleType("models"))
+    monkeypatch.setitem(sys.modules, project.__name__, project)
+    monkeypatch.setattr(project, "DetectionModel", built, raising=False)
+    path = tmp_path / "yolov5n.pt"
+    torch.save({"epoch": -1, "model": built()}, path)
+
+    with pytest.raises(crosscue.CrosscueError) as raised:
+        crosscue.draft_card(path)
+
+    message = str(raised.value)
+    assert "holds code or objects other than tensors (models.yolo.DetectionModel)" in message
+    assert message.endswith("; export the network to ONNX with the project that wrote it")
+    assert "state_dict" not in message
 
 
 def _oversized_archive() -> bytes:

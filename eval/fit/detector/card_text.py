@@ -45,7 +45,7 @@ def with_fit(text: str, fits: Sequence[ClassFit], pictures: str, measured: str, 
             continue
         for label in fit.members:
             scores[label] = _section(fit.scores)
-        if fit.held_out is not None:
+        if fit.held_out is not None and fit.scores.threshold is not None:
             evidence.append(_evidence(fit, pictures, measured, aim))
     if evidence:
         rows = tomlkit.aot()

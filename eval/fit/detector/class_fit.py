@@ -18,6 +18,7 @@ from .threshold import best_bound, fewest_detections, lower_bound, round_between
 
 CalibrationKind: TypeAlias = Literal["platt", "isotonic", "none"]
 CALIBRATIONS: Final[tuple[CalibrationKind, ...]] = ("platt", "isotonic", "none")
+NOT_LABELLED: Final = "not labelled"
 MIN_LABELS: Final = 20
 """Min number of labelled boxes to fit a class."""
 MIN_EACH: Final = 10
@@ -45,7 +46,7 @@ class HeldOut:
 
     Attributes:
         right: Number of detections above the threshold that match a label.
-        of: Number of detections above the threshold.
+        of: Number of detections above the threshold; 0 without a threshold.
         labels: Number of labelled boxes.
         interval: 95 % interval of the precision, for independent detections.
         bound: One-sided lower bound of the precision, with the confidence of the fit.
@@ -86,7 +87,7 @@ class ClassFit:
         right: Number of these detections that match a label.
         scores: Entry for the card; None if the class was not fitted.
         bound: Lower bound of the precision above the threshold; NaN without a threshold.
-        held_out: Result on held-out pictures; None without a threshold.
+        held_out: Result on held-out pictures; None without a threshold and a calibration.
         notes: Reasons why something was not fitted.
     """
 
@@ -122,6 +123,8 @@ def fit_class(
         kind: Kind of calibration.
     """
     n, right = len(chosen_on.scores), int(chosen_on.is_right.sum())
+    if not chosen_on.labels + held_out.labels:
+        return ClassFit(name, members, 0, n, right, None, math.nan, None, (NOT_LABELLED,))
     if chosen_on.labels < MIN_LABELS:
         why = f"{chosen_on.labels} labelled boxes, {MIN_LABELS} needed: not fitted"
         return ClassFit(name, members, chosen_on.labels, n, right, None, math.nan, None, (why,))
@@ -136,8 +139,9 @@ def fit_class(
     if found is None:
         notes.append(_why_none(chosen_on, precision, confidence))
         scores = None if calibration is None else ClassScores(calibration=calibration)
+        held = None if scores is None else _held_out(held_out, scores, confidence)
         return ClassFit(
-            name, members, chosen_on.labels, n, right, scores, math.nan, None, tuple(notes)
+            name, members, chosen_on.labels, n, right, scores, math.nan, held, tuple(notes)
         )
     low, high = _applied(calibration, np.array([found.score, found.next_score])).tolist()
     scores = ClassScores(threshold=round_between(low, high), calibration=calibration)
@@ -177,7 +181,7 @@ def _why_none(judged: Judged, precision: float, confidence: float) -> str:
 
 def _held_out(judged: Judged, by: ClassScores, confidence: float) -> HeldOut:
     after = _applied(by.calibration, judged.scores)
-    sure = after > (by.threshold or 0.0)
+    sure = after > (math.inf if by.threshold is None else by.threshold)
     right, of = int((judged.is_right & sure).sum()), int(sure.sum())
     return HeldOut(
         right,

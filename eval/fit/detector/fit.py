@@ -23,6 +23,7 @@ from crosscue.detectors.catalog.places import card_path, names
 from crosscue.eval.fit.detector.card_text import check_place, with_fit
 from crosscue.eval.fit.detector.class_fit import (
     CALIBRATIONS,
+    NOT_LABELLED,
     CalibrationKind,
     ClassFit,
     Judged,
@@ -107,6 +108,8 @@ class FittedDetector(Result):
 
 
 def _class_lines(one: ClassFit, precision: float) -> list[str]:
+    if one.notes == (NOT_LABELLED,):
+        return [f"{visible(one.name):10} {NOT_LABELLED}, {one.detections:,} detections"]
     lines = [
         f"{visible(one.name):10} {one.labels:,} boxes, {one.detections:,} detections, "
         f"{one.right:,} right"
@@ -130,8 +133,10 @@ def _class_lines(one: ClassFit, precision: float) -> list[str]:
             f"              precision at least {held.bound:.3f} with {CONFIDENCE:.0%} confidence: "
             f"{precision:g} {is_shown} shown"
         )
+    if held is not None:
+        start = "" if held.of else "held out"
         lines.append(
-            f"              calibration error {held.error_before:.3f} before, "
+            f"  {start:11} calibration error {held.error_before:.3f} before, "
             f"{held.error_after:.3f} after, {held.detections:,} detections"
         )
     return lines + [f"  {note}" for note in one.notes]

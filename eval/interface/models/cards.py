@@ -209,6 +209,12 @@ def _guess(path: Path, model: Interface, kind: str | None) -> Guess:
     Raises:
         UsageError: No layout or several fit; the message contains the file's declarations.
     """
+    task = model.metadata.get("task", "detect")[:_MAX_TASK_CHARACTERS]
+    if task not in _TASKS:
+        raise UsageError(
+            f"{path}: task in its metadata: expected one of {', '.join(_TASKS)}, found "
+            f"{task!r}; export a network that detects boxes"
+        )
     found = guesses(model)
     if kind is not None:
         found = [guess for guess in found if guess.settings["kind"] == kind]
@@ -217,12 +223,6 @@ def _guess(path: Path, model: Interface, kind: str | None) -> Guess:
     if len(found) == 1:
         return found[0]
     if not found:
-        task = model.metadata.get("task", "detect")[:_MAX_TASK_CHARACTERS]
-        if task not in _TASKS:
-            raise UsageError(
-                f"{path}: task in its metadata: expected one of {', '.join(_TASKS)}, found "
-                f"{task!r}; export a network that detects boxes"
-            )
         outputs = ", ".join(f"{out.name} {_shape(out.shape)}" for out in model.outputs)
         asked = "" if kind is None else f" as {kind}"
         raise UsageError(

@@ -145,6 +145,9 @@ class DetectorScore:
 
 
 def _line(one: PartScore) -> str:
+    if not one.labels and one.part == "all":
+        why = f"not labelled: {one.wrong:,} detections not judged"
+        return f"{visible(one.label)[:14]:14} {one.part:11} {0:6}  {why}"
     threshold = _number(one.threshold)
     return (
         f"{visible(one.label)[:14]:14} {one.part:11} {one.labels:6,} {_number(one.ap50.value):>6} "
@@ -275,6 +278,6 @@ def calibration_of(of: LabelledRun, overlap: float) -> tuple[Reliability, ...]:
     found = []
     for k, name in enumerate(of.classes):
         matched = match(of.truth, of.found, k, overlaps=np.array([overlap]))
-        judged = ~matched.is_out[0]
+        judged = ~matched.is_out[0] & bool(len(matched.labels))
         found.append(reliability(name, matched.scores[judged], matched.is_right[0][judged]))
     return tuple(found)

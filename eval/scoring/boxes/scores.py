@@ -54,7 +54,8 @@ class PartScore:
         part: Size or range; ``all`` for all boxes.
         labels: Number of labels to detect.
         right: Number of correct detections above the threshold, at the requested overlap.
-        wrong: Number of false detections above the threshold.
+        wrong: Number of false detections above the threshold; of a class without any label, the
+            number of detections that cannot be judged.
         threshold: Threshold for ``right`` and ``wrong``.
         ap: Average precision over overlaps 0.5 to 0.95.
         ap50: Average precision at overlap 0.5.
@@ -96,7 +97,8 @@ def score_parts(
     """
     weights = drawn(blocks, seed)
     has_range = bool((np.isfinite(truth.range_m) & ~truth.is_ignored).any())
-    scores = []
+    scores: list[PartScore] = []
+    labelled: set[str] = set()
     for part in (ALL, *SIZES, *(RANGES if has_range else ())):
         rows = [
             _Row.of(match(truth, found, k, part, np.append(OVERLAPS, overlap)), blocks, weights)
@@ -110,9 +112,19 @@ def score_parts(
             # False detections have no range, so they are in no part.
             some = [replace(one, precision=_UNKNOWN) for one in some]
         known = [row for row in rows if row.labels]
-        if known and part is ALL:
-            scores.append(_mean(known, some))
-        scores += [one for one in some if one.labels or one.wrong]
+        if part is ALL:
+            labelled = {one.label for one in some if one.labels}
+            # No label shows whether these detections are right.
+            some = [
+                one if one.label in labelled else replace(one, precision=_UNKNOWN) for one in some
+            ]
+            if known:
+                scores.append(_mean(known, [one for one in some if one.label in labelled]))
+        scores += [
+            one
+            for one in some
+            if one.labels or (one.wrong and (part is ALL or one.label in labelled))
+        ]
     return scores
 
 

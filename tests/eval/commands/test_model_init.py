@@ -290,6 +290,19 @@ def test_network_for_unsupported_task_is_refused(tmp_path: Path) -> None:
 
     with pytest.raises(crosscue.UsageError, match="expected one of detect, segment, found 'pose'"):
         crosscue.draft_card(path)
+    with pytest.raises(crosscue.UsageError, match="expected one of detect, segment, found 'pose'"):
+        crosscue.draft_card(path, kind="yolov8", class_names=["person"])
+
+
+@pytest.mark.parametrize("shape", [(1, 56, 168), (1, 504, 57)], ids=["v8-pose", "v7-pose"])
+def test_pose_export_without_metadata_is_named_as_one(
+    tmp_path: Path, shape: tuple[int, ...]
+) -> None:
+    path = tmp_path / "my.onnx"
+    path.write_bytes(constant_model((1, 3, 64, 128), {"output0": _zeros(*shape)}))
+
+    with pytest.raises(crosscue.UsageError, match="as those of a network for poses"):
+        crosscue.draft_card(path)
 
 
 def test_check_picture_is_not_written_to_an_image_log(

@@ -213,6 +213,42 @@ def test_class_with_few_labels_is_not_fitted(drive: Path, tmp_path: Path) -> Non
     assert not output.exists()
 
 
+def test_held_out_calibration_is_reported_without_threshold(drive: Path) -> None:
+    output = drive / "net_unreached.toml"
+
+    found = crosscue.fit_detector(drive / "run", drive / "labels", output, precision=0.9999)
+
+    (one,) = found.classes
+    assert not found.has_threshold
+    assert one.held_out is not None
+    assert one.held_out.detections == PICTURES // 2
+    assert one.held_out.error_after < one.held_out.error_before
+    errors = f"{one.held_out.error_before:.3f} before, {one.held_out.error_after:.3f} after"
+    assert f"  held out    calibration error {errors}, 350 detections" in str(found)
+    assert "precision nan" not in str(found)
+    card = read_card(output)
+    assert card.scores["traffic light"].threshold is None
+    assert card.evidence == ()
+
+
+def test_class_without_labelled_box_is_not_labelled(tmp_path: Path) -> None:
+    """Three detections of trucks, and labels that list the class but have no box of it."""
+    run = two_labels_on_one_object(tmp_path)
+    labels = car_labels(tmp_path)
+
+    found = crosscue.score_detector(run, labels, has_figures=False)
+    fitted = crosscue.fit_detector(run, labels)
+
+    (line,) = [line for line in str(found).splitlines() if line.startswith("truck")]
+    assert line.split()[:2] == ["truck", "all"]
+    assert line.endswith("not labelled: 3 detections not judged")
+    assert "of truck" not in str(found)
+    assert "0.000" not in line
+    (scored,) = [one for one in found.scores if one.label == "truck"]
+    assert np.isnan(scored.precision.value)
+    assert "truck      not labelled, 1 detections" in str(fitted)
+
+
 @pytest.mark.parametrize(
     ("rows", "meanings", "error", "message"),
     [
@@ -274,14 +310,20 @@ def two_labels_on_one_object(folder: Path) -> crosscue.Run:
     return detect_with_card(folder, "net")
 
 
-def test_labels_mapped_to_one_class_count_once_per_object(tmp_path: Path) -> None:
-    run = two_labels_on_one_object(tmp_path)
-    labels = tmp_path / "labels"
+def car_labels(folder: Path) -> Path:
+    """Label both cars of these pictures; the class truck has no box."""
+    labels = folder / "labels"
     labels.mkdir()
     (labels / "classes.txt").write_text("car\ntruck\n")
     for number in range(3):
         text = "0 .25 .3333 .25 .3333\n0 .78125 .3333 .3125 .3333\n"
         (labels / f"frame_{number}.txt").write_text(text)
+    return labels
+
+
+def test_labels_mapped_to_one_class_count_once_per_object(tmp_path: Path) -> None:
+    run = two_labels_on_one_object(tmp_path)
+    labels = car_labels(tmp_path)
     meanings = {"car": "vehicle", "truck": "vehicle"}
 
     found = crosscue.score_detector(run, labels, meanings=meanings, has_figures=False)
