@@ -10,7 +10,9 @@ nominally 95 % cover 82 to 88 %. Here the variance is that of the jackknife over
 Inference*, 2023). The quantile is that of Student's t for the effective number of clusters of equal
 size (Kish, *Survey Sampling*, section 8.2). For fractions, the interval is Wilson's with the
 effective number of rows (Korn, Graubard, *Survey Methodology* 24, 1998), which stays within 0 and
-1.
+1. Where a few clusters have most of the errors, their variance is known less well, and Student's t
+has fewer degrees of freedom, by the clusters' kurtosis (Satterthwaite, *Biometrics Bulletin* 2,
+1946).
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from numpy.typing import NDArray
 
 CONFIDENCE: Final = 0.95
 MIN_CLUSTERS: Final = 4
+KURTOSIS_CLUSTERS: Final = 8
+"""Minimum number of clusters whose kurtosis is estimated."""
 TOO_FEW: Final = "too few clusters"
 """Text in place of an interval over too few drives or approaches."""
 
@@ -177,18 +181,21 @@ class Spread(NamedTuple):
         sd: Standard deviation of the mean.
         clusters: Number of clusters.
         equal_clusters: Effective number of clusters of equal size.
+        kurtosis: Kurtosis of the clusters' effects on the mean; 3 if they are normal, or unknown.
     """
 
     mean: float
     sd: float
     clusters: int
     equal_clusters: float
+    kurtosis: float = 3.0
 
-    def quantile(self, confidence: float) -> float:
-        """Return the two-sided quantile of Student's t."""
+    def quantile(self, confidence: float, freedom: float = math.inf) -> float:
+        """Return the two-sided quantile of Student's t, with at most ``freedom`` degrees."""
         from scipy.special import stdtrit
 
-        return float(stdtrit(max(self.equal_clusters - 1.0, 1.0), 0.5 + 0.5 * confidence))
+        freedom = max(min(freedom, self.equal_clusters - 1.0), 1.0)
+        return float(stdtrit(freedom, 0.5 + 0.5 * confidence))
 
     def within_0_and_1(self, rows: float, confidence: float = CONFIDENCE) -> Interval:
         """Return Wilson's interval for the effective number of rows, at most ``rows``."""
@@ -197,7 +204,9 @@ class Spread(NamedTuple):
         if self.sd == 0.0:
             return _wilson(self.mean, self.clusters, float(ndtri(0.5 + 0.5 * confidence)))
         effective = min(self.mean * (1.0 - self.mean) / self.sd**2, rows)
-        return _wilson(self.mean, effective, self.quantile(confidence))
+        # The relative variance of a variance of n values is (kurtosis - 1) / n.
+        freedom = 2.0 * self.equal_clusters / max(self.kurtosis - 1.0, 1e-9)
+        return _wilson(self.mean, effective, self.quantile(confidence, freedom))
 
 
 def _spread(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> Spread | None:
@@ -210,5 +219,19 @@ def _spread(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> Spread 
     rows = np.bincount(which, minlength=n).astype(np.float64)
     whole = float(total.sum() / rows.sum())
     without = (total.sum() - total) / (rows.sum() - rows)
-    sd = math.sqrt((n - 1) / n * float(((without - whole) ** 2).sum()))
-    return Spread(whole, sd, n, float(rows.sum() ** 2 / (rows**2).sum()))
+    squares = (without - whole) ** 2
+    sd = math.sqrt((n - 1) / n * float(squares.sum()))
+    equal = float(rows.sum() ** 2 / (rows**2).sum())
+    return Spread(whole, sd, n, equal, _kurtosis(squares))
+
+
+def _kurtosis(squares: NDArray[np.float64]) -> float:
+    """Return the kurtosis of values by their squares, unbiased for normal values (G2 + 3).
+
+    Joanes, Gill, *Comparing measures of sample skewness and kurtosis*, The Statistician 47, 1998.
+    """
+    n, total = len(squares), float(squares.sum())
+    if n < KURTOSIS_CLUSTERS or total == 0.0:
+        return 3.0
+    excess = n * float((squares**2).sum()) / total**2 - 3.0
+    return 3.0 + (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * excess + 6.0)
