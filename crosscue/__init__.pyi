@@ -4,6 +4,8 @@ from crosscue.datasets.simulate import Approaches as Approaches
 from crosscue.datasets.simulate import simulate_approach as simulate_approach
 from crosscue.datasets.simulate import simulate_approaches as simulate_approaches
 from crosscue.datasets.simulate import simulate_drive as simulate_drive
+from crosscue.datasets.truth.carried import write_truth as write_truth
+from crosscue.datasets.truth.truth import truth_schema as truth_schema
 from crosscue.detectors.base import Detections as Detections
 from crosscue.detectors.base import Detector as Detector
 from crosscue.detectors.base import Frame as Frame
@@ -57,6 +59,7 @@ from crosscue.eval.failures.search import failures as failures
 from crosscue.eval.failures.search import read_failures as read_failures
 from crosscue.eval.fit.compass import fit_compass as fit_compass
 from crosscue.eval.fit.detector.fit import fit_detector as fit_detector
+from crosscue.eval.fit.gnss_truth import truth_from_gnss as truth_from_gnss
 from crosscue.eval.fit.landmarks.fit import fit_landmarks as fit_landmarks
 from crosscue.eval.fit.messages import fit_messages as fit_messages
 from crosscue.eval.fit.odometry import fit_odometry as fit_odometry
@@ -64,7 +67,6 @@ from crosscue.eval.fit.ranges.fit import fit_ranges as fit_ranges
 from crosscue.eval.fit.signs.threshold import fit_signs as fit_signs
 from crosscue.eval.fit.temporal import fit_temporal as fit_temporal
 from crosscue.eval.fit.truth_check import ImportedTruth as ImportedTruth
-from crosscue.eval.fit.truth_check import TruthFit as TruthFit
 from crosscue.eval.fit.truth_check import check_truth as check_truth
 from crosscue.eval.fit.truth_check import import_truth as import_truth
 from crosscue.eval.fleet.compare import compare_many as compare_many
@@ -82,9 +84,6 @@ from crosscue.eval.interface.models.cards import check_card as check_card
 from crosscue.eval.interface.models.cards import draft_card as draft_card
 from crosscue.eval.interface.runs.detector_scores import DetectorScore as DetectorScore
 from crosscue.eval.interface.runs.detector_scores import score_detector as score_detector
-from crosscue.eval.interface.truth import truth_from_gnss as truth_from_gnss
-from crosscue.eval.interface.truth import truth_schema as truth_schema
-from crosscue.eval.interface.truth import write_truth as write_truth
 from crosscue.eval.landmarks import add_landmarks as add_landmarks
 from crosscue.eval.landmarks import list_landmarks as list_landmarks
 from crosscue.eval.landmarks import match_landmarks as match_landmarks

@@ -296,6 +296,6 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return dict(pairs)
 
 
-def json_schema() -> dict[str, Any]:
+def truth_schema() -> dict[str, Any]:
     """Return the JSON Schema of the file, for other tools."""
     return Truth.model_json_schema()

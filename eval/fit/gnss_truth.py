@@ -9,19 +9,48 @@ from typing import Final
 import numpy as np
 
 from crosscue.datasets.geodesy import geodetic_to_enu
+from crosscue.datasets.truth.carried import WrittenTruth
 from crosscue.datasets.truth.truth import Mounting, Origin, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.localization.compass import course_at
 from crosscue.replay.base import EmptyResultError, Floats, Int64s, Log, Selection, name_of
 from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.vehicle.pose import Gnss
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 
 from .log_signals import plan_of, read_signals
 
 POSE_FILE: Final = "gnss.tum"
 HELD_S: Final = 60.0
 """Max time for which a stationary vehicle keeps its last heading, seconds."""
+
+
+def truth_from_gnss(
+    log: DriveGiven, output: Path | str, vehicle: Vehicle | Path | str | None = None
+) -> WrittenTruth:
+    """Write a drive's own GNSS as truth.
+
+    The track is that of the antenna, with standard deviations. Scores of poses take into account
+    the receiver's standard deviation (or gnss.position_sd_m of the vehicle file) and
+    gnss.course_sd_rad. Positions before the car first moves have no heading and are omitted.
+
+    Examples:
+        crosscue truth from-gnss drive.mcap --vehicle car.toml -o truth/
+
+    Args:
+        log: The drive, or its path; ``log.part(...)`` for a part of it.
+        output: Folder for the truth file and its track.
+        vehicle: Vehicle file with the antenna's mounting.
+
+    Raises:
+        EmptyResultError: The log has no position, or none with a heading.
+        OutputError: The files cannot be written.
+    """
+    settings = vehicle_given(vehicle)
+    with opened(log) as drive:
+        found = write_gnss_truth(drive.logs, settings, drive.selection, Path(output))
+    return WrittenTruth(found)
 
 
 def write_gnss_truth(

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 
@@ -34,10 +34,12 @@ from crosscue.replay.base import (
     SchemaError,
     sha256_of,
     strict_json,
-    visible,
     write_text,
 )
+from crosscue.replay.limits import LimitsGiven
 from crosscue.replay.vehicle.vehicle import CUES, Vehicle, vehicle_given
+from crosscue.results import Result
+from crosscue.verb import Option
 
 from .log_images import LogSpan, log_pictures, log_span
 
@@ -47,8 +49,8 @@ SLACK_NS: Final = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class TruthFit:
-    """Content of a truth file that fits its log; its ``repr`` is the output of ``truth check``.
+class TruthFit(Result):
+    """Content of a truth file that fits its log.
 
     Attributes:
         seconds: Duration of the truth.
@@ -75,32 +77,24 @@ class TruthFit:
     outside: int
     is_checked_by_hash: bool
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the attributes as a dictionary."""
-        return asdict(self)
-
-    def __repr__(self) -> str:
-        lines = [
-            f"fits       {self.seconds:.1f} s of truth",
-            f"holds      {self.approaches} approaches, {self.cues} statements about cues,",
-            f"           {self.objects} objects, {self.ranges} ranges, {self.poses} poses",
-        ]
+    def lines(self) -> Iterator[str]:
+        """Yield what the truth contains, and what of it was not checked."""
+        yield f"fits       {self.seconds:.1f} s of truth"
+        yield f"holds      {self.approaches} approaches, {self.cues} statements about cues,"
+        yield f"           {self.objects} objects, {self.ranges} ranges, {self.poses} poses"
         if self.outside:
-            lines.append(
-                f"outside    {self.outside} of them reach beyond the log, whose clock was set back"
-            )
+            text = "of them reach beyond the log, whose clock was set back"
+            yield f"outside    {self.outside} {text}"
         if self.moments:
-            lines.append(
-                f"moments    {self.moments_with_frame} of {self.moments} meet a picture of the log"
-            )
+            met = f"{self.moments_with_frame} of {self.moments}"
+            yield f"moments    {met} meet a picture of the log"
         if not self.is_checked_by_hash:
-            lines.append("log        not checked by hash: the truth names none (log_sha256)")
-        return "\n".join(lines)
+            yield "log        not checked by hash: the truth names none (log_sha256)"
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class ImportedTruth:
-    """Result of an import; its ``repr`` is the output of ``truth import``.
+class ImportedTruth(Result):
+    """Result of an import.
 
     Attributes:
         truth: Path of the truth file.
@@ -120,34 +114,37 @@ class ImportedTruth:
     cues: dict[str, int]
     ignored: Mapping[str, int]
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the attributes as a dictionary."""
-        return asdict(self) | {"truth": str(self.truth), "objects": str(self.objects)}
-
-    def __repr__(self) -> str:
-        lines = [f"pictures   {self.pictures} with {self.things} objects, matched {self.rule}"]
-        lines += [f"           {cue}: present in {count}" for cue, count in self.cues.items()]
+    def lines(self) -> Iterator[str]:
+        """Yield the numbers of pictures, objects and cues, and the files."""
+        yield f"pictures   {self.pictures} with {self.things} objects, matched {self.rule}"
+        yield from (f"           {cue}: present in {count}" for cue, count in self.cues.items())
         if not self.cues:
-            lines.append("           no label is a cue; only objects were imported")
-        lines += [f"ignored    {count} {kind}" for kind, count in self.ignored.items()]
-        lines.append(f"written to {visible(str(self.truth))}")
-        lines.append(f"           {visible(str(self.objects))}")
-        return "\n".join(lines)
+            yield "           no label is a cue; only objects were imported"
+        yield from (f"ignored    {count} {kind}" for kind, count in self.ignored.items())
+        yield f"written to {self.truth}"
+        yield f"           {self.objects}"
 
 
 def check_truth(
     truth: Path | str,
-    log: Path | str,
+    log: Annotated[Path | str, Option("--log")],
     vehicle: Vehicle | Path | str | None = None,
     *,
-    limits: Limits = DEFAULT_LIMITS,
+    limits: LimitsGiven = DEFAULT_LIMITS,
 ) -> TruthFit:
-    """Check a truth file and all files that it names against a log.
+    """Check a truth file against its log.
+
+    All files that it names are checked, too. The check fails for times outside the log, unknown
+    cues or classes, overlapping approaches, boxes outside the picture, pictures of another size,
+    and the hash of another log.
+
+    Examples:
+        crosscue truth check truth.json --log drive.mcap
 
     Args:
-        truth: The file, or the folder with ``truth.json``.
-        log: The log that it belongs to.
-        vehicle: The vehicle file, needed if the log has several cameras.
+        truth: Truth file, or its folder.
+        log: Log that the truth belongs to.
+        vehicle: Vehicle file: camera topic, if the log has several cameras.
         limits: Limits for reading the log.
 
     Raises:

@@ -14,7 +14,7 @@ from rerun.chunk import RrdReader
 
 import crosscue
 from crosscue.datasets.scenes.cues import SIMULATED
-from crosscue.datasets.truth.truth import json_schema
+from crosscue.datasets.truth.truth import truth_schema
 from crosscue.detectors.base import Detections, Found, Frame
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import Seen
@@ -195,7 +195,7 @@ def test_dummy_cue_requires_only_one_row_and_one_function(
     )
     assert CuePass(Vehicle(version=1))(Seen(0, objects=(boxes,))).counts["zebra"] == 2
     assert Fusion().cues["zebra"].precision == 0.61
-    schema = json_schema()
+    schema = truth_schema()
     assert "zebra" in schema["$defs"]["CueTruth"]["properties"]["cue"]["examples"]
 
     # It is scored as its row states, reported with its published precision, drawn in its colour.

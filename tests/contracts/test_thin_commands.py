@@ -16,12 +16,9 @@ from crosscue.eval import cli
 
 ROOT: Final = Path(__file__).parents[2]
 CALLS: Final = {
-    "truth": ("write_truth",),
     "truth import": ("import_truth", "import_labels"),
-    "truth check": ("check_truth",),
     "score detector": ("score_detector",),
     "demo": ("demo",),
-    "truth from-gnss": ("truth_from_gnss",),
     "model init": ("draft_card",),
     "model check": ("check_card",),
 }

@@ -11,7 +11,7 @@ import pytest
 from crosscue.datasets.truth.annotations import LogPictures, place
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.cvat import read_cvat
-from crosscue.datasets.truth.truth import Truth, json_schema, load
+from crosscue.datasets.truth.truth import Truth, load, truth_schema
 from crosscue.eval import cli
 from crosscue.replay.base import SchemaError
 from crosscue.replay.vehicle.cue_table import CUES
@@ -464,5 +464,5 @@ def test_printed_schema_lists_every_cue(capsys: pytest.CaptureFixture[str]) -> N
     assert cli.run(["truth", "schema"]) == 0
     schema = json.loads(capsys.readouterr().out)
 
-    assert schema == json_schema() == Truth.model_json_schema()
+    assert schema == truth_schema() == Truth.model_json_schema()
     assert tuple(schema["$defs"]["CueTruth"]["properties"]["cue"]["examples"]) == tuple(CUES)
