@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import inspect
 import io
 import types
@@ -45,6 +46,7 @@ class Commands(SphinxDirective):
         return section
 
 
+@functools.cache
 def _help(command: str) -> str:
     from crosscue.eval import cli
 
@@ -232,8 +234,12 @@ def _keep_examples(
 def _show_plain_types(app: Sphinx) -> None:
     """Show the types of public names without how the command line reads them."""
     import crosscue
+    from crosscue.eval.cli import COMMANDS
     from crosscue.eval.command_line import types_of
 
+    # Before the types are replaced: the help of commands needs the options in them.
+    for command in COMMANDS:
+        _help(command)
     for found in map(crosscue.__getattr__, crosscue.__all__):
         if isinstance(found, types.FunctionType):
             found.__annotations__ = types_of(found)

@@ -99,6 +99,7 @@ def test_command_example_has_the_described_options(
     help_text = capsys.readouterr().out
     for option in ("LOG", "--from", "--to", "--topics", "--max-chunk", "--min-s S", "--json", "-q"):
         assert option in help_text, option
-    assert cli.run(["longest-gap", "drive.mcap", "--min-s", "-1"]) == 4
+    assert cli.run(["longest-gap", "drive.mcap", "--min-s", "-1"]) == 2
+    assert "--min-s -1.0: expected more than 0" in capsys.readouterr().err
     with pytest.raises(UsageError, match=r"min_s: -1\.0, expected more than 0"):
         verb("drive.mcap", min_s=-1.0)

@@ -154,7 +154,7 @@ def test_folder_without_export_and_unknown_format_are_refused(
     with pytest.raises(AnnotationError, match="crosscue export wrote"):
         crosscue.import_labels(exported, tmp_path, tmp_path / "labelled")
     with pytest.raises(UsageError, match="expected one of coco"):
-        crosscue.export(worst, tmp_path / "x", to="voc")
+        crosscue.export(worst, tmp_path / "x", to="voc")  # type: ignore[arg-type]
 
 
 def test_deleted_run_is_left_out_of_the_export_with_its_reason(worst: Path, tmp_path: Path) -> None:
