@@ -48,22 +48,22 @@ from crosscue.detectors.registry import make
 
 Floats = NDArray[np.float64]
 Size = tuple[int, int]
+# Vehicle classes by their number among COCO's 80 classes.
 VEHICLES = {2: "car", 5: "bus", 7: "truck"}
-"""Vehicle classes by their number among COCO's 80 classes."""
 STOP_SIGN = 11
 VEHICLE_WORDS = ("Car", "Truck", "Bus", "Vehicle", "Van", "Towed")
 NEAR_M, FAR_M = 30.0, 80.0
 MIN_VISIBLE = 0.5
+# Lowest score of detections that count towards the average precision.
 MIN_SCORE = 0.01
-"""Lowest score of detections that count towards the average precision."""
 RECALL_SCORE, FALSE_SCORE, SIGN_SCORE = 0.3, 0.5, 0.9
+# Fraction of a false box that may overlap a vehicle's box at most.
 MAX_FALSE_FRACTION = 0.1
-"""Fraction of a false box that may overlap a vehicle's box at most."""
+# Successive pictures (1 s) that are resampled together, because their errors correlate.
 BLOCK = 10
-"""Successive pictures (1 s) that are resampled together, because their errors correlate."""
 DRAWS = 300
+# Timings of each picture; the minimum is the least disturbed by other work.
 ROUNDS = 5
-"""Timings of each picture; the minimum is the least disturbed by other work."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

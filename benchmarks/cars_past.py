@@ -38,6 +38,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 MIN_IOU = 0.3
 FOUND = "found"
+# Names of unmet conditions, from the last condition of the rule to the first.
 REASONS = (
     "not surely past the far kerb",
     "speed not surely above 2 m/s",
@@ -48,7 +49,6 @@ REASONS = (
     "detected with too low a score, or for the first time",
     "not detected",
 )
-"""Names of unmet conditions, from the last condition of the rule to the first."""
 
 
 class Missed(NamedTuple):

@@ -18,8 +18,8 @@ from crosscue.eval.scoring.runs import judge_run
 from crosscue.eval.studies.intersections.contact_sheet import write_sheet
 
 RUNS: Final = (1, 4, 6, 9)
+# Quality of the JPEG, low so that its page loads quickly.
 QUALITY: Final = 60
-"""Quality of the JPEG, low so that its page loads quickly."""
 
 
 def main() -> None:

@@ -28,10 +28,10 @@ Rgb = tuple[int, int, int]
 RED: Final[Rgb] = (178, 28, 38)
 WHITE: Final[Rgb] = (238, 238, 234)
 BLACK: Final[Rgb] = (22, 22, 22)
+# Factor of the drawing's size; averaging it down makes smooth edges.
 OVER: Final = 4
-"""Factor of the drawing's size; averaging it down makes smooth edges."""
+# Width of the signs of simulated scenes.
 SCENE_PX: Final = 128
-"""Width of the signs of simulated scenes."""
 
 _BLACK, _RED, _WHITE, _AROUND = 25, 85, 235, 140
 _OVERSIZE: Final = 8

@@ -60,13 +60,13 @@ CPU: Final = torch.device("cpu")
 PLAIN: Final = "torchvision, 1000 proposals, pasted"
 SAME_PX: Final = 0.5
 RIGHT_OVERLAP: Final = 0.3
+# Calibrated scores above which the cues use a detection.
 CUE_SCORES: Final = {"car": 0.95, "stop sign": 0.9, "traffic light": 0.9}
-"""Calibrated scores above which the cues use a detection."""
 SURE, COMPETING, REMAINING = 5, 60, 20
 
 Way = Callable[[Frame], Any]
+# Map from a class to the min raw score of its detections.
 Least = Callable[[str], float]
-"""Map from a class to the min raw score of its detections."""
 
 
 @dataclass(frozen=True, slots=True)

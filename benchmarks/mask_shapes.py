@@ -28,11 +28,11 @@ from crosscue.replay.base import Floats
 
 CLASSES: Final = ("car", "stop sign", "traffic light")
 SAME_OBJECT: Final = 0.5
+# Min length over height of cars that the cues evaluate.
 LONG: Final = 2.0
-"""Min length over height of cars that the cues evaluate."""
 
+# Detected box, true box, detected mask, true mask and picture.
 Pair = tuple[Floats, Floats, bytes, bytes, LabelledPicture]
-"""Detected box, true box, detected mask, true mask and picture."""
 
 
 def pairs(

@@ -235,12 +235,12 @@ CASES: dict[str, Callable[[Path], int]] = {
 }
 
 
+# Reference of the ratios, number of digits, and True if higher is better.
 AGAINST = (
     ("Rerun McapReader", 2, True),
     ("rosbags, deserialised", 1, True),
     ("bare decompression", 2, False),
 )
-"""Reference of the ratios, number of digits, and True if higher is better."""
 
 
 def speed(rounds: int) -> None:

@@ -77,8 +77,8 @@ def their_database(dbc: Path) -> Any:
     return load_can_database(dbc)
 
 
+# Bus, identifier and signal.
 Key = tuple[str, int, str]
-"""Bus, identifier and signal."""
 SOURCE = re.compile(r"CAN(\d+)\.CAN_DataFrame\.ID=0x([0-9A-F]+) EXT=(?:True|False)")
 
 

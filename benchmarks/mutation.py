@@ -51,8 +51,8 @@ EQUIVALENT: Final = Path(__file__).with_name("mutation_equivalent.toml")
 PACKAGES: Final = ("replay", "detectors", "fusion", "localization", "datasets", "eval")
 VERSION: Final = "3.8.1"
 SURVIVED: Final = 0
+# Exit status of mutants that no test reaches.
 NO_TEST: Final = 33
-"""Exit status of mutants that no test reaches."""
 NOT_RUN: Final = None
 NO_EFFECT: Final = re.compile(r",? ?(strict=(True|False|None),?|(?=\)))|(?<=\bcast\()[^,(]*, ")
 

@@ -53,8 +53,8 @@ from crosscue.replay.vehicle.vehicle import load as load_vehicle
 from support.perfect_boxes import frames, is_there, role_at, true_cars
 
 VISIBLE = (0.3, 0.5, 0.7, 0.9)
+# Visibility threshold for which errors are listed by their cause.
 SHOWN = 0.7
-"""Visibility threshold for which errors are listed by their cause."""
 RULES = {"cross_traffic": cross_traffic, "parked": parked_cars}
 LABELLED = {"stop_sign": "stop sign", "traffic_light": "traffic light"}
 Claims = dict[str, tuple[list[bool], list[int]]]

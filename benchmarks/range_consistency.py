@@ -22,8 +22,8 @@ STARTS_M = (79.0, 57.0)
 RIGHT_M = (1.0, -6.0)
 WAY_M, FRAMES = 17.0, 80
 SCALE_SD = 0.01
+# Mean NEES of the far and the near light on PandaSet 002.
 REAL = (0.18, 0.07)
-"""Mean NEES of the far and the near light on PandaSet 002."""
 
 
 def track(rng: np.random.Generator) -> NDArray[np.float64]:

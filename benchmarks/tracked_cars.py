@@ -33,8 +33,8 @@ from crosscue.replay.vehicle.vehicle import load as load_vehicle
 from support.perfect_boxes import frames, is_there
 
 VISIBLE = 0.5
+# Standard deviation assumed for the true range, as of a good estimate.
 PLACE_SD_M = 2.0
-"""Standard deviation assumed for the true range, as of a good estimate."""
 
 
 class Totals(NamedTuple):

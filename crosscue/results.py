@@ -14,8 +14,8 @@ from typing import Any, ClassVar, Final, Protocol, Self, TypeVar, overload, runt
 from crosscue.replay.safe_text import table, terminal_width, visible
 
 T = TypeVar("T")
+# Metadata of a field that is not in the JSON form.
 HIDDEN: Final = {"json": ""}
-"""Metadata of a field that is not in the JSON form."""
 
 
 def json_key(name: str) -> dict[str, str]:

@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 __all__ = ["check_cue", "check_dataset", "check_detector", "check_reader"]
 
+# Log time and content of each row in stored order, by topic.
 Rows: TypeAlias = dict[str, list[tuple[int, object]]]
-"""Log time and content of each row in stored order, by topic."""
 
 
 def check_reader(

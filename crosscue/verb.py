@@ -49,8 +49,8 @@ class Option:
     made_by: Callable[..., object] | None = None
 
 
+# For a parameter that is not on the command line.
 HIDDEN: Final = Option(is_hidden=True)
-"""For a parameter that is not on the command line."""
 
 
 @overload

@@ -18,9 +18,9 @@ SEMI_MINOR_M: Final = SEMI_MAJOR_M * (1.0 - FLATTENING)
 FIRST_ECCENTRICITY_2: Final = FLATTENING * (2.0 - FLATTENING)
 SECOND_ECCENTRICITY_2: Final = FIRST_ECCENTRICITY_2 / (1.0 - FIRST_ECCENTRICITY_2)
 
+# Number of iterations. One is exact to a micrometre near the ground, three up to a satellite's
+# orbit.
 _BOWRING_STEPS: Final = 3
-"""Number of iterations. One is exact to a micrometre near the ground, three up to a satellite's
-orbit."""
 
 
 def geodetic_to_ecef(

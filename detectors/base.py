@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from . import rle
 
+# Score above which a detection is a cue, where vehicle file and detector set no other.
 MIN_SCORE: Final = 0.5
-"""Score above which a detection is a cue, where vehicle file and detector set no other."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,12 +28,12 @@ from crosscue.replay.readers.images.damage import damage_of
 
 from .base import View
 
+# Size of the largest picture that is decoded: 192 MB in colour.
 MAX_PIXELS: Final = 64_000_000
-"""Size of the largest picture that is decoded: 192 MB in colour."""
+# Reason of a dropped row: damaged, too large, or empty; the detail says which.
 NOT_DECODED: Final = "picture not decoded"
-"""Reason of a dropped row: damaged, too large, or empty; the detail says which."""
+# Factors by which a JPEG decoder can reduce a picture while decoding.
 _REDUCTIONS: Final = (8, 4, 2)
-"""Factors by which a JPEG decoder can reduce a picture while decoding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +180,7 @@ def _eight_bits(pixels: np.ndarray[tuple[int, ...], np.dtype[np.generic]], bits:
     return np.asarray(np.minimum(shifted, 255), np.uint8)
 
 
+# Channels, bytes per channel and OpenCV's conversion to BGR, by ROS encoding.
 _RAW: Final = {
     "mono8": (1, 1, None), "8UC1": (1, 1, None), "mono16": (1, 2, None), "16UC1": (1, 2, None),
     "bgr8": (3, 1, None), "8UC3": (3, 1, None), "rgb8": (3, 1, "COLOR_RGB2BGR"),
@@ -187,7 +188,6 @@ _RAW: Final = {
     "bayer_rggb8": (1, 1, "COLOR_BayerRGGB2BGR"), "bayer_bggr8": (1, 1, "COLOR_BayerBGGR2BGR"),
     "bayer_gbrg8": (1, 1, "COLOR_BayerGBRG2BGR"), "bayer_grbg8": (1, 1, "COLOR_BayerGRBG2BGR"),
 }  # fmt: skip
-"""Channels, bytes per channel and OpenCV's conversion to BGR, by ROS encoding."""
 
 
 def _raw(picture: Encoded, layout: tuple[int, int, int, str], view: View, bits: int) -> Bytes:

@@ -20,8 +20,8 @@ GREEN: Final = (80, 220, 60)
 BLUE: Final = (255, 140, 0)
 AMBER: Final = (90, 190, 255)
 PALE: Final = (230, 230, 230)
+# Margin to the left and right of the line of cues.
 MARGIN_PX: Final = 10
-"""Margin to the left and right of the line of cues."""
 
 
 @dataclass(slots=True)

@@ -31,25 +31,25 @@ from .catalog.entries import weights_folder
 
 GROUP: Final = GROUPS["detector"]
 
+# ``module:factory`` of each detector, by name.
 BUILTIN: Final[Mapping[str, str]] = {
     "mask-rcnn": "crosscue.detectors.networks.mask_rcnn.detector:build",
     "model": "crosscue.detectors.networks.model_detector:build",
     "road": "crosscue.detectors.networks.road.detector:build",
     "signs": "crosscue.detectors.signs.detector:build",
 }
-"""``module:factory`` of each detector, by name."""
 
+# Detectors of the demo and the studies: embedded networks, trained on simulated scenes only.
 EMBEDDED: Final = "mask-rcnn,road,signs"
-"""Detectors of the demo and the studies: embedded networks, trained on simulated scenes only."""
 
+# Setting that selects a network, and its default, which selects the embedded one.
 _EMBEDDED_BY: Final = {"mask-rcnn": ("network", "embedded"), "road": ("checkpoint", None)}
-"""Setting that selects a network, and its default, which selects the embedded one."""
 
+# Endings of files with weights, which need a card.
 _WEIGHTS: Final = (".onnx", ".pt", ".pth", ".safetensors", ".tflite", ".xml")
-"""Endings of files with weights, which need a card."""
 
+# Attributes that every ``Detector`` has.
 _PARTS: Final = ("view", "identity", "__call__")
-"""Attributes that every ``Detector`` has."""
 
 
 def chosen(names: str | Sequence[object], sections: Mapping[str, Choice]) -> tuple[Choice, ...]:

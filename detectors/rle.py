@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 _BASE: Final = 48
 _MORE: Final = 0x20
 _SIGN: Final = 0x10
+# Maximum number of five-bit groups in a run's length: 35 bits.
 _LONGEST: Final = 7
-"""Maximum number of five-bit groups in a run's length: 35 bits."""
 
 
 def encode(mask: NDArray[np.bool_], corner_px: tuple[int, int], size_px: tuple[int, int]) -> bytes:

@@ -14,8 +14,8 @@ from .images import NOT_DECODED, Encoded, decode, encoded, reduction, size_of
 from .ranging.lens import VERSION, with_lenses
 from .result_cache import ResultCache, picture_key
 
+# Number of pictures decoded and passed to a detector at a time.
 BATCH: Final = 8
-"""Number of pictures decoded and passed to a detector at a time."""
 OTHER_SIZE: Final = "picture of another size than the first"
 
 

@@ -18,13 +18,13 @@ from torch import Tensor
 from crosscue.replay.base import VehicleError, json_tree, one_line
 
 SUM: Final = "crosscue-sha256"
+# SHA-256 of the files that are part of the crosscue package.
 EMBEDDED: Final[Mapping[str, str]] = {
     "compact_simulated.safetensors": (
         "270a8420ddeacd52901b85fe2139ef4f3af4eb19b9b0d8e015ec30776ca3b87d"
     ),
     "road.safetensors": "a1323a9f1f04962a6b6a4af7db8800d3c22e304c48a561c4ffbf808a75fafdc6",
 }
-"""SHA-256 of the files that are part of the crosscue package."""
 
 
 def embedded(name: str) -> Path:

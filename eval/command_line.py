@@ -23,6 +23,7 @@ from crosscue.replay.errors import UsageError
 from crosscue.results import Result
 from crosscue.verb import Option, attributes_of
 
+# Metavar by name of a parameter, the same in every command.
 METAVARS: Final = {
     "vehicle": "V.toml",
     "truth": "T.json",
@@ -44,9 +45,8 @@ METAVARS: Final = {
     "labels": "LABELS",
     "topics": "TOPIC",
 }
-"""Metavar by name of a parameter, the same in every command."""
+# Metavar by the unit that ends a parameter's name.
 UNITS: Final = {"m": "M", "s": "S", "px": "PX", "deg": "DEG", "gib": "GIB"}
-"""Metavar by the unit that ends a parameter's name."""
 TYPES: Final[dict[Any, str]] = {int: "N", float: "X", Path: "FILE", str: "NAME"}
 Groups = dict[str, argparse._MutuallyExclusiveGroup]
 _SECTION: Final = re.compile(r"^(Args|Attributes|Returns|Yields|Raises|Examples?):$", re.MULTILINE)

@@ -24,8 +24,8 @@ from crosscue.results import Result
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
+# Shortest time between two updates of the line.
 EVERY_S: Final = 0.1
-"""Shortest time between two updates of the line."""
 
 
 class Done(NamedTuple):

@@ -60,11 +60,11 @@ from .temporal import (
     update_with,
 )
 
+# Distance over which an accumulated turn decays, so that bends of a road do not add up to one.
 TURN_FADES_M: Final = 25.0
-"""Distance over which an accumulated turn decays, so that bends of a road do not add up to one."""
+# Distance since the last evidence of static objects below which the car stands, as in
+# ``Fusion.dissent_every_m``.
 STANDING_M: Final = 0.1
-"""Distance since the last evidence of static objects below which the car stands, as in
-``Fusion.dissent_every_m``."""
 
 
 @dataclass(frozen=True, slots=True)

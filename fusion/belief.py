@@ -64,11 +64,9 @@ def probabilities(belief: Belief, graph: FactorGraph) -> dict[str, float]:
     }
 
 
+# Message model: maps a frame's situation to the sum of messages into each feature, in log odds. It
+# can depend on earlier messages of the same approach; each approach has a new instance.
 MessageModel = Callable[[Situation], Sequence[float]]
-"""Message model: maps a frame's situation to the sum of messages into each feature, in log odds.
-
-It can depend on earlier messages of the same approach; each approach has a new instance.
-"""
 
 
 class _Line(NamedTuple):

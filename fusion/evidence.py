@@ -72,5 +72,5 @@ class FrameEvidence:
     posteriors: tuple[RangePosterior, ...] = ()
 
 
+# Counts cues that depend on the intersection's position, given the best range.
 PastCues = Callable[[RangeBelief | None, Reference | None], Mapping[str, int]]
-"""Counts cues that depend on the intersection's position, given the best range."""

@@ -12,14 +12,11 @@ from typing import Final, Self
 
 from crosscue.replay.vehicle.fusion import Fade, Fusion
 
+# Default fade of a cue without a fitted one.
 USUAL_FADE: Final = Fade(way_m=10.0)
-"""Default fade of a cue without a fitted one."""
+# Limit of log odds in the conversion to a probability, which stays 1e-13 away from 0 and 1. Sums of
+# log odds are not limited, so that evidence can reverse a belief and its order does not matter.
 LOG_ODDS_LIMIT: Final = 30.0
-"""Limit of log odds in the conversion to a probability, which stays 1e-13 away from 0 and 1.
-
-Sums of log odds are not limited, so that evidence can reverse a belief and its order does not
-matter.
-"""
 
 
 def log_odds(probability: float) -> float:

@@ -46,9 +46,8 @@ class RangeTrack(NamedTuple):
 
 
 NOTHING: Final = RangeTrack()
+# Weight of an observation at the position of the last one; positive to avoid a division by zero.
 MIN_EFFECTIVE_SAMPLES: Final = 1e-9
-"""Weight of an observation at the position of the last one; positive to avoid a division by zero.
-"""
 
 
 def advance(

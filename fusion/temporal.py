@@ -42,21 +42,21 @@ from .factor_graph import CueNode, FactorGraph, log_odds
 from .independence import effective_sample_fraction
 from .intersection_range import Reference
 
+# Feature on which all others depend.
 PRESENCE: Final = "intersection"
-"""Feature on which all others depend."""
+# Stray ranges are uniform up to this distance.
 MAX_RANGE_M: Final = 150.0
-"""Stray ranges are uniform up to this distance."""
+# Minimum distance of a reported probability from 0 and 1.
 FLOOR: Final = 1e-9
-"""Minimum distance of a reported probability from 0 and 1."""
+# Maximum fraction of a cell's mass that moves to either side per step; the remaining variance is
+# applied in the next step.
 MAX_SPREAD: Final = 0.25
-"""Maximum fraction of a cell's mass that moves to either side per step; the remaining variance is
-applied in the next step."""
 
 
+# Relative s.d. of the default length, for an intersection whose end only was measured.
 LENGTH_SD_FRACTION: Final = 0.25
-"""Relative s.d. of the default length, for an intersection whose end only was measured."""
+# Minimum weight of a range in independent ranges; below it, a repeated range is ignored.
 MIN_WORTH: Final = 1e-3
-"""Minimum weight of a range in independent ranges; below it, a repeated range is ignored."""
 
 
 def ranges_to_start(

@@ -29,8 +29,8 @@ Floats: TypeAlias = NDArray[np.float64]
 X: Final = 0
 Y: Final = 1
 
+# Full major axis of the 2-sigma ellipse above which the car is lost, by the dissertation.
 LOST_M: Final = 100.0
-"""Full major axis of the 2-sigma ellipse above which the car is lost, by the dissertation."""
 
 _ROUNDING: Final = 1e-9
 

@@ -20,8 +20,8 @@ import numpy as np
 from .ekf import PoseBelief, coast
 from .pose_filter import HEADING, SPEED
 
+# Variance of an unknown heading.
 FULL_TURN_VAR_RAD2 = math.pi**2 / 3.0
-"""Variance of an unknown heading."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from .angles import wrap
 
 Ints = NDArray[np.int64]
+# Index that stands for no place, no option or no landmark.
 NONE: Final = -1
-"""Index that stands for no place, no option or no landmark."""
 PLACES, OPTIONS = 0, 1
 _ROOM: Final = 64
 
@@ -33,12 +33,12 @@ class Strategy(IntEnum):
     HYBRID = 2
 
 
+# Strategies by their names in a study's settings.
 STRATEGIES: Final = {
     "straight to goal": Strategy.STRAIGHT,
     "landmark to landmark": Strategy.LANDMARKS,
     "hybrid": Strategy.HYBRID,
 }
-"""Strategies by their names in a study's settings."""
 _LANDMARKS: Final = int(Strategy.LANDMARKS)
 _HYBRID: Final = int(Strategy.HYBRID)
 

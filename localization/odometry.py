@@ -30,8 +30,8 @@ TurnKind: TypeAlias = Literal["yaw rate", "steering"]
 BY_YAW_RATE: Final = 0
 BY_STEERING: Final = 1
 BY_WHEELS: Final = 2
+# Turn source of a gap between two time segments, without odometry.
 BY_NOTHING: Final = 3
-"""Turn source of a gap between two time segments, without odometry."""
 
 _POSITIVE: Final = (
     "track_width_m",

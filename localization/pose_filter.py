@@ -21,8 +21,8 @@ from .angles import wrap
 
 HEADING: Final = 2
 SPEED: Final = 3
+# Angle below which ``arc`` uses series, which are exact to rounding there.
 SMALL_RAD: Final = 1e-2
-"""Angle below which ``arc`` uses series, which are exact to rounding there."""
 
 
 class State(NamedTuple):

@@ -27,11 +27,11 @@ from .pose_track import Headings
 if TYPE_CHECKING:
     import gtsam
 
+# Maximum time between two poses of the graph.
 STEP_NS: Final = 1_000_000_000
-"""Maximum time between two poses of the graph."""
+# Variance added to make the covariance of an arc, which has no sideways error, invertible: 3 mm and
+# 0.1 mrad.
 _MIN_VARIANCE: Final = np.diag([1e-5, 1e-5, 1e-8])
-"""Variance added to make the covariance of an arc, which has no sideways error, invertible: 3 mm
-and 0.1 mrad."""
 RELATIVE_TOLERANCE: Final = 1e-10
 ABSOLUTE_TOLERANCE: Final = 1e-6
 _AT_REST: Final = State(*(0.0,) * len(State._fields))

@@ -13,10 +13,10 @@ from .fixes import Fixes
 from .odometry import Increments
 from .pose_filter import State
 
+# Duration of the start of the drive that is used.
 START_S: Final = 15.0
-"""Duration of the start of the drive that is used."""
+# Time over which positions count as one observation, because GNSS errors persist.
 INDEPENDENT_S: Final = 1.0
-"""Time over which positions count as one observation, because GNSS errors persist."""
 
 
 class Path(NamedTuple):

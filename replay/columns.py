@@ -24,17 +24,17 @@ Bytes: TypeAlias = NDArray[np.uint8]
 Floats: TypeAlias = NDArray[np.float64]
 Flag = TypeVar("Flag", np.bool_, np.uint8)
 
+# Maximum number of rows in one block; with ``BLOCK_BYTES`` this bounds memory.
 BLOCK_ROWS: Final = 65_536
-"""Maximum number of rows in one block; with ``BLOCK_BYTES`` this bounds memory."""
+# Target for the maximum payload bytes in one block, unless one message is larger.
 BLOCK_BYTES: Final = 8 << 20
-"""Target for the maximum payload bytes in one block, unless one message is larger."""
 
 DATA: Final = 0
 REMOTE: Final = 1
 ERROR: Final = 2
 
+# ``CanFrames.length`` where the log does not store it; the bytes are then padded with zeros.
 LENGTH_UNKNOWN: Final = 255
-"""``CanFrames.length`` where the log does not store it; the bytes are then padded with zeros."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,8 +26,8 @@ work; they issue a ``LossWarning``.
 import re
 from typing import Final
 
+# Schemes in which the part before the ``@`` names a container.
 _CONTAINER: Final = ("abfs", "abfss", "az", "wasb", "wasbs")
-"""Schemes in which the part before the ``@`` names a container."""
 # Path("http://...") has only one slash.
 _URL: Final = re.compile(r"\b([a-z][a-z0-9+.-]{1,30}):(/+)(\S+)", re.IGNORECASE)
 _HOST: Final = re.compile(r"\[[0-9a-f:.%]*\](:\d*)?|arn:[^@]*|[^:@]*(:\d*)?", re.IGNORECASE)

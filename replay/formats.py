@@ -49,6 +49,7 @@ class DataSet:
     truth: str
 
 
+# Folders are matched in this order, so data sets come before folders of images.
 FORMATS: Final[dict[str, Format]] = {
     "mcap": Format((".mcap",), (), "crosscue.replay.readers.mcap.reader:open_mcap", "MCAP"),
     "rosbag1": Format(
@@ -122,7 +123,6 @@ FORMATS: Final[dict[str, Format]] = {
         "folder of images with a time file",
     ),
 }
-"""Folders are matched in this order, so data sets come before folders of images."""
 
 
 def known_formats() -> dict[str, Format]:

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from .errors import AccountError, LossWarning
 
+# Maximum number of skips and losses stored with their details; counts stay exact beyond it.
 DETAILS_KEPT: Final = 1000
-"""Maximum number of skips and losses stored with their details; counts stay exact beyond it."""
 
 NOT_ASKED_TIME: Final = "outside --from/--to"
 NOT_ASKED_TOPIC: Final = "topic not selected"
@@ -50,8 +50,8 @@ class RowsOfTopic(Protocol):
     def __len__(self) -> int: ...
 
 
+# Min rows of a topic whose log times all decrease to report it.
 REVERSED_ROWS: Final = 3
-"""Min rows of a topic whose log times all decrease to report it."""
 _LATEST_NS: Final = (1 << 63) - 1
 B = TypeVar("B", bound=RowsOfTopic)
 

@@ -67,5 +67,5 @@ def limits_of(
     return replace(DEFAULT_LIMITS, chunk_bytes=max_chunk_bytes, follow_links=follow_links)
 
 
+# Limits, as a parameter of a verb.
 LimitsGiven: TypeAlias = Annotated[Limits, Option(made_by=limits_of)]
-"""Limits, as a parameter of a verb."""

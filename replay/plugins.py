@@ -19,13 +19,13 @@ from typing import Final, Literal, TypeVar
 Kind = Literal["detector", "cue", "reader", "dataset"]
 T = TypeVar("T")
 
+# Entry point groups by kind of plug-in.
 GROUPS: Final[dict[Kind, str]] = {
     "detector": "crosscue.detectors",
     "cue": "crosscue.cues",
     "reader": "crosscue.readers",
     "dataset": "crosscue.datasets",
 }
-"""Entry point groups by kind of plug-in."""
 
 
 class PluginWarning(UserWarning):

@@ -27,10 +27,10 @@ from .losses import warn_again, with_losses
 
 T = TypeVar("T")
 R = TypeVar("R")
+# Time for a stopped worker to remove its incomplete files, seconds.
 GRACE_S: Final = 5.0
-"""Time for a stopped worker to remove its incomplete files, seconds."""
+# Time between two checks whether the parent still lives, seconds.
 PARENT_S: Final = 0.2
-"""Time between two checks whether the parent still lives, seconds."""
 
 
 def in_processes(work: Callable[[T], R], things: Sequence[T], workers: int) -> Iterator[R]:

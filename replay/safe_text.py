@@ -7,8 +7,8 @@ import unicodedata
 from collections.abc import Iterator, Sequence
 from typing import Final
 
+# Unicode categories that are invisible, reorder text, or drive a terminal.
 _HARMFUL: Final = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
-"""Unicode categories that are invisible, reorder text, or drive a terminal."""
 _NARROWEST: Final = 8
 _CUT: Final = "~"
 

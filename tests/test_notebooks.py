@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
+# Notebooks that do not use the toolkit.
 SELF_CONTAINED = {"variable_recruitment"}
-"""Notebooks that do not use the toolkit."""
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 
 

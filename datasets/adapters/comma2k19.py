@@ -41,8 +41,8 @@ STEP_NS: Final = 1_000_000_000
 LATEST_NS: Final = 1 << 62
 NO_TIME: Final = -(1 << 63)
 MICROTESLA: Final = 1e-6
+# Signs that convert [forward, right, down] to [forward, left, up].
 FLIP: Final = np.array([1.0, -1.0, -1.0])
-"""Signs that convert [forward, right, down] to [forward, left, up]."""
 
 Values = NDArray[np.generic]
 

@@ -17,8 +17,8 @@ from .npy import read_column
 
 POSE_FILE: Final = "pose.tum"
 
+# Upper bound on times of recordings, in seconds since 1970 or since the start.
 LATEST_S: Final = 9e9
-"""Upper bound on times of recordings, in seconds since 1970 or since the start."""
 
 
 def write(path: Path, folder: Path) -> Path:

@@ -54,18 +54,18 @@ from .kitti_odometry import BOX, SETUP, projection
 from .kitti_oxts import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse
 
 POSE_FILE: Final = "pose.tum"
+# Default period of frames, if positions and speeds do not determine it.
 TRACKING_PERIOD_NS: Final = 100_000_000
-"""Default period of frames, if positions and speeds do not determine it."""
 PERIOD_STEP_S: Final = 1e-4
+# Max relative difference between the period and the published 10 Hz; more means damage.
 MAX_PERIOD_ERROR: Final = 0.2
-"""Max relative difference between the period and the published 10 Hz; more means damage."""
 ROWS_PER_BLOCK: Final = 100
 FRAMES_FOR_PERIOD: Final = 10_000
+# Topic, reason, count and detail of a stream that cannot be read.
 Unreadable: TypeAlias = tuple[str, str, int | None, str]
-"""Topic, reason, count and detail of a stream that cannot be read."""
 
+# Position, time and bytes of a packet; a string in place of bytes is the reason for their loss.
 Line: TypeAlias = tuple[str, int, bytes | str]
-"""Position, time and bytes of a packet; a string in place of bytes is the reason for their loss."""
 
 TOPICS: Final[dict[str, tuple[str, Callable[[Packets], Table]]]] = {
     "oxts/imu": ("sensor_msgs/msg/Imu", lambda packets: packets.table(IMU)),

@@ -18,6 +18,7 @@ from crosscue.replay.files.image_header import size_in_header
 
 MAX_FILE_BYTES: Final = 64 * MIB
 HEADER_BYTES: Final = 4096
+# COCO's names by class of the data set; a cyclist's box contains person and bicycle.
 LABELS: Final = {
     "Car": "car",
     "Van": "car",
@@ -28,11 +29,10 @@ LABELS: Final = {
     "Person_sitting": "person",
     "Cyclist": "cyclist",
 }
-"""COCO's names by class of the data set; a cyclist's box contains person and bicycle."""
+# Classes that are neither missed nor false in unlabelled regions.
 UNLABELLED: Final = ("car", "person")
-"""Classes that are neither missed nor false in unlabelled regions."""
+# Visible fraction by the data set's level of occlusion: none, partly, largely.
 VISIBLE: Final = {0: 1.0, 1: 0.7, 2: 0.3}
-"""Visible fraction by the data set's level of occlusion: none, partly, largely."""
 
 
 class Labelled(NamedTuple):

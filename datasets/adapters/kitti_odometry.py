@@ -48,10 +48,10 @@ SETUP: Final = (
     "Geiger, Lenz, Stiller, Urtasun, Vision meets Robotics: The KITTI Dataset (IJRR 2013), figure "
     "of the sensors' places on the car"
 )
+# Mounting of the GNSS/INS box; its yaw is the vehicle's, as defined in ``dataformat.txt``.
 BOX: Final = Mounting(x_m=-0.05, y_m=0.32, z_m=0.93, roll_rad=None, pitch_rad=None)
-"""Mounting of the GNSS/INS box; its yaw is the vehicle's, as defined in ``dataformat.txt``."""
+# Rotation from right, down, ahead to ahead, left, up.
 AXES: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Rotation from right, down, ahead to ahead, left, up."""
 
 
 class Poses(NamedTuple):

@@ -40,11 +40,11 @@ from crosscue.replay.seal.touched import Touched
 
 from .nuscenes_tables import Row, RowsOf, checked, whole_table
 
+# Wheel radius of the Renault Zoe, from nuscenes-devkit, can_bus_tutorial.ipynb ("Known Zoe wheel
+# radius in meters"). An unloaded 195/55 R16 tyre has 0.3105 m, 2 % more than this loaded tyre. An
+# earlier edition has 0.328, which is 8 % faster; ``crosscue fit odometry`` fits the scale of a
+# drive.
 WHEEL_RADIUS_M: Final = 0.305
-"""Wheel radius of the Renault Zoe, from nuscenes-devkit, can_bus_tutorial.ipynb ("Known Zoe wheel
-radius in meters"). An unloaded 195/55 R16 tyre has 0.3105 m, 2 % more than this loaded tyre. An
-earlier edition has 0.328, which is 8 % faster; ``crosscue fit odometry`` fits the scale of a
-drive."""
 RPM_TO_MPS: Final = WHEEL_RADIUS_M * 2.0 * math.pi / 60.0
 DAMAGED_ROW: Final = "a damaged row"
 FRONT: Final = "CAM_FRONT"

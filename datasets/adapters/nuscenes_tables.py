@@ -14,8 +14,8 @@ from crosscue.replay.base import PIECE_BYTES, LogFormatError, visible
 
 Row: TypeAlias = Mapping[str, Any]
 
+# Max length of a row in characters, which bounds reading ahead; rows have a few hundred.
 MAX_ROW_CHARS: Final = 64 * 1024
-"""Max length of a row in characters, which bounds reading ahead; rows have a few hundred."""
 _BETWEEN: Final = " \t\r\n,[]\ufeff"
 
 

@@ -24,6 +24,7 @@ from .nuscenes import FRONT, SceneTables, ego_poses, find_scene, matrix_of, numb
 from .nuscenes_tables import Row, RowsOf, checked, whole_table
 
 POSE_FILE: Final = "pose.tum"
+# COCO's names by prefix of a category; other categories keep their names.
 LABELS: Final = (
     ("vehicle.car", "car"),
     ("vehicle.truck", "truck"),
@@ -34,7 +35,6 @@ LABELS: Final = (
     ("vehicle.bicycle", "bicycle"),
     ("human.pedestrian", "person"),
 )
-"""COCO's names by prefix of a category; other categories keep their names."""
 VISIBLE: Final = {"1": 0.2, "2": 0.5, "3": 0.7, "4": 0.9}
 NEAREST_M: Final = 0.5
 

@@ -37,8 +37,8 @@ from crosscue.replay.seal.touched import Touched
 MAX_FILE_BYTES: Final = 256 * MIB
 MILE_H_MPS: Final = 0.44704
 MICROTESLA: Final = 1e-6
+# Quarter of an hour; time zones differ from UTC by multiples of it.
 QUARTER_HOUR_S: Final = 900.0
-"""Quarter of an hour; time zones differ from UTC by multiples of it."""
 DAMAGED: Final = "a line that cannot be parsed"
 GRAVITY: Final = tuple(f"motionGravity{axis}(G)" for axis in "XYZ")
 GYRO: Final = tuple(f"gyroRotation{axis}(rad/s)" for axis in "XYZ")

@@ -33,22 +33,22 @@ from crosscue.replay.vehicle.vehicle import load
 
 FOLDER: Final = Path(__file__).parent / "pandaset_002"
 RANGES: Final = "ranges.csv"
+# Distance along the road from the camera in the first frame to the crosswalk's near edge.
 CROSSWALK_M: Final = 59.0
-"""Distance along the road from the camera in the first frame to the crosswalk's near edge."""
 FAR_KERB_M: Final = 79.0
+# Number of signals: two with a green light, two with a red arrow. Three more are visible from
+# behind or the side.
 SIGNALS: Final = 4
-"""Number of signals: two with a green light, two with a red arrow. Three more are visible from
-behind or the side."""
 VEHICLES: Final = ("Car", "Pickup Truck", "Medium-sized Truck", "Bus")
 WIDTH_PX: Final = 1920
 GRID: Final = 10
+# Max distance of two boxes of one car; most cars have two boxes.
 BEHIND_M: Final = 3.0
-"""Max distance of two boxes of one car; most cars have two boxes."""
+# Max distance at which the direction of a vehicle is recognizable in these frames.
 REACH_M: Final = 110.0
-"""Max distance at which the direction of a vehicle is recognizable in these frames."""
 ALONG: Final = ("oncoming_cars", "outgoing_cars")
+# Min angle between road and heading of a vehicle across the road.
 ACROSS_DEG: Final = 45.0
-"""Min angle between road and heading of a vehicle across the road."""
 
 
 class Boxes:

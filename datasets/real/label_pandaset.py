@@ -34,8 +34,8 @@ LABELS: Final = {
 SIZE_PX: Final = (1920, 1080)
 REACH_M: Final = 60.0
 MIN_VISIBLE: Final = 0.5
+# Boxes nearer to the camera's plane are not projected.
 NEAR_M: Final = 1.0
-"""Boxes nearer to the camera's plane are not projected."""
 _COLUMNS: Final = ("frame", "label", "x_m", "y_m", "z_m", "width_m", "length_m", "height_m")
 _CORNERS: Final = np.array(
     [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]

@@ -15,8 +15,8 @@ from crosscue.datasets.scenes.rendering.mesh import Floats, Mesh, Rgb, disc, joi
 SKIRT_M: Final = 0.24
 GLASS: Final[Rgb] = (0.09, 0.11, 0.13)
 TYRE: Final[Rgb] = (0.05, 0.05, 0.055)
+# Offset of painted details from a side, which avoids depth ties.
 TILL_SHUT_M: Final = 0.012
-"""Offset of painted details from a side, which avoids depth ties."""
 
 
 @dataclass(frozen=True, slots=True)

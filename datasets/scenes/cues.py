@@ -13,8 +13,8 @@ from crosscue.replay.vehicle.cue_table import CUES
 from .layout import Layout
 from .world import Thing
 
+# Min size of a recognizable object.
 MIN_PIXELS: Final = 12
-"""Min size of a recognizable object."""
 PAST_REACH_M: Final = 110.0
 LANES_REACH_M: Final = 45.0
 
@@ -98,6 +98,7 @@ def _runs_on(layout: Layout, picture: Picture) -> bool:
     return layout.has_ahead and picture.view.rear_axle[0] > layout.end_m - LANES_REACH_M
 
 
+# Rules by cue; a cue of a plug-in without a rule is omitted from simulated truth.
 SIMULATED: Final[dict[str, Simulated]] = {
     "stop_sign": _sign("stop_sign"),
     "traffic_light": _sign("traffic_light"),
@@ -116,7 +117,6 @@ SIMULATED: Final[dict[str, Simulated]] = {
     "one_way_right": _sign("one_way_right"),
     "do_not_enter": _sign("do_not_enter"),
 }
-"""Rules by cue; a cue of a plug-in without a rule is omitted from simulated truth."""
 
 
 class CueRuns:

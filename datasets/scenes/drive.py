@@ -57,15 +57,15 @@ from .layout import Layout
 from .mobileye import Device
 from .world import World
 
+# File that identifies the drive of a folder.
 MADE_OF: Final = SIMULATED
-"""File that identifies the drive of a folder."""
 CAR_BUS: Final = "/can/car"
 MOBILEYE_BUS: Final = "/can/mobileye"
 IMAGES: Final = "/camera/image/compressed"
 CALIBRATION: Final = "/camera/camera_info"
 SOURCE: Final = "simulated by crosscue, exact"
+# Start of drives with sparse pictures, as the distance before the intersection.
 FROM_M: Final = 62.0
-"""Start of drives with sparse pictures, as the distance before the intersection."""
 SPACING_M: Final = 5.0
 SPACING_S: Final = 1.0
 TOPICS: Final = (
@@ -168,8 +168,8 @@ def sparse_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int
             yield t_ns, renderer.picture(t_s, number)
 
 
+# Few enough photographs to process a hundred layouts with networks.
 SPARSE_PHOTOGRAPHS: Final = Imager("sparse photographs 1", sparse_pictures, _photograph, "jpeg")
-"""Few enough photographs to process a hundred layouts with networks."""
 
 
 def write_scene(

@@ -35,10 +35,10 @@ LABELS: Final[dict[Category, str]] = {
     "one_way_right": "one way right",
     "do_not_enter": "do not enter",
 }
+# Time between two pictures while the vehicle moves.
 MOVING_NS: Final = 200_000_000
-"""Time between two pictures while the vehicle moves."""
+# Time between two pictures while the vehicle is stationary.
 STANDING_NS: Final = 400_000_000
-"""Time between two pictures while the vehicle is stationary."""
 STANDS_MPS: Final = 0.3
 ROAD, LEFT, RIGHT, AHEAD, FIRST_PATCH, FIRST_FALSE = 1, 2, 3, 4, 10, 200
 FALSE_SIZE_M: Final[dict[Category, float]] = {
@@ -347,6 +347,7 @@ def png(picture: Picture, _: PictureSettings) -> bytes:
     return bytes(cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
 
 
+# Faultless detector: exact masks of all objects that are visible by at least two thirds.
 NO_FAULTS: Final = Faults(
     sights=dict.fromkeys(LABELS, Sight(1.0, 1e-3)),
     height_sd_fraction=0.0,
@@ -361,7 +362,6 @@ NO_FAULTS: Final = Faults(
     false_road=0.0,
     false_roads=0.0,
 )
-"""Faultless detector: exact masks of all objects that are visible by at least two thirds."""
 
 
 def _perfect_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
@@ -369,9 +369,9 @@ def _perfect_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[i
     return label_pictures(clear, settings, NO_FAULTS)
 
 
+# Label images of the faultless detector, which show the best possible result of the rules.
 PERFECT_LABELS: Final = Imager("perfect labels 1", _perfect_pictures, png, "png", is_painted=False)
-"""Label images of the faultless detector, which show the best possible result of the rules."""
+# Label images with faults, which a drive's camera records instead of photographs.
 LABEL_IMAGES: Final = Imager("faulty labels 1", label_pictures, png, "png", is_painted=False)
-"""Label images with faults, which a drive's camera records instead of photographs."""
+# Detectors that read label images.
 DETECTORS: Final = "crosscue.detectors.label_images:objects,crosscue.detectors.label_images:road"
-"""Detectors that read label images."""

@@ -192,14 +192,15 @@ def any_layout(seed: int) -> Layout:
 
 
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+# Missing roads by kind; a bend has exactly one of the sides.
 WITHOUT: Final[Mapping[Kind, tuple[str, ...]]] = {
     "t_both": ("ahead",), "t_left": ("right",), "t_right": ("left",), "one_way_t": ("ahead",),
     "straight": ("left", "right"), "driveways": ("left", "right"), "lot": ("left", "right"),
     "curve": ("left", "right"),
 }  # fmt: skip
-"""Missing roads by kind; a bend has exactly one of the sides."""
 
 
+# Possible traffic controls by kind.
 CONTROLS: Final[Mapping[Kind, tuple[Control, ...]]] = {
     "crossing": ("stop_sign",), "light": ("traffic_light",), "open": ("none",),
     "t_both": ("stop_sign", "stop_sign", "none"), "t_left": ("stop_sign", "stop_sign", "none"),
@@ -207,7 +208,6 @@ CONTROLS: Final[Mapping[Kind, tuple[Control, ...]]] = {
     "one_way_t": ("stop_sign",), "straight": ("none",), "bend": ("none",), "driveways": ("none",),
     "lot": ("none",), "curve": ("none",),
 }  # fmt: skip
-"""Possible traffic controls by kind."""
 
 
 def mixed_kind(seed: int) -> Kind:

@@ -14,8 +14,8 @@ from crosscue.datasets.simulated.drive import RATE_HZ, START_NS, TrueMotion
 from .conditions import Conditions
 from .layout import NEAR_KERB_M, PARKING_LANE_M, Layout
 
+# Distance from rear axle to front bumper.
 FRONT_M: Final = 3.75
-"""Distance from rear axle to front bumper."""
 STEP_S: Final = 1.0 / RATE_HZ
 Turn = Literal["left", "right", "ahead"]
 

@@ -26,22 +26,22 @@ Int64s: TypeAlias = NDArray[np.int64]
 WHEELBASE_M: Final = 2.7
 TRACK_WIDTH_M: Final = 1.55
 STEERING_RATIO: Final = 15.0
+# Horizontal (towards magnetic north) and vertical (up) part of the Earth's field.
 FIELD_T: Final = np.array([20e-6, -43e-6])
-"""Horizontal (towards magnetic north) and vertical (up) part of the Earth's field."""
+# Files next to the log of a drive; some drives have fewer.
 FILES_OF_DRIVE: Final = ("vehicle.toml", "truth.json", "pose.tum", "objects.json", "ranges.csv")
-"""Files next to the log of a drive; some drives have fewer."""
 START_NS: Final = 1_700_000_000_000_000_000
 RATE_HZ: Final = 100
+# Relative standard deviation of a tyre's radius, which is constant during a drive.
 TYRE_SD: Final = 0.003
-"""Relative standard deviation of a tyre's radius, which is constant during a drive."""
+# Relative standard deviation of a wheel's speed, with a correlation time of ``SLIP_TIME_S``.
 SLIP_SD: Final = 0.004
-"""Relative standard deviation of a wheel's speed, with a correlation time of ``SLIP_TIME_S``."""
 SLIP_TIME_S: Final = 2.0
+# Standard deviation of a reading, without the bias.
 GYRO_SD_RADPS: Final = 0.004
-"""Standard deviation of a reading, without the bias."""
 START_SD_M: Final = 0.1
+# Standard deviation of a calibrated car's heading at the start of the drive.
 START_HEADING_SD_RAD: Final = 0.01
-"""Standard deviation of a calibrated car's heading at the start of the drive."""
 
 
 @dataclass(frozen=True, slots=True)

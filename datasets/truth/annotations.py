@@ -23,15 +23,15 @@ from crosscue.replay.vehicle.cue_table import CUES
 
 from .truth import CueTruth
 
+# Labels of objects on a road that are not cues by themselves.
 OTHER_THINGS: Final = frozenset(
     {"person", "pedestrian", "bicycle", "car", "motorcycle", "bus", "train", "truck", "van",
      "vehicle", "rider", "trailer"}
 )  # fmt: skip
-"""Labels of objects on a road that are not cues by themselves."""
+# Max distance of a box outside the picture; tools round differently.
 SLACK_PX: Final = 1.0
-"""Max distance of a box outside the picture; tools round differently."""
+# Max time between a picture and its frame, as a fraction of the time between frames.
 FAR: Final = 0.4
-"""Max time between a picture and its frame, as a fraction of the time between frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,8 +127,8 @@ class Placed:
     rule: str
 
 
+# Width and height by the name of a picture without suffix; ``*`` for all others.
 Sizes = Mapping[str, tuple[int, int]]
-"""Width and height by the name of a picture without suffix; ``*`` for all others."""
 
 
 def size_of(stem: str, sizes: Sizes, path: Path) -> tuple[int, int]:

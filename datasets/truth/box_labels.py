@@ -68,8 +68,8 @@ def meanings_of(
     return found
 
 
+# Class or cue of each label, as a parameter of a verb: on the command line, ``--map``.
 Meanings: TypeAlias = Annotated[Mapping[str, str], Option(made_by=meanings_of)]
-"""Class or cue of each label, as a parameter of a verb: on the command line, ``--map``."""
 
 
 @dataclass(frozen=True, slots=True)

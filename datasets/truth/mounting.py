@@ -11,17 +11,17 @@ from .truth import Mounting
 from .tum import Trajectory, heading_rad
 
 _TRAVEL_STEP_S: Final = 1.0
+# Min length of a step; over a shorter one, positions with centimetre errors do not determine the
+# course to half a degree.
 _TRAVEL_MIN_M: Final = 3.0
-"""Min length of a step; over a shorter one, positions with centimetre errors do not determine the
-course to half a degree."""
 _TRAVEL_MIN_STEPS: Final = 3
+# Min standard deviation of a step's course, from the vehicle's slip and the track's error.
 _TRAVEL_SD_RAD: Final = 0.005
-"""Min standard deviation of a step's course, from the vehicle's slip and the track's error."""
 _LEVER_M: Final = 1.0
+# Prior standard deviation of the lever: the body is between the rear axle and the windscreen.
 _LEVER_SD_M: Final = 1.5
-"""Prior standard deviation of the lever: the body is between the rear axle and the windscreen."""
+# Max standard deviation of the yaw that is accepted, 0.3 degrees.
 _TURNED_MAX_SD_RAD: Final = 0.005
-"""Max standard deviation of the yaw that is accepted, 0.3 degrees."""
 
 
 class TurnedBy(NamedTuple):

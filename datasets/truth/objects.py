@@ -11,6 +11,7 @@ from crosscue.replay.base import strict_json, write_text
 
 OBJECTS_FILE: Final = "objects.json"
 
+# COCO's category numbers; other labels are numbered from 200.
 COCO_IDS: Final = {
     "person": 1,
     "bicycle": 2,
@@ -20,7 +21,6 @@ COCO_IDS: Final = {
     "train": 7,
     "truck": 8,
 }
-"""COCO's category numbers; other labels are numbered from 200."""
 
 
 @dataclass(slots=True)

@@ -32,6 +32,7 @@ VERSION: Final = 1
 FILE: Final = "truth.json"
 MAX_BYTES: Final = 256 * MIB
 
+# Functions that write the truth of a data set, by format of ``replay.formats.FORMATS``.
 CARRIED: Final[dict[str, str]] = {
     "comma2k19": "crosscue.datasets.adapters.comma2k19_truth:write",
     "kitti-raw": "crosscue.datasets.adapters.kitti:write_truth",
@@ -39,7 +40,6 @@ CARRIED: Final[dict[str, str]] = {
     "nuscenes": "crosscue.datasets.adapters.nuscenes_truth:write",
     "pandaset": "crosscue.datasets.adapters.pandaset:write_truth",
 }
-"""Functions that write the truth of a data set, by format of ``replay.formats.FORMATS``."""
 
 
 class Section(BaseModel):

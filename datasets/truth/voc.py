@@ -16,8 +16,8 @@ from crosscue.replay.base import MIB, AnnotationError, read_at_most
 
 MAX_BYTES: Final = 16 * MIB
 MAX_DEPTH: Final = 16
+# Class; x0, y0, x1, y1 in pixels; True if it is marked difficult.
 VocBox: TypeAlias = tuple[str, tuple[float, float, float, float], bool]
-"""Class; x0, y0, x1, y1 in pixels; True if it is marked difficult."""
 
 
 def read_voc(path: Path) -> tuple[str, tuple[int, int] | None, list[VocBox]]:

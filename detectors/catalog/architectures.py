@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
+# Names of functions of ``torchvision.models.detection``.
 ArchitectureName = Literal[
     "maskrcnn_resnet50_fpn",
     "maskrcnn_resnet50_fpn_v2",
@@ -19,7 +20,6 @@ ArchitectureName = Literal[
     "ssd300_vgg16",
     "ssdlite320_mobilenet_v3_large",
 ]
-"""Names of functions of ``torchvision.models.detection``."""
 WEIGHTS_SUFFIXES: Final = (".pth", ".pt", ".safetensors")
 
 

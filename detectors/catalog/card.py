@@ -35,8 +35,8 @@ from crosscue.replay.vehicle.validation_errors import explain
 from .architectures import WEIGHTS_SUFFIXES, ArchitectureName
 from .class_scores import ClassScores
 
+# Maximum size of a weights file.
 MAX_BYTES: Final = 2048 * MIB
-"""Maximum size of a weights file."""
 MAX_CARD_BYTES: Final = 1 * MIB
 Side = Annotated[int, Field(gt=0, le=8192)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]

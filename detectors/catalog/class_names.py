@@ -17,8 +17,8 @@ COCO_80: Final = (
     "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors",
     "teddy bear", "hair drier", "toothbrush",
 )  # fmt: skip
+# Numbers below 91 that COCO's numbering of its 80 classes skips.
 _GAPS: Final = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
-"""Numbers below 91 that COCO's numbering of its 80 classes skips."""
 
 
 def _coco_90() -> tuple[str, ...]:
@@ -26,9 +26,10 @@ def _coco_90() -> tuple[str, ...]:
     return tuple(f"unused {n}" if n in _GAPS else next(names) for n in range(1, 91))
 
 
+# Class names by COCO's own numbers, which have gaps: number n is at index n - 1.
 COCO_90: Final = _coco_90()
-"""Class names by COCO's own numbers, which have gaps: number n is at index n - 1."""
 
+# Labels that the default cues count.
 CUE_LABELS: Final = (
     "stop sign",
     "traffic light",
@@ -39,7 +40,6 @@ CUE_LABELS: Final = (
     "one way right",
     "do not enter",
 )
-"""Labels that the default cues count."""
 
 _MEANINGS: Final = {
     "stop": "stop sign",

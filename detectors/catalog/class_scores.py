@@ -17,8 +17,8 @@ from pydantic import Field, model_validator
 
 from crosscue.detectors.settings import Proportion, Settings
 
+# Weight of the network's score in ``Isotonic``, so that no two scores become equal.
 ORDER: Final = 1e-6
-"""Weight of the network's score in ``Isotonic``, so that no two scores become equal."""
 
 
 class Platt(Settings):

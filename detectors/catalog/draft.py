@@ -19,13 +19,11 @@ from .segmentation import drivable
 
 _LINE: Final = 100
 _DECODE: Final = 'decode = "full"  # as scripts around networks do; "reduced" is faster'
+# Number of classes for which a pose export without metadata is taken. Its columns are a box, a
+# score (in YOLOv7 also a class) and 17 points with x, y and visibility.
 _POSE_CLASSES: Final[Mapping[object, int]] = {"yolov5": 52, "yolov8": 52}
-"""Number of classes for which a pose export without metadata is taken.
-
-Its columns are a box, a score (in YOLOv7 also a class) and 17 points with x, y and visibility.
-"""
+# Names of a background class, which no detection has.
 _NOTHING: Final = ("background", "bg")
-"""Names of a background class, which no detection has."""
 
 
 @dataclass(frozen=True, slots=True)

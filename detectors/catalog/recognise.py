@@ -33,23 +33,21 @@ from .architectures import WEIGHTS_SUFFIXES
 from .card import MAX_BYTES, Input
 from .segmentation import recognise_segmentation
 
+# Maximum number of brackets in metadata; parsing more is slow.
 _MAX_NAMES_CHARACTERS: Final = 100_000
-"""Maximum number of brackets in metadata; parsing more is slow."""
+# Default side of a network's input, where the file declares no size.
 DEFAULT_SIDE_PX: Final = 640
-"""Default side of a network's input, where the file declares no size."""
+# Maximum number of values of one input: the largest picture that a card may specify.
 MAX_INPUT_VALUES: Final = 3 * 8192 * 8192
-"""Maximum number of values of one input: the largest picture that a card may specify."""
+# Number of classes to assume where the shapes do not determine it.
 _MANY_CLASSES: Final = 10_000
-"""Number of classes to assume where the shapes do not determine it."""
+# ONNX's numbers of int32 and int64.
 _ONNX_INTEGERS: Final = frozenset((6, 7))
-"""ONNX's numbers of int32 and int64."""
+# Minimum spread of candidates, as a fraction of the input's sides. If the layout is correct, the
+# candidates of all cells are spread over the whole picture.
 SPREAD_FRACTION: Final = 0.5
-"""Minimum spread of candidates, as a fraction of the input's sides.
-
-If the layout is correct, the candidates of all cells are spread over the whole picture.
-"""
+# Path of the class names in an OpenVINO file, with underscores for spaces.
 _LABELS: Final = ["model_info", "labels"]
-"""Path of the class names in an OpenVINO file, with underscores for spaces."""
 _REFUSED: Final = {
     ".pkl": "a pickle runs code when it is read; export it to ONNX",
     ".torchscript": "a TorchScript archive carries code; export it to ONNX",

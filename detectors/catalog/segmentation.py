@@ -8,14 +8,14 @@ from typing import Final
 from crosscue.detectors.decoders.base import Guess, Interface, Tensor, static
 
 _MAX_CLASSES: Final = 256
+# Maximum size of an output's pixel, in pixels of the input.
 _COARSEST: Final = 8
-"""Maximum size of an output's pixel, in pixels of the input."""
+# Usual name of the input of networks from Caffe, as those of Open Model Zoo.
 _CAFFE_INPUT: Final = "data"
-"""Usual name of the input of networks from Caffe, as those of Open Model Zoo."""
+# Names of drivable classes, without blanks and underscores.
 _DRIVABLE: Final = frozenset(
     {"road", "mark", "roadmark", "marking", "lanemarking", "drivable", "drivablearea", "lane"}
 )
-"""Names of drivable classes, without blanks and underscores."""
 
 
 def recognise_segmentation(model: Interface) -> Guess | None:

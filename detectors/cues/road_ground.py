@@ -30,14 +30,14 @@ from crosscue.replay.vehicle.vehicle import Camera, Regions
 
 from .observed import NOT_SEEN, Place, RoadFractions
 
+# Fraction of the intersection's depth that is left out at either end.
 MARGIN: Final = 0.25
-"""Fraction of the intersection's depth that is left out at either end."""
 MIN_IN_PICTURE: Final = 0.25
+# Distance ahead of the camera below which nothing is projected.
 NEAREST_M: Final = 1.0
-"""Distance ahead of the camera below which nothing is projected."""
 
+# Minimum and maximum distance ahead of the rear axle, then to its left, in metres.
 Rectangle: TypeAlias = tuple[float, float, float, float]
-"""Minimum and maximum distance ahead of the rear axle, then to its left, in metres."""
 
 
 def ground_fractions(

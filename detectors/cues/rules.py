@@ -9,8 +9,8 @@ from typing import Any, TypeAlias, cast
 
 from crosscue.replay.vehicle.vehicle import CUES, CueSpec, Input
 
+# Function of input, settings and the cue's row that returns a count; None if unknown.
 Rule: TypeAlias = Callable[[Any, Any, CueSpec], int | None]
-"""Function of input, settings and the cue's row that returns a count; None if unknown."""
 
 
 @lru_cache(maxsize=256)

@@ -17,16 +17,16 @@ Floats: TypeAlias = NDArray[np.float64]
 Int64s: TypeAlias = NDArray[np.int64]
 
 Array: TypeAlias = NDArray[np.generic]
+# Raw outputs by name, for one picture; the batch axis has length 1.
 Outputs: TypeAlias = Mapping[str, Array]
-"""Raw outputs by name, for one picture; the batch axis has length 1."""
+# Width and height in pixels.
 Size: TypeAlias = tuple[int, int]
-"""Width and height in pixels."""
 
 
+# Minimum score of a detection, where nothing else was fitted or asked for.
 DEFAULT_SCORE: Final = 0.3
-"""Minimum score of a detection, where nothing else was fitted or asked for."""
+# Default intersection over union above which two boxes are of one object.
 DEFAULT_OVERLAP: Final = 0.45
-"""Default intersection over union above which two boxes are of one object."""
 
 
 class Masks(Protocol):
@@ -199,10 +199,10 @@ def static(shape: tuple[int | str | None, ...], axis: int) -> int | None:
     return size if isinstance(size, int) else None
 
 
+# Second input of RT-DETR, D-FINE and others: width and height to which boxes are scaled.
 PICTURE_SIZE_INPUT: Final = "orig_target_sizes"
-"""Second input of RT-DETR, D-FINE and others: width and height to which boxes are scaled."""
+# Strides of the grids of YOLO networks and of YOLOX.
 GRID_STRIDES: Final = (8, 16, 32)
-"""Strides of the grids of YOLO networks and of YOLOX."""
 
 
 def cell_count(size_px: Size, strides: Sequence[int], *, round_up: bool = False) -> int:

@@ -30,13 +30,13 @@ _MAX_QUERIES: Final = 1000
 _SELECTED_COLUMNS: Final = 6
 _COCO_COLUMNS_OF_DETR: Final = 92
 _RF_DETR_NAMES: Final = ("dets", "labels")
+# Input of networks trained from ImageNet's weights: mean and scale of red, green and blue.
 _IMAGENET: Final = {
     "mean": tuple(255 * mean for mean in (0.485, 0.456, 0.406)),
     "scale": tuple(1 / (255 * deviation) for deviation in (0.229, 0.224, 0.225)),
 }
-"""Input of networks trained from ImageNet's weights: mean and scale of red, green and blue."""
+# Name of RT-DETR's head in the metadata of Ultralytics' exports, since 8.4.
 ULTRALYTICS_HEAD: Final = "RTDETRDecoder"
-"""Name of RT-DETR's head in the metadata of Ultralytics' exports, since 8.4."""
 
 
 class DetrOutput(BoxOutput):

@@ -8,18 +8,18 @@ import numpy as np
 
 from .base import Candidates, Floats, Size
 
+# Minimum fraction of boxes with a sensible size if the layout is correct.
 SENSIBLE_FRACTION: Final = 0.99
-"""Minimum fraction of boxes with a sensible size if the layout is correct."""
+# Minimum fraction of boxes that touch the picture if the layout is correct.
 INSIDE_FRACTION: Final = 0.9
-"""Minimum fraction of boxes that touch the picture if the layout is correct."""
+# Number of detections in one picture that are suspicious if they are all alike.
 _MANY: Final = 100
-"""Number of detections in one picture that are suspicious if they are all alike."""
+# Minimum number of boxes to judge by where they are.
 _FEW: Final = 10
-"""Minimum number of boxes to judge by where they are."""
+# Fraction of the picture that a box of the whole picture covers at least.
 _WHOLE: Final = 0.9
-"""Fraction of the picture that a box of the whole picture covers at least."""
+# Boxes that all end before this are fractions of the picture, taken for pixels.
 _CORNER_PX: Final = 2.0
-"""Boxes that all end before this are fractions of the picture, taken for pixels."""
 
 
 def oddity(found: Candidates, size_px: Size, score: float) -> str | None:

@@ -28,5 +28,5 @@ AnyBoxOutput: TypeAlias = (
     | DetectionOutput
 )
 
+# Decoders, in the order in which ``crosscue model init`` lists candidates.
 DECODERS: Final[tuple[type[BoxOutput], ...]] = get_args(AnyBoxOutput)
-"""Decoders, in the order in which ``crosscue model init`` lists candidates."""

@@ -24,8 +24,8 @@ from .base import (
     static,
 )
 
+# Size to which torchvision's networks scale a picture, so that none is scaled twice.
 _USUAL_SIZE_PX: Final = (1333, 800)
-"""Size to which torchvision's networks scale a picture, so that none is scaled twice."""
 
 
 class TorchvisionOutput(BoxOutput):

@@ -23,8 +23,8 @@ CLASSES: Final = (
     "car", "stop sign", "traffic light", "one way left", "one way right", "do not enter",
 )  # fmt: skip
 ROAD_BIT: Final = 128
+# Maximum number of objects in one picture, limited by the values of green.
 MAX_OBJECTS: Final = 255
-"""Maximum number of objects in one picture, limited by the values of green."""
 
 
 class LabelledObject(NamedTuple):

@@ -25,8 +25,8 @@ from .openvino import import_openvino
 from .weights import Weights
 
 Array = NDArray[np.generic]
+# Encoded protobuf key of a tensor that is stored in another file.
 _EXTERNAL: Final = b"\x0a\x08location"
-"""Encoded protobuf key of a tensor that is stored in another file."""
 
 
 class Network(Protocol):
@@ -192,12 +192,12 @@ def _output_name(output: Any, index: int) -> str:
     return str(names[0]) if names else f"output{index}"
 
 
+# Back ends by suffix of the weights, the preferred one first.
 BACKENDS: Final[Mapping[str, tuple[str, ...]]] = {
     ".onnx": ("onnxruntime", "opencv", "openvino"),
     ".xml": ("openvino",),
     ".tflite": ("litert",),
 }
-"""Back ends by suffix of the weights, the preferred one first."""
 _PACKAGE: Final = {
     "onnxruntime": "onnxruntime",
     "opencv": "cv2",

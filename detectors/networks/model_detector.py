@@ -26,8 +26,8 @@ from .box_model import BoxModel
 from .picture_input import Placement, prepared, view_of
 from .weights import Weights
 
+# Incremented when the same pixels, card and settings yield different numbers than before.
 VERSION: Final = 2
-"""Incremented when the same pixels, card and settings yield different numbers than before."""
 
 
 class ModelSettings(Settings):

@@ -12,8 +12,8 @@ from typing import Final, TypeAlias
 Field: TypeAlias = tuple[int, int | memoryview]
 _GRAPH, _INITIALIZER, _INITIALIZER_NAME, _INPUT = 7, 5, 8, 11
 _NAME, _TYPE, _TENSOR, _SHAPE, _DIMENSION, _VALUE = 1, 2, 1, 2, 1, 1
+# Number of bytes of the wire types with a fixed length.
 _FIXED: Final = {1: 8, 5: 4}
-"""Number of bytes of the wire types with a fixed length."""
 
 
 def input_shape(content: bytes) -> tuple[int | None, ...] | None:

@@ -9,8 +9,8 @@ from crosscue.detectors.catalog.card import Tiles
 from crosscue.detectors.decoders.base import Size
 
 Corner = tuple[int, int]
+# Distance to a tile's inner edge within which a box counts as cut off.
 EDGE_PX = 2.0
-"""Distance to a tile's inner edge within which a box counts as cut off."""
 
 
 def corners(picture: Size, tile: Size, tiles: Tiles) -> list[Corner]:

@@ -25,8 +25,8 @@ from crosscue.replay.errors import VehicleError, one_line
 
 from .weights import Weights
 
+# Suffix of training counters: missing if normalisation is frozen, and unused in detection.
 _COUNTER: Final = "num_batches_tracked"
-"""Suffix of training counters: missing if normalisation is frozen, and unused in detection."""
 _NESTED: Final = ("model", "state_dict", "model_state_dict", "weights")
 _PREFIXES: Final = ("module.", "model.", "_orig_mod.")
 
@@ -81,8 +81,8 @@ def read_state_dict(content: bytes, where: str) -> StateDict:
 _SAVE: Final = "save tensors only: torch.save(model.state_dict(), FILE)"
 _SAVE_OR_EXPORT: Final = f"{_SAVE}, or export the network to ONNX"
 _EXPORT: Final = "export the network to ONNX with the project that wrote it"
+# Packages of networks that are not torchvision's, so that their tensors alone are of no use.
 _PROJECTS: Final = frozenset({"models", "ultralytics", "yolox", "super_gradients", "transformers"})
-"""Packages of networks that are not torchvision's, so that their tensors alone are of no use."""
 
 
 def _safetensors(content: bytes, where: str) -> Mapping[str, Tensor]:

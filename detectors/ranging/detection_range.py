@@ -20,9 +20,8 @@ from .height_to_range import range_of
 from .standard_sizes import VEHICLES, size_of
 from .vehicle_range import GroundCamera, OneRange, size_range, vehicle_range
 
+# Distance to the picture's edge within which a box counts as cut, so that its height is unusable.
 BORDER_PX: Final = 2.0
-"""Distance to the picture's edge within which a box counts as cut, so that its height is unusable.
-"""
 
 
 def detection_range(

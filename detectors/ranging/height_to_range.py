@@ -57,19 +57,16 @@ class RangeFit:
     outliers: int = 0
 
 
+# Number of scales from the curve beyond which a pair is an outlier. It must be beyond both in
+# metres and relative to the range, because it is unknown whether errors grow with the range. Scales
+# are median absolute deviations, which ten per cent of bad pairs hardly change.
 OUTLIER_SIGMAS: Final = 5.0
-"""Number of scales from the curve beyond which a pair is an outlier.
-
-It must be beyond both in metres and relative to the range, because it is unknown whether errors
-grow with the range. Scales are median absolute deviations, which ten per cent of bad pairs hardly
-change.
-"""
+# Relative distance from the curve below which no pair is an outlier, for pairs without errors.
 MIN_OUTLIER: Final = 0.02
-"""Relative distance from the curve below which no pair is an outlier, for pairs without errors."""
+# Relative residual above which pairs have less weight in the first fit.
 SOFT_FRACTION: Final = 0.05
-"""Relative residual above which pairs have less weight in the first fit."""
+# Maximum number of rounds of fitting and removing outliers; two or three usually suffice.
 ROUNDS: Final = 10
-"""Maximum number of rounds of fitting and removing outliers; two or three usually suffice."""
 
 
 def range_of(height_px: Floats, curve: RangeCurve) -> Floats:

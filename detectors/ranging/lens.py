@@ -19,30 +19,30 @@ from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections, Frame
 
+# Version of the rule; cached results of other versions are not used.
 VERSION: Final = 1
-"""Version of the rule; cached results of other versions are not used."""
 Lens = Literal["red", "yellow", "green", "dark", "unknown"]
 MIN_WIDTH_PX: Final = 6.0
+# Height below which a box is too small: its lens, a third of it, is under five pixels.
 MIN_HEIGHT_PX: Final = 14.0
-"""Height below which a box is too small: its lens, a third of it, is under five pixels."""
 MIN_SATURATION: Final = 90
+# Minimum saturation and value, of 255. Sunlit walls and sky are pale, housings are dark.
 MIN_VALUE: Final = 120
-"""Minimum saturation and value, of 255. Sunlit walls and sky are pale, housings are dark."""
+# Hues in OpenCV's half degrees; signal green is bluish (CIE S 004), and more so in cameras.
 HUES: Final[Mapping[Lens, tuple[tuple[int, int], ...]]] = {
     "red": ((0, 10), (160, 179)),
     "yellow": ((11, 34),),
     "green": ((45, 105),),
 }
-"""Hues in OpenCV's half degrees; signal green is bluish (CIE S 004), and more so in cameras."""
+# Bounds of the spot's diameter over the box's width: 0.30 m of 0.35 m without a backplate and of
+# 0.60 m with one, with a margin for glare and blur.
 LENS_PER_WIDTH: Final = (0.2, 1.0)
-"""Bounds of the spot's diameter over the box's width: 0.30 m of 0.35 m without a backplate and of
-0.60 m with one, with a margin for glare and blur."""
+# Minimum fraction of the spot's bounding box that it fills (a disc: 0.79).
 MIN_ROUND: Final = 0.5
-"""Minimum fraction of the spot's bounding box that it fills (a disc: 0.79)."""
+# Maximum ratio of the spot's longer to its shorter side.
 MAX_LONG: Final = 2.0
-"""Maximum ratio of the spot's longer to its shorter side."""
+# Fraction of the box's width that is left out on either side, as background.
 MARGIN: Final = 0.06
-"""Fraction of the box's width that is left out on either side, as background."""
 
 
 def lens_of(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Lens:

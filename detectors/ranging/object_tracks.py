@@ -23,42 +23,42 @@ from .lens import HUES
 from .range_from_motion import MotionRange, range_from_motion
 from .standard_sizes import BOX_SPREAD, SizePrior, size_of
 
+# Maximum distance of a box from a track's predicted box, in heights of the box: the car's pitch
+# shifts a distant object by about its own height, and lights are further apart.
 NEAR_HEIGHTS: Final = 1.0
-"""Maximum distance of a box from a track's predicted box, in heights of the box: the car's pitch
-shifts a distant object by about its own height, and lights are further apart."""
+# Maximum ratio of the heights of a box and a track's predicted box.
 GROWTH: Final = 1.5
-"""Maximum ratio of the heights of a box and a track's predicted box."""
+# Intersection over union above which a box is the same object as an assigned box.
 SAME_IOU: Final = 0.3
-"""Intersection over union above which a box is the same object as an assigned box."""
+# Distance travelled within which observations are merged to one, with their mean height.
 MERGE_M: Final = 0.2
-"""Distance travelled within which observations are merged to one, with their mean height."""
+# Maximum number of observations of a track; the newest, over 80 m or more, are kept.
 MAX_OBSERVATIONS: Final = 400
-"""Maximum number of observations of a track; the newest, over 80 m or more, are kept."""
 GONE_M: Final = 5.0
+# A track ends after this time (and the distance ``GONE_M``) without an observation.
 GONE_S: Final = 1.0
-"""A track ends after this time (and the distance ``GONE_M``) without an observation."""
 MIN_LIT: Final = 2
+# A light faces the car if a lens was lit in ``MIN_LIT`` frames and in this fraction of the frames
+# where the box was large enough. The fraction is low because lamps flicker, hoods hide them, and
+# the rule for one frame misses four in ten small or blurred lenses.
 MIN_LIT_FRACTION: Final = 0.15
-"""A light faces the car if a lens was lit in ``MIN_LIT`` frames and in this fraction of the frames
-where the box was large enough. The fraction is low because lamps flicker, hoods hide them, and the
-rule for one frame misses four in ten small or blurred lenses."""
 MIN_DARK: Final = 10
+# A light does not face the car if it was dark in ``MIN_DARK`` frames and lit in at most this
+# fraction.
 MAX_LIT_FRACTION: Final = 0.05
-"""A light does not face the car if it was dark in ``MIN_DARK`` frames and lit in at most this
-fraction."""
+# Relative spread of the heights of lights at one intersection, which are mostly of one make. It
+# includes the errors of the boxes and is much less than the spread of standard sizes.
 SAME_MAKE: Final = 0.06
-"""Relative spread of the heights of lights at one intersection, which are mostly of one make. It
-includes the errors of the boxes and is much less than the spread of standard sizes."""
+# Maximum ratio of the aspects (height over width) of two lights of one make.
 SAME_ASPECT: Final = 1.2
-"""Maximum ratio of the aspects (height over width) of two lights of one make."""
+# Maximum difference of the sizes by motion of two lights of one make, in standard deviations.
 OTHER_MAKE: Final = 2.0
-"""Maximum difference of the sizes by motion of two lights of one make, in standard deviations."""
+# Minimum information on the size by motion, as a fraction of that of the standard sizes.
 MIN_INFORMATION: Final = 0.25
-"""Minimum information on the size by motion, as a fraction of that of the standard sizes."""
+# Minimum number of frames of a light for it to inform the size of others.
 MIN_SEEN: Final = 5
-"""Minimum number of frames of a light for it to inform the size of others."""
+# Turn after which a track restarts, because range from motion assumes a straight path.
 STRAIGHT_RAD: Final = 0.15
-"""Turn after which a track restarts, because range from motion assumes a straight path."""
 
 
 class Facing(StrEnum):

@@ -76,11 +76,11 @@ class MotionRange:
 NEAREST_M: Final = 0.5
 FURTHEST_M: Final = 500.0
 GRID: Final = 101
+# Number of standard deviations beyond which an observation's weight decreases with the square of
+# its distance.
 OUTLIER: Final = 2.5
-"""Number of standard deviations beyond which an observation's weight decreases with the square of
-its distance."""
+# Number of rounds of reweighting; weights converge in three or four.
 ROUNDS: Final = 8
-"""Number of rounds of reweighting; weights converge in three or four."""
 
 
 def range_from_motion(

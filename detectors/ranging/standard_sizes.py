@@ -52,6 +52,8 @@ class Housing(NamedTuple):
     proportion: float
 
 
+# Kinds of signals by name. The proportions are assumed, because no count of signals is available:
+# new signals have at least three lenses of 0.30 m (MUTCD), with or without a backplate.
 HOUSINGS: Final[Mapping[str, Housing]] = {
     "3 lenses of 0.30 m": Housing(1.07, 0.35, 0.38),
     "3 lenses of 0.30 m, backplate": Housing(1.32, 0.61, 0.38),
@@ -61,26 +63,24 @@ HOUSINGS: Final[Mapping[str, Housing]] = {
     "4 lenses of 0.30 m, backplate": Housing(1.68, 0.61, 0.05),
     "2 lenses of 0.30 m": Housing(0.71, 0.35, 0.02),
 }
-"""Kinds of signals by name. The proportions are assumed, because no count of signals is available:
-new signals have at least three lenses of 0.30 m (MUTCD), with or without a backplate."""
+# Spread of a box's aspect (height over width) about its housing's, in logarithms.
 ASPECT_SPREAD: Final = 0.15
-"""Spread of a box's aspect (height over width) about its housing's, in logarithms."""
 OBLIQUE: Final = 0.10
+# Proportion of boxes without a characteristic aspect (seen from the side, with hoods, or cut), and
+# their span of log aspects.
 ANY_ASPECT: Final = 1.5
-"""Proportion of boxes without a characteristic aspect (seen from the side, with hoods, or cut), and
-their span of log aspects."""
+# Relative spread of a box's height about its object's.
 BOX_SPREAD: Final = 0.05
-"""Relative spread of a box's height about its object's."""
+# Stop signs are 0.75 m and 0.90 m across flats, rarely 0.60 m; errors of boxes are included.
 STOP_SIGN: Final = SizePrior(0.82, 0.13)
-"""Stop signs are 0.75 m and 0.90 m across flats, rarely 0.60 m; errors of boxes are included."""
+# Sizes of vehicles by COCO label. Cars are 1.45 m high, vans and SUVs 1.7 to 1.9 m, in about equal
+# numbers; detectors label both pick-ups of 1.9 m and lorries of 4 m as trucks. The spread includes
+# the errors of boxes.
 VEHICLES: Final[Mapping[str, SizePrior]] = {
     "car": SizePrior(1.65, 0.15),
     "truck": SizePrior(2.50, 0.35),
     "bus": SizePrior(3.10, 0.15),
 }
-"""Sizes of vehicles by COCO label. Cars are 1.45 m high, vans and SUVs 1.7 to 1.9 m, in about equal
-numbers; detectors label both pick-ups of 1.9 m and lorries of 4 m as trucks. The spread includes
-the errors of boxes."""
 
 
 def light_size(aspect: float | None = None) -> SizePrior:

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 POINTS: Final = 600
 MIN_POINTS: Final = 60
+# Minimum optical flow; below it, noise dominates.
 MIN_FLOW_PX: Final = 2.0
-"""Minimum optical flow; below it, noise dominates."""
 THERE_AND_BACK_PX: Final = 0.5
 OFF_LINE_PX: Final = 0.7
+# Minimum fraction of inliers: static points must outnumber moving ones.
 INLIERS: Final = 0.5
-"""Minimum fraction of inliers: static points must outnumber moving ones."""
 
 
 class Travel(NamedTuple):

@@ -17,15 +17,15 @@ from typing import Final, NamedTuple
 from .standard_sizes import SizePrior
 
 EDGE_PX: Final = 1.0
+# Standard deviation of a box's edge as a fraction of the box's height, added to ``EDGE_PX`` in
+# squares.
 EDGE_FRACTION: Final = 0.03
-"""Standard deviation of a box's edge as a fraction of the box's height, added to ``EDGE_PX`` in
-squares."""
+# Standard deviation by the overhang ahead of the wheels and by uneven roads.
 OVERHANG_M: Final = 0.5
-"""Standard deviation by the overhang ahead of the wheels and by uneven roads."""
+# Relative standard deviation of the camera's height, by load and suspension.
 CAMERA_HEIGHT_SD: Final = 0.05
-"""Relative standard deviation of the camera's height, by load and suspension."""
+# Minimum distance of a box's edge below the horizon, in standard deviations.
 MIN_SIGMAS: Final = 2.0
-"""Minimum distance of a box's edge below the horizon, in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,15 +22,15 @@ from .matching import Counts, Words, nearest, window_counts
 from .templates import AMERICAN, LABELS, Drawing, Kind, drawings
 
 VERSION: Final = 1
+# Maximum number of points of a drawing; more than any has.
 POINTS_DRAWN: Final = 500
-"""Maximum number of points of a drawing; more than any has."""
+# Minimum side of a pyramid level; ORB's border of 8 pixels and patch of 16 leave too little of a
+# smaller one.
 MIN_SIDE_PX: Final = 32
-"""Minimum side of a pyramid level; ORB's border of 8 pixels and patch of 16 leave too little of a
-smaller one."""
+# Side of the cells in which votes are counted.
 _CELL_PX: Final = 4
-"""Side of the cells in which votes are counted."""
+# Intersection over union above which two windows are the same sign.
 _SAME_SIGN: Final = 0.5
-"""Intersection over union above which two windows are the same sign."""
 
 
 class SignSettings(Settings):

@@ -17,8 +17,8 @@ Words = NDArray[np.uint64]
 Counts = NDArray[np.int32]
 _BITS_AT: Final = np.uint64(32)
 _PLACE: Final = np.uint64(0xFFFFFFFF)
+# A key without a match: more differing bits than a descriptor has.
 _NONE: Final = np.uint64(257 << 32)
-"""A key without a match: more differing bits than a descriptor has."""
 
 
 @njit(cache=True)

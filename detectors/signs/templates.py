@@ -19,13 +19,13 @@ from crosscue.replay.errors import UsageError
 Kind = Literal["one way left", "one way right", "do not enter", "no entry"]
 KINDS: Final[tuple[Kind, ...]] = ("one way left", "one way right", "do not enter", "no entry")
 AMERICAN: Final[tuple[Kind, ...]] = KINDS[:3]
+# Labels that differ from the kind; the international disc means the same as the American sign.
 LABELS: Final = {"no entry": "do not enter"}
-"""Labels that differ from the kind; the international disc means the same as the American sign."""
+# Width of the grey margin around a drawing, so that points at its edge have a neighbourhood.
 MARGIN_PX: Final = 12
-"""Width of the grey margin around a drawing, so that points at its edge have a neighbourhood."""
 _AROUND: Final = 140
+# Heights of the stored drawings: the default heights, and one to scale down to any other.
 FILES_PX: Final = (48, 64, 512)
-"""Heights of the stored drawings: the default heights, and one to scale down to any other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from crosscue.detectors import rle
 from crosscue.replay.base import AnnotationError, Int64s, SchemaError, json_tree, read_at_most
 
+# Maximum size of an annotation file.
 MAX_BYTES: Final = 2 << 30
-"""Maximum size of an annotation file."""
 MAX_SIDE_PX: Final = 32768
 
+# x0, y0, x1, y1.
 Box: TypeAlias = tuple[float, float, float, float]
-"""x0, y0, x1, y1."""
+# Compressed runs, or polygons as consecutive (x, y) pairs.
 Mask: TypeAlias = bytes | tuple[tuple[float, ...], ...]
-"""Compressed runs, or polygons as consecutive (x, y) pairs."""
 
 
 @dataclass(frozen=True, slots=True)

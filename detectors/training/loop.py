@@ -27,8 +27,8 @@ from .samples import Sample, Sampler
 
 STATE_KEY: Final = "crosscue_training"
 GRADIENT_LIMIT: Final = 5.0
+# Number of consecutive losses that are not finite after which training stops.
 BAD_STEPS: Final = 20
-"""Number of consecutive losses that are not finite after which training stops."""
 
 
 @dataclass(frozen=True, slots=True)

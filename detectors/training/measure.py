@@ -30,10 +30,10 @@ from .operating_point import Judged, Rates, rates_at
 from .platt import fit_platt
 from .scores import MIN_AREA_PX, average_precisions, detections_on
 
+# Score below which detections are left out of the average precision.
 MIN_SCORE: Final = 0.02
-"""Score below which detections are left out of the average precision."""
+# Scores at which precision and recall are reported; the last two are thresholds of cues.
 AIMS: Final = (0.5, 0.9, 0.95)
-"""Scores at which precision and recall are reported; the last two are thresholds of cues."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +102,8 @@ def rates_by_score(rows: Judged, by: Calibration) -> dict[float, Rates]:
 
 
 OVERLAP: Final = 0.3
+# Minimum number of correct and of wrong detections of a class for a calibration.
 MIN_ROWS: Final = 20
-"""Minimum number of correct and of wrong detections of a class for a calibration."""
 
 
 def judged(labelled: LabelledSet, found: Sequence[Detections]) -> Mapping[str, Judged]:

@@ -34,8 +34,8 @@ from crosscue.replay.base import (
 from crosscue.replay.files.made_of import NOTHING, refuse_another
 
 STATE_KEY: Final = "crosscue_road_training"
+# Maximum size of a state file; the network and its moments need a few MB.
 MAX_BYTES: Final = 1024 * MIB
-"""Maximum size of a state file; the network and its moments need a few MB."""
 EDGE_WEIGHT: Final = 6.0
 EDGE_PX: Final = 9
 GRADIENT_LIMIT: Final = 5.0

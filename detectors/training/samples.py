@@ -19,12 +19,12 @@ from crosscue.replay.base import Bytes, Floats, LogError, SchemaError
 
 from .annotations import Box, Labelled, LabelledPicture, LabelledSet, mask_of
 
+# Fraction of windows that are placed around an object.
 NEAR_OBJECT: Final = 0.85
-"""Fraction of windows that are placed around an object."""
+# Minimum side of an object in the window; a smaller object cannot be recognised.
 MIN_SIDE_PX: Final = 3.0
-"""Minimum side of an object in the window; a smaller object cannot be recognised."""
+# Minimum fraction of an object's pixels within the window for it to count as present.
 MIN_FRACTION: Final = 0.3
-"""Minimum fraction of an object's pixels within the window for it to count as present."""
 MAX_OBJECTS: Final = 24
 
 

@@ -17,11 +17,11 @@ from crosscue.replay.base import Floats, UsageError
 from .annotations import LabelledPicture, LabelledSet, mask_of
 from .samples import read_picture
 
+# Area below which true objects are ignored: found or not, they do not count.
 MIN_AREA_PX: Final = 24
-"""Area below which true objects are ignored: found or not, they do not count."""
 HALF: Final = 0.5
+# COCO's sizes: small below 32 x 32 pixels, large above 96 x 96.
 SIZES: Final = ("all", "small", "medium", "large")
-"""COCO's sizes: small below 32 x 32 pixels, large above 96 x 96."""
 
 
 def detections_on(

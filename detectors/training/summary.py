@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from .measure import Measured
     from .operating_point import Rates
 
+# Suffix of a kind's name, and heading of its column.
 COLUMNS: Final = (
     ("", "AP"),
     ("50", "AP50"),
@@ -16,7 +17,6 @@ COLUMNS: Final = (
     (" medium", "medium"),
     (" large", "large"),
 )
-"""Suffix of a kind's name, and heading of its column."""
 
 
 def measured_text(network: str, pictures: int, proposals: int, reached: Measured) -> str:

@@ -45,9 +45,10 @@ from .shards import Shard, read_shard
 VEHICLE: Final = "vehicle.toml"
 TRUTH: Final = "truth.json"
 LIST_BYTES: Final = 64 * MIB
+# Max nesting of folders of drives.
 DEPTH: Final = 8
-"""Max nesting of folders of drives."""
 NAME_LENGTH: Final = 150
+# File names of logs that do not identify a drive.
 SAYS_NOTHING: Final = frozenset(
     {
         "bag",
@@ -67,7 +68,6 @@ SAYS_NOTHING: Final = frozenset(
         "video",
     }
 )
-"""File names of logs that do not identify a drive."""
 
 
 @dataclass(frozen=True, slots=True)

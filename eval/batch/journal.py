@@ -21,8 +21,8 @@ JOURNAL: Final = ".drives"
 PLANS: Final = "plans"
 FORMAT_VERSION: Final = 2
 BEAT_S: Final = 10.0
+# Silence after which a worker of another machine is considered dead, seconds.
 STALE_S: Final = 12.0 * BEAT_S
-"""Silence after which a worker of another machine is considered dead, seconds."""
 
 
 def entry_path(run: Path) -> Path:

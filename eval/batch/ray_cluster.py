@@ -20,8 +20,8 @@ from crosscue.replay.errors import CrosscueError, UsageError, one_line
 GIB: Final = 1 << 30
 LOCAL: Final = "local"
 WAIT_S: Final = 5.0
+# Size of a local cluster's object store; results are small.
 STORE_BYTES: Final = 96 << 20
-"""Size of a local cluster's object store; results are small."""
 
 
 @contextmanager

@@ -24,8 +24,8 @@ from .jobs import Done, Events, Job, R, attempt, reported_error, worker_crashed
 from .processes import THREAD_VARIABLES, TICK_S
 from .ray_cluster import GIB, LOCAL, check_fits, joined
 
+# Memory of a drive with a camera and a neural network, on one core.
 MEMORY_BYTES: Final = 2 * GIB
-"""Memory of a drive with a camera and a neural network, on one core."""
 
 
 @dataclass(frozen=True, slots=True)

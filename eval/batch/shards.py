@@ -16,8 +16,8 @@ from crosscue.replay.errors import UsageError
 
 AUTO: Final = "auto"
 SLURM: Final = "SLURM_ARRAY_TASK_"
+# Variables that torchrun, MPI launchers for PyTorch and many schedulers set; ranks start at 0.
 RANKS: Final = ("RANK", "WORLD_SIZE")
-"""Variables that torchrun, MPI launchers for PyTorch and many schedulers set; ranks start at 0."""
 
 
 @dataclass(frozen=True, slots=True)

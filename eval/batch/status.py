@@ -14,10 +14,10 @@ from crosscue.replay.base import UnreadableRunError
 
 from .journal import STALE_S, has_journal, names_in, read_entry, silent_s, started_s
 
+# Name of the merged run's folder.
 MERGED: Final = "merged"
-"""Name of the merged run's folder."""
+# Time over which the rate is measured, seconds; less if the batch started later.
 WINDOW_S: Final = 3600.0
-"""Time over which the rate is measured, seconds; less if the batch started later."""
 NO_RUN: Final = "no run yet"
 
 

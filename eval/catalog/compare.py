@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 T = TypeVar("T")
+# Parts of a manifest that are compared.
 COMPARED: Final = {
     "versions",
     "settings",
@@ -51,10 +52,9 @@ COMPARED: Final = {
     "logs",
     "landmarks",
 }
-"""Parts of a manifest that are compared."""
 MAX_BYTES: Final = 256 * MIB
+# Max lines of settings, and of metrics, in the printed comparison.
 MAX_LINES: Final = 20
-"""Max lines of settings, and of metrics, in the printed comparison."""
 
 
 class Tolerance(NamedTuple):

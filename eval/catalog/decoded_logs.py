@@ -60,10 +60,10 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from numpy.typing import NDArray
 
+# Min rows of a row group; rows of a table are buffered until then.
 ROWS_HELD: Final = 8192
-"""Min rows of a row group; rows of a table are buffered until then."""
+# Name of the table of skipped and dropped rows.
 RESERVED: Final = "skipped"
-"""Name of the table of skipped and dropped rows."""
 
 
 class _BlockDecoder(Protocol):

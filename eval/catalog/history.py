@@ -28,8 +28,8 @@ from .paired import pooled
 if TYPE_CHECKING:
     import pyarrow as pa
 
+# Column of ``runs`` by the value of ``--by``; any other value is the name of a tag.
 BY: Final[Mapping[str, str]] = {"commit": "crosscue_commit", "version": "crosscue"}
-"""Column of ``runs`` by the value of ``--by``; any other value is the name of a tag."""
 
 
 class Queryable(Protocol):

@@ -15,8 +15,8 @@ from .paired import compare_drives
 if TYPE_CHECKING:
     import pyarrow as pa
 
+# Each drive's contribution to the metrics (None if not scored); True if no rows were dropped.
 Scored: TypeAlias = tuple[list[DriveMetric] | None, bool]
-"""Each drive's contribution to the metrics (None if not scored); True if no rows were dropped."""
 
 
 class Queryable(Protocol):

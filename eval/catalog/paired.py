@@ -27,14 +27,14 @@ from numpy.typing import NDArray
 from crosscue.eval.scoring.by_drive import Direction, DriveMetric, Kind, direction
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS
 
+# Max fraction of comparisons in which any unchanged metric gets a verdict.
 FALSE_ALARMS: Final = 0.05
-"""Max fraction of comparisons in which any unchanged metric gets a verdict."""
+# With five drives, no p value is below 2 / 32, so nothing would ever be decided.
 MIN_DRIVES: Final = 6
-"""With five drives, no p value is below 2 / 32, so nothing would ever be decided."""
+# Standard normal quantile of the power: the detectable difference is found with about 80 %.
 POWER_QUANTILE: Final = 0.841621
-"""Standard normal quantile of the power: the detectable difference is found with about 80 %."""
+# Above this, the number of drives that would decide is not printed.
 MAX_DRIVES: Final = 1_000_000
-"""Above this, the number of drives that would decide is not printed."""
 EXACT_DRIVES: Final = 12
 SWAPS: Final = 1 << EXACT_DRIVES
 SEED: Final = 0

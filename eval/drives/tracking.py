@@ -91,8 +91,8 @@ class MlflowSink:
         )
 
 
+# Parts of ``metrics.json`` that are not scores.
 LEFT_OUT = ("truth", "settings", "format", "account")
-"""Parts of ``metrics.json`` that are not scores."""
 
 
 def open_mlflow(uri: str, experiment: str = "crosscue") -> MlflowSink:

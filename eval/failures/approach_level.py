@@ -17,8 +17,8 @@ from crosscue.replay.vehicle.cue_table import CUES
 from .causes import Finding, approach_findings
 from .record import About, Failure, Kind
 
+# Min distance of a probability from 0 and 1, which limits severities to 20 bits.
 SURE: Final = 1e-6
-"""Min distance of a probability from 0 and 1, which limits severities to 20 bits."""
 EVEN: Final = 0.5
 AGAINST: Final = "a cue speaks against it"
 NOTHING: Final = "no cue speaks against it"

@@ -31,8 +31,8 @@ from crosscue.verb import Option, keywords
 
 from .search import ENDINGS, Failures, FailureSettings, search
 
+# Number of reasons for missing pictures to print.
 PRINTED: Final = 3
-"""Number of reasons for missing pictures to print."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

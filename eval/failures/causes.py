@@ -31,10 +31,10 @@ Cause = Literal[
     "claimed wrongly",
 ]
 
+# Max fraction of the frames showing an object in which it was found, to blame the detectors.
 MOSTLY: Final = 0.5
-"""Max fraction of the frames showing an object in which it was found, to blame the detectors."""
+# Conditions that explain no failure.
 GOOD: Final = frozenset({"clear", "overcast"})
-"""Conditions that explain no failure."""
 
 
 @dataclass(frozen=True, slots=True)

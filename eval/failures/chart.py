@@ -22,8 +22,8 @@ WIDTH: Final = 560.0
 LANES: Final = 8
 THRESHOLD: Final = 0.9
 STYLES: Final = {"intersection": "s0", "left": "s1", "right": "s2", "straight": "s3"}
+# Max gap that a line is drawn across, seconds.
 BREAK_S: Final = 1.0
-"""Max gap that a line is drawn across, seconds."""
 NOT_FEATURES: Final = frozenset(
     {"t_ns", "approach", "established", "not_believed", "segment", "log_t_ns"}
 )

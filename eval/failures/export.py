@@ -15,8 +15,8 @@ from crosscue.eval.runs.stored_images import camera_of, pictures_at
 from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.replay.base import DEFAULT_LIMITS, Limits, spelled, write_bytes
 
+# Encodings that every tool reads; others are converted to PNG, which is lossless.
 ENDINGS: Final = {"jpeg": ".jpg", "png": ".png"}
-"""Encodings that every tool reads; others are converted to PNG, which is lossless."""
 NO_PICTURE: Final = "frames whose picture cannot be read"
 OTHER: Final = "detections of labels that no cue is made of"
 

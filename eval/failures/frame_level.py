@@ -15,15 +15,15 @@ from crosscue.eval.scoring.scene.ranges import RangeJudged, sds_off
 
 from .record import About, Failure, Kind
 
+# Failures of one cue that are closer in time than this are merged.
 APART_NS: Final = 2_000_000_000
-"""Failures of one cue that are closer in time than this are merged."""
+# A smaller error, as a fraction of the range, is blamed on the interval, a larger on the range.
 NARROW: Final = 0.1
-"""A smaller error, as a fraction of the range, is blamed on the interval, a larger on the range."""
 MOSTLY: Final = 0.5
 SDS_95: Final = 1.959964
 
+# Rows of ``detections.parquet`` by the time of their frame.
 Detected = Mapping[int, Sequence[Mapping[str, Any]]]
-"""Rows of ``detections.parquet`` by the time of their frame."""
 
 
 def missed_and_false(

@@ -24,8 +24,8 @@ SMALL_PX: Final = 240
 QUALITY: Final = 72
 SIDES: Final = ("left", "straight", "right")
 
+# Callback for the time of a frame, its picture and its thumbnail, both as JPEG.
 Keep = Callable[[int, bytes, bytes], None]
-"""Callback for the time of a frame, its picture and its thumbnail, both as JPEG."""
 
 
 def draw_pictures(run: RunFolder, times: Iterable[int], keep: Keep) -> str:

@@ -27,10 +27,10 @@ Kind = Literal["missed", "late", "false", "range", "flipped"]
 Level = Literal["approach", "frames"]
 KINDS: Final[tuple[Kind, ...]] = ("missed", "late", "false", "range", "flipped")
 FORMAT: Final = 1
+# Max size of a table in JSON.
 MAX_BYTES: Final = 256 << 20
-"""Max size of a table in JSON."""
+# Bin edges of the distances by which failures are filtered.
 DISTANCES_M: Final = (0, 10, 20, 40, 80)
-"""Bin edges of the distances by which failures are filtered."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,8 +34,8 @@ from crosscue.replay.vehicle.vehicle import RangeCurve, Vehicle
 if TYPE_CHECKING:
     import pyarrow as pa
 
+# Min fraction of the time between two frames that odometry must cover.
 COVERED: Final = 0.9
-"""Min fraction of the time between two frames that odometry must cover."""
 NOTHING_THERE: Final = {"intersection": False, "left": False, "right": False}
 CURVES: Final = {Reference.START: "stop_sign", Reference.END: "traffic_light"}
 

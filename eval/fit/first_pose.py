@@ -25,10 +25,10 @@ from .log_signals import plan_of, read_signals
 from .reference import GeodeticOrigin, Reference, of_gnss, of_truth
 from .turns import turn_samples, wheel_speeds
 
+# Time read from the start of a drive, seconds; receivers and buses start at different times.
 READ_S: Final = START_S + 10.0
-"""Time read from the start of a drive, seconds; receivers and buses start at different times."""
+# Max s.d. of a heading from GNSS; otherwise the compass or the map's axes determine it.
 MAX_HEADING_SD_RAD: Final = math.radians(30.0)
-"""Max s.d. of a heading from GNSS; otherwise the compass or the map's axes determine it."""
 
 
 def with_start(

@@ -22,8 +22,8 @@ from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from .log_signals import plan_of, read_signals
 
 POSE_FILE: Final = "gnss.tum"
+# Max time for which a stationary vehicle keeps its last heading, seconds.
 HELD_S: Final = 60.0
-"""Max time for which a stationary vehicle keeps its last heading, seconds."""
 
 
 def truth_from_gnss(

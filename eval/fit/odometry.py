@@ -48,6 +48,7 @@ SHARED: Final = (
     "turn_delay_s",
     "turn_rad_per_sqrt_rad",
 )
+# Settings that belong to a single source of turns.
 OF_ONE_TURN: Final = {
     "yaw rate": ("yaw_rate_scale", "gyro_bias_radps", "gyro_noise_rad_per_sqrt_s"),
     "steering": (
@@ -58,7 +59,6 @@ OF_ONE_TURN: Final = {
     ),
     "wheels": ("right_wheel_scale", "track_width_m", "wheel_turn_rad_per_sqrt_m"),
 }
-"""Settings that belong to a single source of turns."""
 
 
 @dataclass(frozen=True, slots=True)

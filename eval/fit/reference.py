@@ -16,12 +16,12 @@ from crosscue.replay.base import EmptyResultError, Floats, Int64s
 from crosscue.replay.signals.kinds import Samples
 from crosscue.replay.vehicle.vehicle import Vehicle
 
+# Latitude and longitude in degrees, altitude in metres.
 GeodeticOrigin: TypeAlias = tuple[float, float, float]
-"""Latitude and longitude in degrees, altitude in metres."""
+# Min spacing of positions; nearer ones add little, because their errors are correlated.
 SPACING_NS: Final = 1_000_000_000
-"""Min spacing of positions; nearer ones add little, because their errors are correlated."""
+# Initial s.d. of a truth file that states no quality; the fit estimates it.
 TRUTH_SD_M: Final = 0.3
-"""Initial s.d. of a truth file that states no quality; the fit estimates it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

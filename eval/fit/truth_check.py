@@ -44,8 +44,8 @@ from crosscue.verb import Option
 from .log_images import LogSpan, log_pictures, log_span
 
 FILE: Final = truth_file.FILE
+# Max time by which truth may exceed its log, because clocks and last pictures differ slightly.
 SLACK_NS: Final = 1_000_000_000
-"""Max time by which truth may exceed its log, because clocks and last pictures differ slightly."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)

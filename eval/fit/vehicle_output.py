@@ -9,8 +9,8 @@ from typing import Final
 from crosscue.replay.base import OutputError, UsageError, write_text
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 
+# Vehicle file with only default values.
 DEFAULTS: Final = "version = 1\n"
-"""Vehicle file with only default values."""
 
 
 def check_output(

@@ -188,9 +188,9 @@ def _csv(found: pa.Table) -> str:
     return stream.getvalue()
 
 
+# Function that writes a table, by suffix of the file.
 WRITERS: Final[dict[str, Callable[[Path, Any], None]]] = {
     ".parquet": write_table,
     ".csv": lambda path, found: write_bytes(path, _csv(found).encode()),
     ".json": lambda path, found: write_text(path, strict_json(_records(found)) + "\n"),
 }
-"""Function that writes a table, by suffix of the file."""

@@ -242,18 +242,18 @@ def unopened_if_any(
     return UnopenedLog(logs, part, limits) if logs else None
 
 
+# A drive, as a parameter of a verb: on the command line, ``LOG...`` and the part to read.
 DriveGiven: TypeAlias = Annotated[Log | UnopenedLog | Path | str, Option(made_by=unopened)]
-"""A drive, as a parameter of a verb: on the command line, ``LOG...`` and the part to read."""
+# A drive, as a parameter of a verb that can do without one.
 DriveIfGiven: TypeAlias = Annotated[
     Log | UnopenedLog | Path | str | None, Option(made_by=unopened_if_any)
 ]
-"""A drive, as a parameter of a verb that can do without one."""
+# One log, as a parameter of a verb.
 LogGiven: TypeAlias = Annotated[Log | UnopenedLog | Path | str, Option(made_by=unopened_one)]
-"""One log, as a parameter of a verb."""
+# A drive of which a verb chooses the part itself.
 WholeDriveGiven: TypeAlias = Annotated[
     Log | UnopenedLog | Path | str, Option(made_by=unopened_whole)
 ]
-"""A drive of which a verb chooses the part itself."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)

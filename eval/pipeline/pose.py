@@ -42,13 +42,13 @@ from crosscue.replay.signals.windows import Window
 from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Segment, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
+# Max plausible fraction of rejected readings; a consistent filter rejects one in a thousand.
 REJECTED_SHARE: Final = 0.1
-"""Max plausible fraction of rejected readings; a consistent filter rejects one in a thousand."""
+# Time for which frames without odometry are kept.
 FRAMES_WAIT_NS: Final = 10_000_000_000
-"""Time for which frames without odometry are kept."""
 FOREVER_NS: Final = int(np.iinfo(np.int64).max)
+# S.d. of the first heading if it defines the map's axes and is therefore exact.
 OWN_FRAME_SD_RAD: Final = 1e-3
-"""S.d. of the first heading if it defines the map's axes and is therefore exact."""
 
 
 def turn_signal_of(planned: Plan, vehicle: Vehicle) -> Signal | None:

@@ -36,8 +36,8 @@ from .drive_time import drive_timeline
 from .empty_result import nothing_left
 from .estimate import begin_again, estimate_into
 
+# Tables of the first stage that the second stage reads.
 TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
-"""Tables of the first stage that the second stage reads."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -169,10 +169,10 @@ def open_run_of_logs(
     return open_run(run, logs, limits=limits)
 
 
+# A run, as a parameter of a verb: on the command line, ``RUN`` and where its logs are.
 RunGiven: TypeAlias = Annotated[Run | Path | str, Option(made_by=open_run_of_logs)]
-"""A run, as a parameter of a verb: on the command line, ``RUN`` and where its logs are."""
+# A run of a verb that shows its pictures, unless ``--without-images`` is set.
 PicturedRun: TypeAlias = Annotated[Run | Path | str, Option(made_by=open_run)]
-"""A run of a verb that shows its pictures, unless ``--without-images`` is set."""
 
 
 def run_schema() -> dict[str, Any]:

@@ -33,8 +33,8 @@ ALONG: Final = (235, 235, 235)
 PAST: Final = (60, 190, 70)
 ARROW_S: Final = 1.0
 NEAREST_M: Final = 1.0
+# Length of a parked car's arrow as a fraction of the picture's width.
 NOSE: Final = 0.04
-"""Length of a parked car's arrow as a fraction of the picture's width."""
 
 
 @dataclass(slots=True)

@@ -13,8 +13,8 @@ from crosscue.replay.base import LogFormatError
 
 from .columns import DriveTime
 
+# Encodings that the viewer decodes itself.
 PASSED_THROUGH: Final = ("jpeg", "png")
-"""Encodings that the viewer decodes itself."""
 ENTITY: Final = "camera/picture"
 BATCH_BYTES: Final = 4 << 20
 QUALITY: Final = 90

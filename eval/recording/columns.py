@@ -119,8 +119,8 @@ def packed(colours: Sequence[Colour]) -> NDArray[np.uint32]:
     return (rgb @ np.array([1 << 24, 1 << 16, 1 << 8], np.uint32) + 0xFF).astype(np.uint32)
 
 
+# Name of the timeline; the viewer reserves ``log_time`` for the wall clock of logging.
 TIMELINE: Final = "drive"
-"""Name of the timeline; the viewer reserves ``log_time`` for the wall clock of logging."""
 YEAR_2000_NS: Final = 946_684_800_000_000_000
 
 

@@ -20,8 +20,8 @@ from .series import BELIEF, CUES, POSE, RANGE
 FAR_M: Final = 110.0
 BEHIND_M: Final = 12.0
 ASIDE_M: Final = 24.0
+# Time marked on either side of a moment on the time line.
 MARKED_NS: Final = 100_000_000
-"""Time marked on either side of a moment on the time line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

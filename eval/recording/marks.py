@@ -44,10 +44,10 @@ REGION_WITH_ROAD: Final = (60, 190, 70)
 CROSSING: Final = (255, 130, 30)
 PARKED: Final = (190, 130, 255)
 HATCH_ROWS: Final = 4
+# Length of an arrow as a multiple of the step from one frame to the next.
 ARROW_STEPS: Final = 4.0
-"""Length of an arrow as a multiple of the step from one frame to the next."""
+# Min width of an object with a permanent label, as a fraction of the picture's width.
 LABELLED: Final = 0.03
-"""Min width of an object with a permanent label, as a fraction of the picture's width."""
 SIDES: Final = ("left", "straight", "right")
 
 

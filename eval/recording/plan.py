@@ -19,8 +19,8 @@ PATH_POINTS: Final = 20_000
 ELLIPSES_PER_S: Final = 5.0
 HALF_ROAD_M: Final = 8.0
 CAR_M: Final = 8.0
+# Min length of the vehicle's arrow as a fraction of the track's extent.
 CAR_SHARE: Final = 0.02
-"""Min length of the vehicle's arrow as a fraction of the track's extent."""
 LANDMARK_POINTS: Final = 6.0
 TRUE_CAR_POINTS: Final = 5.0
 

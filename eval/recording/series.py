@@ -25,15 +25,15 @@ BELIEF: Final = ("plots", "belief")
 RANGE: Final = ("plots", "range")
 CUES: Final = ("cues",)
 FOUND: Final = "found"
+# Displayed duration of the only frame of a run.
 ONE_FRAME_NS: Final = 100_000_000
-"""Displayed duration of the only frame of a run."""
+# Plots of the pose and their titles.
 POSE: Final[Mapping[str, str]] = {
     "speed": "Speed (m/s)",
     "heading": "Heading (deg)",
     "heading_sd": "Heading s.d. (deg)",
     "ellipse": "2-sigma ellipse, full major axis (m)",
 }
-"""Plots of the pose and their titles."""
 NOT_IN_BELIEF: Final = (*NOT_FEATURES, *LABELS)
 
 

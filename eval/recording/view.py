@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 
 BEFORE_NS: Final = 2_000_000_000
+# Time recorded after a moment.
 BEHIND_NS: Final = 4_000_000_000
-"""Time recorded after a moment."""
 
 
 def save_recording(

@@ -16,8 +16,8 @@ from .svg_plot import Drawing, Panel, ticks
 TEMPLATE: Final = "history.html.j2"
 WIDTH: Final = 460.0
 HEIGHT: Final = 190.0
+# Width of a version's name below a chart.
 LABEL_PX: Final = 52.0
-"""Width of a version's name below a chart."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,12 +18,12 @@ from typing import Any, Final
 
 from crosscue.replay.base import OutputError, UsageError, one_line, valid_text
 
+# Max number of metrics in one request.
 MAX_METRICS: Final = 1000
-"""Max number of metrics in one request."""
+# Max characters of a tag's value.
 MAX_VALUE: Final = 5000
-"""Max characters of a tag's value."""
+# Characters not allowed in names in MLflow.
 _STRANGE: Final = re.compile(r"[^\w .:/-]")
-"""Characters not allowed in names in MLflow."""
 SWITCHED: Final = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
     # The default of seven retries with growing pauses would block a command for minutes.

@@ -48,10 +48,10 @@ POSE_FIGURES: Final = {
     "it if the filter is consistent.",
     "pose_major_axis.png": "Length of the 2-sigma ellipse against distance travelled.",
 }
+# Max number of approaches with their own chart.
 BELIEFS: Final = 12
-"""Max number of approaches with their own chart."""
+# Cues whose published precision is the target to which the dissertation tuned them.
 YEAR_2000_NS: Final = 946_684_800_000_000_000
-"""Cues whose published precision is the target to which the dissertation tuned them."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,8 @@ STYLES: Final[Mapping[str, str]] = {
 WIDTH: Final = 480.0
 PUBLISHED_DETECTED_M: Final = 34.4
 PUBLISHED_FULL_M: Final = 16.2
+# Max number of approaches drawn as lines; more are shown only as bins.
 TRACES: Final = 12
-"""Max number of approaches drawn as lines; more are shown only as bins."""
 
 
 AXES: Final[Mapping[str, str]] = {
@@ -246,8 +246,8 @@ class WorstFrame:
     size_px: tuple[int, int] = (0, 0)
 
 
+# Max width of a distance bin, which bounds the distance of its middle from its rows.
 WIDEST_BIN_M: Final = 20.0
-"""Max width of a distance bin, which bounds the distance of its middle from its rows."""
 
 
 def draw_range(

@@ -17,8 +17,8 @@ from crosscue.eval.scoring.boxes.labelled_run import LabelledRun
 from crosscue.eval.scoring.boxes.matching import match
 from crosscue.replay.base import Bytes, CrosscueError, Floats
 
+# Pictures closer in time than this show the same mistakes, so only the worst is shown.
 APART_NS: Final = 1_000_000_000
-"""Pictures closer in time than this show the same mistakes, so only the worst is shown."""
 WIDTH_PX: Final = 960
 QUALITY: Final = 80
 RED: Final = (60, 60, 250)

@@ -22,8 +22,8 @@ from crosscue.replay.vehicle.vehicle import CUES, Vehicle
 from .scene_figures import WorstFrame
 
 MAX_FRAMES: Final = 6
+# Wrong frames of one cue closer in time than this are one mistake, shown by its worst frame.
 APART_NS: Final = 2_000_000_000
-"""Wrong frames of one cue closer in time than this are one mistake, shown by its worst frame."""
 WIDTH_PX: Final = 640
 QUALITY: Final = 80
 FOUND: Final = (

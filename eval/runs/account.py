@@ -32,8 +32,8 @@ from .record import Record
 
 REASONS_SHOWN: Final = 20
 DETAILS_SHOWN: Final = 5
+# Name for rows whose topic is unknown.
 UNATTRIBUTED: Final = ""
-"""Name for rows whose topic is unknown."""
 _ROWS: Final = {
     "reading": "rows", "detecting": "frames", "estimating": "readings", "scoring": "judgements",
 }  # fmt: skip

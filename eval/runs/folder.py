@@ -147,16 +147,16 @@ __all__ = [
 
 MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"
+# Inputs of a run, written first, because an interrupted run has no manifest.
 INPUT: Final = "input.json"
-"""Inputs of a run, written first, because an interrupted run has no manifest."""
+# Error of the last attempt at a run; removed when the run finishes.
 FAILURE: Final = "failure.log"
-"""Error of the last attempt at a run; removed when the run finishes."""
+# The user's tags of a run, see ``tags``; they are kept when the run is made again.
 TAGS: Final = "tags.json"
-"""The user's tags of a run, see ``tags``; they are kept when the run is made again."""
+# Wall times of a run, which is complete without them.
 TIMINGS: Final = "timings.json"
-"""Wall times of a run, which is complete without them."""
+# Folder inside a run with the files that will replace it when they are complete.
 STAGED: Final = ".new"
-"""Folder inside a run with the files that will replace it when they are complete."""
 MAX_MANIFEST_BYTES: Final = 256 << 20
 _RECORDS: Final = frozenset({MANIFEST, INPUT, FAILURE, LOCK, TAGS, TIMINGS})
 _RUN: Final = re.compile(

@@ -44,8 +44,8 @@ from crosscue.replay.remote.logs import RangedLog
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
+# Max depth of folders searched for logs that have moved.
 DEPTH: Final = 8
-"""Max depth of folders searched for logs that have moved."""
 
 
 def log_names(logs: Sequence[Log]) -> list[str]:

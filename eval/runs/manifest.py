@@ -27,10 +27,10 @@ from .candidates import CandidateRow
 from .record import Record
 
 FORMAT_VERSION: Final = 7
+# Max characters of a printed field.
 LINE: Final = 100
-"""Max characters of a printed field."""
+# Notice of a run whose poses are in its own frame, rotated against any other.
 OWN_FRAME: Final = "no start heading and no compass: the map's x axis points where the car did"
-"""Notice of a run whose poses are in its own frame, rotated against any other."""
 
 
 def _vehicle(given: object) -> object:

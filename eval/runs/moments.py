@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 __all__ = ["TableFolder", "approach_spans", "moment_ns", "part_of", "seconds_into", "span_ns"]
 
+# Tables that define a run's time span; the first that has rows is used.
 TABLES: Final = ("frames", "pose")
-"""Tables that define a run's time span; the first that has rows is used."""
 
 
 def span_ns(run: TableFolder) -> tuple[int, int]:

@@ -21,11 +21,11 @@ from crosscue.replay.base import (
 )
 
 MAX_LIST_BYTES: Final = 256 << 20
+# Max number of files named in an error.
 NAMED: Final = 10
-"""Max number of files named in an error."""
 
+# Whether crosscue wrote a file, given its path in the folder, with slashes.
 IsOurs: TypeAlias = Callable[[str], bool]
-"""Whether crosscue wrote a file, given its path in the folder, with slashes."""
 
 
 def of_list(marker: Path) -> IsOurs:

@@ -33,8 +33,8 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .logs import place_of
 
+# Max difference between a picture's own clock and the log's.
 AROUND_NS: Final = 2_000_000_000
-"""Max difference between a picture's own clock and the log's."""
 
 
 @dataclass(frozen=True, slots=True)

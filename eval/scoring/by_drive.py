@@ -11,12 +11,15 @@ from .metric_values import MetricValue, metric_values
 if TYPE_CHECKING:
     import pyarrow as pa
 
+# Folder of a score, in a run or in a study.
 FOLDER: Final = "score"
-"""Folder of a score, in a run or in a study."""
 METRICS: Final = "metrics.json"
 BY_DRIVE: Final = "by_drive"
 Direction = Literal["higher", "lower"]
 Kind = Literal["mean", "rms", "sum"]
+# Better direction by the last part of a metric's path; other metrics are shown but not judged. The
+# amount scored is not judged. The mean distance at detection is judged with undetected approaches
+# counted as 0 m, because an additional, late detection would otherwise lower it.
 BETTER: Final[Mapping[str, Direction]] = {
     **dict.fromkeys(
         (
@@ -46,15 +49,11 @@ BETTER: Final[Mapping[str, Direction]] = {
         "lower",
     ),
 }
-"""Better direction by the last part of a metric's path; other metrics are shown but not judged.
-
-The amount scored is not judged. The mean distance at detection is judged with undetected approaches
-counted as 0 m, because an additional, late detection would otherwise lower it.
-"""
 OR_0: Final = "_or_0"
 SCORED: Final = "scored"
+# Also stored for each drive, for queries, and to find metrics that are no longer scored.
 SHOWN: Final = frozenset({SCORED, "detected_m", "full_m"})
-"""Also stored for each drive, for queries, and to find metrics that are no longer scored."""
+# Metrics below these are based on few rows each; they are shown but not judged.
 PARTS: Final = (
     "by_distance",
     "by_control",
@@ -64,7 +63,6 @@ PARTS: Final = (
     "things",
     "attribution",
 )
-"""Metrics below these are based on few rows each; they are shown but not judged."""
 
 
 class DriveMetric(NamedTuple):
@@ -135,13 +133,13 @@ def parts_of(
         yield _part(log, "pose.lost", MetricValue(float(is_lost)), {})
 
 
+# Sibling of a metric of a condition that is the number of its approaches.
 COUNTED_BY: Final = {
     "detected": "approaches",
     "full": "approaches",
     "detected_m": "detected",
     "full_m": "full",
 }
-"""Sibling of a metric of a condition that is the number of its approaches."""
 
 
 def _part(

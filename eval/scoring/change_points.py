@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 FALSE_ALARMS: Final = 0.05
+# Min number of drives with results on both sides of a split, as in a comparison.
 MIN_DRIVES: Final = 6
-"""Min number of drives with results on both sides of a split, as in a comparison."""
 SHUFFLES: Final = 1000
 SEED: Final = 0
 ROUNDING: Final = 1e-9

@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+# Reason why rows around a set-back of the clock are not scored.
 AMBIGUOUS: Final = "log time comes twice"
-"""Reason why rows around a set-back of the clock are not scored."""
+# Value for rows without an approach.
 NONE: Final = -1
-"""Value for rows without an approach."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 
 CONFIDENCE: Final = 0.95
 MIN_CLUSTERS: Final = 4
+# Minimum number of clusters whose kurtosis is estimated.
 KURTOSIS_CLUSTERS: Final = 8
-"""Minimum number of clusters whose kurtosis is estimated."""
+# Text in place of an interval over too few drives or approaches.
 TOO_FEW: Final = "too few clusters"
-"""Text in place of an interval over too few drives or approaches."""
 
 
 class Interval(NamedTuple):

@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+# Edges of the bins of true range.
 BINS_M: Final = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
-"""Edges of the bins of true range."""
 
 
 def cluster_numbers(

@@ -44,10 +44,10 @@ from .pose.score import PoseScore, ScoredPoses
 from .run_tables import in_log_time
 from .truth import DriveTruth
 
+# Tables of a run that are scored.
 TABLES: Final = ("frames", "cues", "range", "belief")
-"""Tables of a run that are scored."""
+# Tolerance for approaches outside the run, because clocks and last pictures differ a little.
 SLACK_NS: Final = 1_000_000_000
-"""Tolerance for approaches outside the run, because clocks and last pictures differ a little."""
 
 
 @dataclass(frozen=True, slots=True)

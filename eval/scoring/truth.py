@@ -19,13 +19,11 @@ from .columns import NONE
 
 COLUMNS: Final = ("t_ns", "approach", "start_m", "end_m")
 MAX_BYTES: Final = 256 * MIB
+# Max time between a moment and the true ranges it is interpolated from.
 NEAREST_NS: Final = 500_000_000
-"""Max time between a moment and the true ranges it is interpolated from."""
+# Time after entering during which the car is assumed to be in the intersection. Nothing is judged
+# in this time.
 CROSSING_NS: Final = 10_000_000_000
-"""Time after entering during which the car is assumed to be in the intersection.
-
-Nothing is judged in this time.
-"""
 FEATURES: Final = ("intersection", "left", "right", "straight")
 
 

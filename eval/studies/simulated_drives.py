@@ -34,10 +34,10 @@ from crosscue.replay.vehicle.vehicle import load
 
 LOG: Final = "drive.mcap"
 VEHICLE: Final = "vehicle.toml"
+# Camera and detectors of a study of many layouts.
 SPARSE_AND_EMBEDDED: Final = (SPARSE_PHOTOGRAPHS, EMBEDDED)
-"""Camera and detectors of a study of many layouts."""
+# File in a complete simulated drive's folder, with the key of its settings and of the code.
 MADE_BY: Final = "made_by.txt"
-"""File in a complete simulated drive's folder, with the key of its settings and of the code."""
 
 
 @dataclass(frozen=True, slots=True)

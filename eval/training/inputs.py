@@ -12,8 +12,8 @@ from crosscue.datasets.scenes.layout import SCORED
 from crosscue.replay.base import UsageError, write_text
 
 Device: TypeAlias = Literal["auto", "cpu", "cuda", "mps"]
+# Max number of layouts of a command, far more than can be rendered in practice.
 MAX_LAYOUTS: Final = 100_000
-"""Max number of layouts of a command, far more than can be rendered in practice."""
 
 
 def layouts_of(texts: Sequence[str], who: str) -> list[str]:

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 CLASSES: Final = ("car", "stop sign", "traffic light")
 HELD_EVERY: Final = 10
+# Number of region proposals that the detector uses.
 PROPOSALS: Final = 100
-"""Number of region proposals that the detector uses."""
+# Max side length of a training window.
 MAX_WINDOW_PX: Final = 4096
-"""Max side length of a training window."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from crosscue.detectors.networks.road.network import RoadNetwork
     from crosscue.detectors.training.road import RoadTraining
 
+# Width and height, pixels.
 Size: TypeAlias = tuple[int, int]
-"""Width and height, pixels."""
 Reported: TypeAlias = dict[str, str | int | float]
 Layouts: TypeAlias = Annotated[Sequence[str], Option(metavar="LAYOUT")]
 HELD_EVERY: Final = 10

@@ -42,8 +42,8 @@ from crosscue.replay.vehicle.drafting.series import Grid, Series, Track
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 
 WHEELS: Final = ("front left", "front right", "rear left", "rear right")
+# Max relative difference of two focal lengths of the same pictures.
 INTRINSICS_OFF: Final = 0.02
-"""Max relative difference of two focal lengths of the same pictures."""
 WHEEL_OFF: Final = 0.1
 UNCONFIRMED: Final = "too few bends here for course or wheels to confirm its sign"
 

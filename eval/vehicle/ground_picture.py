@@ -20,10 +20,10 @@ from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 
 AHEAD_M: Final = (5, 10, 15, 20, 30, 50, 80)
 ASIDE_M: Final = (-15, -10, -5, 0, 5, 10, 15)
+# Distance ahead of the camera at which the grid begins.
 NEAREST_M: Final = 0.5
-"""Distance ahead of the camera at which the grid begins."""
+# Assumed intersection for which regions are drawn.
 ASSUMED: Final = Place(30.0, 50.0, 0.0)
-"""Assumed intersection for which regions are drawn."""
 YELLOW, WHITE, GREEN, BLACK = (0, 230, 255), (255, 255, 255), (80, 230, 80), (0, 0, 0)
 
 

@@ -29,11 +29,11 @@ from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 
 DEGREE: Final = np.pi / 180.0
 WIDTH_PX: Final = 960
+# Distance between two pictures: near objects move visibly, but stay in the picture.
 APART_M: Final = 1.5
-"""Distance between two pictures: near objects move visibly, but stay in the picture."""
 MOVING_MPS: Final = 2.0
+# Max curvature of a straight road, a radius of 290 m.
 STRAIGHT_RAD_PER_M: Final = 0.2 * DEGREE
-"""Max curvature of a straight road, a radius of 290 m."""
 PAIRS: Final = 200
 MIN_PAIRS: Final = 10
 LOOKED_AT_NS: Final = 60_000_000_000

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from crosscue.fusion.factor_graph import CueNode
 
+# Count of a cue that was not evaluated.
 NOT_EVALUATED: Final = -1
-"""Count of a cue that was not evaluated."""
 
 Bools = NDArray[np.bool_]
 

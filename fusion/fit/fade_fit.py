@@ -20,8 +20,8 @@ from crosscue.fusion.factor_graph import USUAL_FADE, CueNode, FactorGraph
 from crosscue.fusion.fit.annotated_approach import AnnotatedApproach, Bools
 from crosscue.replay.vehicle.fusion import Fade
 
+# Minimum number of positive observations for a fit.
 MIN_POSITIVES: Final = 20
-"""Minimum number of positive observations for a fit."""
 LAGS: Final = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89)
 WAYS_M: Final = np.geomspace(0.3, 100.0, 36)
 TIMES_S: Final = np.geomspace(0.05, 20.0, 36)

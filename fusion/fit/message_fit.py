@@ -27,14 +27,12 @@ from crosscue.fusion.fit.fade_fit import FadeFit, fit_fade
 from crosscue.fusion.situation import Situation
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Rates
 
+# Minimum number of places with the feature, and of places without it, for a rate or exponent. A
+# rate also requires this number of places where the cue was positive; otherwise only the published
+# message is known.
 MIN_PLACES: Final = 3
-"""Minimum number of places with the feature, and of places without it, for a rate or exponent.
-
-A rate also requires this number of places where the cue was positive; otherwise only the published
-message is known.
-"""
+# Number of places at the pooled rate that are added to either side.
 PULL_PLACES: Final = 1.0
-"""Number of places at the pooled rate that are added to either side."""
 EXPONENTS: Final = np.linspace(0.05, 1.0, 96)
 
 

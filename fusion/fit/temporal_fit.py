@@ -37,13 +37,13 @@ from crosscue.replay.vehicle.temporal import CueChain, Temporal
 from .annotated_approach import NOT_EVALUATED
 
 EDGES_M: Final = (0.0, 10.0, 20.0, 35.0, 50.0, 80.0)
+# Number of additional steps; about that of a drive, so the effect is that of one more place.
 PULL_STEPS: Final = 20.0
-"""Number of additional steps; about that of a drive, so the effect is that of one more place."""
 STRAY_SD: Final = 3.0
 EXPONENTS: Final = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18)
 LAPSES: Final = (0.0, 0.02, 0.05, 0.1)
+# Minimum distance of a fitted probability from 0 and 1, because rare events can occur.
 MIN_RATE: Final = 0.002
-"""Minimum distance of a fitted probability from 0 and 1, because rare events can occur."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,8 +85,8 @@ class State(NamedTuple):
 
 
 NOWHERE: Final = State((), (), None)
+# Number of steps by state, previous step (``first``, ``stays``, ``appears``) and current value.
 Tally = Counter[tuple[State, str, bool]]
-"""Number of steps by state, previous step (``first``, ``stays``, ``appears``) and current value."""
 
 
 class TemporalFit(NamedTuple):

@@ -33,8 +33,8 @@ SOFT_IRON: Final = "soft iron"
 
 _BIN_DEG: Final = 10
 _BIN_READINGS: Final = 3
+# Maximum scatter of a ring, as a fraction of its radius; an unstructured cloud has about 0.5.
 _RING: Final = 0.2
-"""Maximum scatter of a ring, as a fraction of its radius; an unstructured cloud has about 0.5."""
 
 
 class NotObservable(NamedTuple):

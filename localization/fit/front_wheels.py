@@ -18,8 +18,8 @@ from crosscue.replay.base import Floats, Int64s
 
 PIECES: Final = 10
 MIN_ROWS: Final = 10 * PIECES
+# Relative standard deviation of the given track width and wheelbase.
 LENGTH_DOUBT: Final = 0.1
-"""Relative standard deviation of the given track width and wheelbase."""
 
 
 class FrontWheel(NamedTuple):

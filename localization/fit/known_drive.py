@@ -23,11 +23,11 @@ from crosscue.replay.compiled import kept
 Floats: TypeAlias = NDArray[np.float64]
 Int64s: TypeAlias = NDArray[np.int64]
 
+# Maximum duration of an arc of odometry.
 STEP_S: Final = 0.2
-"""Maximum duration of an arc of odometry."""
+# Normalised innovation squared beyond which a position has less weight; one good position in a
+# thousand exceeds it.
 GATE_NIS: Final = 13.8
-"""Normalised innovation squared beyond which a position has less weight; one good position in a
-thousand exceeds it."""
 
 
 class Steps(NamedTuple):

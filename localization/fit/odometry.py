@@ -34,23 +34,23 @@ from crosscue.replay.base import Floats, VehicleError
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
+# Residual at which the robust loss changes from squares to absolute values.
 LOSS_SD: Final = 2.0
-"""Residual at which the robust loss changes from squares to absolute values."""
+# Maximum s.d. of an observable parameter, as a fraction of its plausible deviation.
 DETERMINED: Final = 0.5
-"""Maximum s.d. of an observable parameter, as a fraction of its plausible deviation."""
+# Minimum s.d. of a position of the rear axle, because the body leans and slips, and levers are
+# measured by hand. Without it, a smooth track would count as perfect, and its sway as turns.
 MIN_FIX_SD_M: Final = 0.1
-"""Minimum s.d. of a position of the rear axle, because the body leans and slips, and levers are
-measured by hand. Without it, a smooth track would count as perfect, and its sway as turns."""
+# S.d. of a direction without information, in units of the plausible deviation.
 NO_INFORMATION_SD: Final = 1e5
-"""S.d. of a direction without information, in units of the plausible deviation."""
+# S.d. in those units above which a parameter has no effect on the drive.
 WITHOUT_EFFECT: Final = 1e3
-"""S.d. in those units above which a parameter has no effect on the drive."""
+# Maximum deviation from the given value in the fit, in units of the plausible deviation.
 REACH: Final = 4.5
-"""Maximum deviation from the given value in the fit, in units of the plausible deviation."""
+# Maximum number of alternations between fit and noise.
 ROUNDS: Final = 8
-"""Maximum number of alternations between fit and noise."""
+# Relative change of the noise below which it has converged.
 SETTLED: Final = 0.05
-"""Relative change of the noise below which it has converged."""
 MIN_FIXES: Final = 15
 MIN_DISTANCE_M: Final = 100.0
 _MIN_SD: Final = 1e-6
@@ -85,12 +85,12 @@ PARAMETERS: Final[Mapping[str, _Kind]] = {
     "start_y_m": _Kind(10.0, False, ""),
     "start_heading_rad": _Kind(0.5, False, ""),
 }
+# Parameters by turn source.
 OF_TURN: Final[Mapping[str, tuple[str, ...]]] = {
     "yaw rate": ("gyro_bias_radps", DRIFT, "yaw_rate_scale", "turn_delay_s"),
     "steering": ("steering_ratio", "steering_offset_rad", "wheelbase_m", "turn_delay_s"),
     "wheels": ("right_wheel_scale", "track_width_m"),
 }
-"""Parameters by turn source."""
 TURN_NOISE: Final[Mapping[str, str]] = {
     "yaw rate": "gyro_noise_rad_per_sqrt_s",
     "steering": "steering_noise_rad_sqrt_m",

@@ -41,8 +41,8 @@ from .file import (
     kind_of,
 )
 
+# Maximum sigmas of a search: the R*Tree's boxes include this many of each landmark's own.
 REACH_SIGMAS: Final = 4.0
-"""Maximum sigmas of a search: the R*Tree's boxes include this many of each landmark's own."""
 MAX_POINTS: Final = 20_000
 MAX_TEXT: Final = 1024
 

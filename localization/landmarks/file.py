@@ -18,8 +18,8 @@ from urllib.parse import quote
 
 from crosscue.replay.base import LogError, LogFormatError, OutputError, cannot_write
 
+# ``CCLM`` in the file's header.
 APPLICATION_ID: Final = 0x43434C4D
-"""``CCLM`` in the file's header."""
 VERSION: Final = 1
 _MAX_BYTES: Final = 16 << 20
 _BUSY_S: Final = 5.0

@@ -20,10 +20,10 @@ from crosscue.replay.base import Bytes, UsageError
 
 from .features import CameraGeometry, Features, Match
 
+# Minimum side of a picture: the size of ORB's patches.
 _MIN_SIDE_PX: Final = 32
-"""Minimum side of a picture: the size of ORB's patches."""
+# Minimum number of pairs for a geometry, which four or five points always fit.
 _MIN_PAIRS: Final = {"homography": 6, "essential": 8}
-"""Minimum number of pairs for a geometry, which four or five points always fit."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,8 +34,8 @@ from .database import REACH_SIGMAS, LandmarkDatabase, Nearby, Place
 from .features import Features, Match, Matcher
 from .sighting import Sighting
 
+# Fraction of the peak score below which the peak is over.
 FALLEN_FRACTION: Final = 0.8
-"""Fraction of the peak score below which the peak is over."""
 
 
 @dataclass(frozen=True, slots=True)

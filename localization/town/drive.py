@@ -83,14 +83,14 @@ Ints = NDArray[np.int64]
 CITY_STREAM: Final = np.uint64(1)
 PLACE_STREAM: Final = np.uint64(2)
 SENSOR_STREAM: Final = np.uint64(3)
+# Outcome of a city without intersections.
 NO_CITY: Final = -1.0
-"""Outcome of a city without intersections."""
 STEP_FIELDS: Final = 16
 EVENT_FIELDS: Final = 6
+# Kinds of events: a new goal, and a landmark that is new, missed, used or rejected.
 GOAL_SET, LANDMARK_SET, LANDMARK_MISSED, LANDMARK_TAKEN, LANDMARK_REFUSED = range(5)
-"""Kinds of events: a new goal, and a landmark that is new, missed, used or rejected."""
+# Straight, left, right: the order in which options are listed.
 _QUARTERS: Final = (0, 1, 3)
-"""Straight, left, right: the order in which options are listed."""
 
 
 class Outcome(IntEnum):

@@ -15,11 +15,11 @@ from .streets import COSINES, HEADINGS_RAD, SINES, Streets, place_of, step_of
 from .vehicle import Lane, Vehicle
 
 UNDECIDED: Final = -1
+# Turns at an intersection, in quarter turns to the left.
 STRAIGHT, LEFT, BACK, RIGHT = range(4)
-"""Turns at an intersection, in quarter turns to the left."""
 MAX_ARCS: Final = 3
+# Number of values of an arc: x, y and heading of its start, curvature, length.
 ARC_FIELDS: Final = 5
-"""Number of values of an arc: x, y and heading of its start, curvature, length."""
 
 
 class Route(NamedTuple):

@@ -21,8 +21,8 @@ HEADINGS_RAD: Final = (0.0, math.pi / 2.0, math.pi, -math.pi / 2.0)
 COSINES: Final = tuple(math.cos(heading) for heading in HEADINGS_RAD)
 SINES: Final = tuple(math.sin(heading) for heading in HEADINGS_RAD)
 MAX_TRIES: Final = 1000
+# Kinds of connection: from a place along roads, to it along roads, and in either direction.
 ONWARD, HOMEWARD, EITHER = 1, 2, 4
-"""Kinds of connection: from a place along roads, to it along roads, and in either direction."""
 _BOTH: Final = ONWARD | HOMEWARD
 _ALL: Final = ONWARD | HOMEWARD | EITHER
 

@@ -15,11 +15,11 @@ from .parameters import Parameters
 from .random_stream import Stream, normal
 
 MAX_STEERING_RAD: Final = 0.7
+# Ratio of the maximum deceleration to the maximum acceleration.
 BRAKE_FACTOR: Final = 1.5
-"""Ratio of the maximum deceleration to the maximum acceleration."""
 MIN_SPEED_MPS: Final = 1.0
+# Bound of both controllers' integrals.
 MAX_INTEGRAL: Final = 2.0
-"""Bound of both controllers' integrals."""
 
 
 class Lane(NamedTuple):

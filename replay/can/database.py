@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from cantools.database.can.internal_database import InternalDatabase
 
 FORMATS: Final = ("dbc", "kcd", "arxml", "sym")
+# Max reported pairs of overlapping signals in a message.
 _MAX_PAIRS: Final = 100
-"""Max reported pairs of overlapping signals in a message."""
 _EXTENDED_FLAG: Final = 0x8000_0000
 
 

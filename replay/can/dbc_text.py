@@ -67,11 +67,11 @@ _FLOATS: Final = (1, 2)
 _UNUSED: Final = "VECTOR__INDEPENDENT_SIG_MSG"
 _FORMAT: Final = "VFrameFormat"
 _LONG_NAMES: Final = ("SystemMessageLongSymbol", "SystemSignalLongSymbol")
+# Meanings of the numbers of ``VFrameFormat``, where a file declares it as a number.
 _FORMATS: Final = (
     "StandardCAN", "ExtendedCAN", "reserved", "J1939PG", *["reserved"] * 10, "StandardCAN_FD",
     "ExtendedCAN_FD",
 )  # fmt: skip
-"""Meanings of the numbers of ``VFrameFormat``, where a file declares it as a number."""
 
 
 class _UnusualError(Exception):

@@ -49,12 +49,12 @@ RARE_REASONS: Final = (
     TOO_SHORT,
     TOO_LONG,
 )
+# Key for all further identifiers once ``COUNTS_KEPT`` are counted separately.
 OTHERS: Final = (-1, False)
-"""Key for all further identifiers once ``COUNTS_KEPT`` are counted separately."""
 COUNTS_KEPT: Final = 20_000
 
+# Number of frames that NumPy decodes in the time that loading Numba takes (measured: 0.6 s).
 AUTO_FRAMES: Final = 16_000_000
-"""Number of frames that NumPy decodes in the time that loading Numba takes (measured: 0.6 s)."""
 
 EngineName: TypeAlias = Literal["auto", "numpy", "numba"]
 Wanted: TypeAlias = Collection[str] | Collection[tuple[str, str]]

@@ -19,19 +19,19 @@ from numpy.typing import NDArray
 
 from .layout import Arithmetic, CanMessage, CanSignal, is_whole
 
+# Shape (N, W / 8): payloads as little-endian words.
 Words: TypeAlias = NDArray[np.uint64]
-"""Shape (N, W / 8): payloads as little-endian words."""
 Column: TypeAlias = NDArray[Any]
 Number = TypeVar("Number", np.uint64, np.float64)
 
+# Suffix of the companion column of a signal that may be absent and cannot be NaN.
 PRESENT_SUFFIX: Final = "_is_present"
-"""Suffix of the companion column of a signal that may be absent and cannot be NaN."""
 
+# Number of bits in the fraction of a float64.
 SHORT_BITS: Final = 52
-"""Number of bits in the fraction of a float64."""
+# Sign and exponent of the float64 2**52 + n, where n are the 52 bits below. This converts integers
+# without a loop.
 EXPONENT: Final = 0x4330_0000_0000_0000
-"""Sign and exponent of the float64 2**52 + n, where n are the 52 bits below. This converts
-integers without a loop."""
 
 _FLOATS: Final = {16: (np.uint16, np.float16), 32: (np.uint32, np.float32)}
 

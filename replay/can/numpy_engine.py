@@ -13,9 +13,9 @@ from crosscue.replay.columns import DATA, LENGTH_UNKNOWN, CanFrames
 from .extract import Words
 from .grouping import STANDARD_IDS, Columns, Grouped, Rules, Strange, Tables, words_of
 
+# Max number of messages for which searching for each is faster than sorting (0.11 ms against 0.21
+# ms for 10 messages in 58,000 frames).
 FEW: Final = 16
-"""Max number of messages for which searching for each is faster than sorting (0.11 ms against
-0.21 ms for 10 messages in 58,000 frames)."""
 
 
 class NumpyEngine:

@@ -9,11 +9,11 @@ from typing import Final
 
 from crosscue.replay.base import MIB, CanDatabaseError, Limits, LogTooLargeError, read_at_most
 
+# Upper bound on the bits of a message; the longest multi-packet message has 1785 bytes.
 _MAX_BITS: Final = 8 * 2048
-"""Upper bound on the bits of a message; the longest multi-packet message has 1785 bytes."""
 _MAX_BRANCHES: Final = 1_000_000
+# Max characters of a DBC or SYM text for cantools, which takes up to 340 bytes for each.
 MAX_CANTOOLS: Final = 2 * MIB
-"""Max characters of a DBC or SYM text for cantools, which takes up to 340 bytes for each."""
 
 _MESSAGE_HEADS: Final = {
     "dbc": r"^[ \t]*BO_\s+(\d+)",

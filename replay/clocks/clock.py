@@ -9,8 +9,8 @@ import numpy as np
 
 from crosscue.replay.columns import Block, Int64s
 
+# Upper bound on valid stamps, in the year 2116; below it, differences fit into 64 bits.
 LATEST_NS: Final = 1 << 62
-"""Upper bound on valid stamps, in the year 2116; below it, differences fit into 64 bits."""
 
 
 class Clock(Enum):

@@ -15,14 +15,14 @@ SECOND_NS: Final = 1_000_000_000
 DRIFT_WORTH_TELLING_PPM: Final = 50.0
 DRIFT_ERRORS_WORTH_TELLING: Final = 5.0
 DUPLICATES_WORTH_TELLING: Final = 0.01
+# Min number of rows for a report of a clock's offset. One or two messages sent long before the
+# recorder started are latched messages, not a wrong clock.
 ROWS_FOR_OFFSET: Final = 3
-"""Min number of rows for a report of a clock's offset. One or two messages sent long before the
-recorder started are latched messages, not a wrong clock."""
+# Distance between the times of two topics beyond which they share no clock.
 APART_NS: Final = SECOND_NS
-"""Distance between the times of two topics beyond which they share no clock."""
 
+# Start of the year 2000; lower stamps do not count from 1970.
 _FIRST_UTC_NS: Final = 946_684_800 * SECOND_NS
-"""Start of the year 2000; lower stamps do not count from 1970."""
 _GPS_EPOCH_S: Final = 315_964_800
 _KNOWN_OFFSETS_S: Final[Mapping[int, str]] = {
     18: "GPS time counted from 1970, without leap seconds",

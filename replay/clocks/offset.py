@@ -29,8 +29,8 @@ JUMP_FLOOR_NS: Final = 10_000_000
 JUMP_WINDOW_NS: Final = 2_000_000_000
 _JUMP_OVER_WAIT: Final = 6
 _SHARP_ROWS: Final = 4
+# Rows required on either side of a jump; with fewer, a ramp looks the same.
 _ROWS_BESIDE: Final = 16
-"""Rows required on either side of a jump; with fewer, a ramp looks the same."""
 _SHORTEST_SIDE_NS: Final = 100_000_000
 _WINDOW_ROWS: Final = (_ROWS_BESIDE, 8192)
 _ENVELOPE_BINS: Final = 1024

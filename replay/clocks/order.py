@@ -21,9 +21,9 @@ from .periods import PeriodSketch
 
 LOOK_AHEAD: Final = 128
 EVENTS_KEPT: Final = 32
+# Rows required after a reset. A backward step closer to the end counts as a late row, because the
+# two cannot be distinguished.
 _ROWS_TO_BELIEVE: Final = 3
-"""Rows required after a reset. A backward step closer to the end counts as a late row, because the
-two cannot be distinguished."""
 
 
 @dataclass(frozen=True, slots=True)

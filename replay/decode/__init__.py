@@ -29,6 +29,7 @@ class Decoder(Protocol):
         ...
 
 
+# Factories by message encoding, as ``module:function``. Each maps a topic to a decoder or None.
 BY_ENCODING: Final[Mapping[str, str]] = {
     "columns": "crosscue.replay.decode:_as_it_is",
     "cdr": "crosscue.replay.decode.ros.decoder:ros_decoder",
@@ -36,7 +37,6 @@ BY_ENCODING: Final[Mapping[str, str]] = {
     "protobuf": "crosscue.replay.decode.protobuf:protobuf_decoder",
     "json": "crosscue.replay.decode.json_text:json_decoder",
 }
-"""Factories by message encoding, as ``module:function``. Each maps a topic to a decoder or None."""
 
 
 def decoder_for(topic: Topic) -> Decoder | None:

@@ -6,11 +6,11 @@ from typing import Final
 
 from crosscue.replay.columns import ImageCoding
 
+# Number of first bytes that ``coding_of`` examines.
 MAGIC_BYTES: Final = 12
-"""Number of first bytes that ``coding_of`` examines."""
 
+# Suffixes of files that are read as images.
 IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp")
-"""Suffixes of files that are read as images."""
 JPEG: Final = b"\xff\xd8"
 _LABELS: Final[tuple[tuple[str, ImageCoding], ...]] = (
     ("jpeg", "jpeg"),
@@ -20,13 +20,13 @@ _LABELS: Final[tuple[tuple[str, ImageCoding], ...]] = (
     ("tiff", "tiff"),
     ("bmp", "bmp"),
 )
+# Codings by supported label of ``CompressedVideo``.
 STREAMS: Final[dict[str, ImageCoding]] = {
     "h264": "h264",
     "h265": "h265",
     "hevc": "h265",
     "av1": "av1",
 }
-"""Codings by supported label of ``CompressedVideo``."""
 
 
 def coding_of(first: bytes, label: str) -> ImageCoding | None:

@@ -16,11 +16,11 @@ from crosscue.replay.base import Block, Images, Ledger, Messages, one_line
 if TYPE_CHECKING:
     from av import VideoFrame
 
+# FFmpeg's decoders by coding of ``Images``.
 CODECS: Final = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
-"""FFmpeg's decoders by coding of ``Images``."""
 MAX_PIXELS: Final = 64_000_000
+# Number of pictures in a block; at 1280 by 720 these are 22 MB.
 AT_ONCE: Final = 8
-"""Number of pictures in a block; at 1280 by 720 these are 22 MB."""
 NOT_DECODED: Final = "video packet not decoded"
 NO_PICTURE: Final = "video packet without picture"
 

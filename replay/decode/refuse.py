@@ -14,10 +14,10 @@ VIDEO_CODING: Final = "unknown video coding"
 BIG_ENDIAN: Final = "big-endian pixels not supported"
 LONG_LENS: Final = "over 14 lens coefficients"
 
+# Reasons for intact messages that are not supported; any other reason means damage.
 FOREIGN: Final = frozenset(
     {WRONG_CODING, EMPTY_PICTURE, IMAGE_CODING, VIDEO_CODING, BIG_ENDIAN, LONG_LENS}
 )
-"""Reasons for intact messages that are not supported; any other reason means damage."""
 
 
 def refuse(

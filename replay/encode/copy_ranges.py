@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+# Max number of different lengths for copies length by length; with more, copies are single.
 FEW_LENGTHS: Final = 32
-"""Max number of different lengths for copies length by length; with more, copies are single."""
+# Mean size in bytes from which single copies are as fast.
 LARGE: Final = 4096
-"""Mean size in bytes from which single copies are as fast."""
 
 
 def copy_ranges(

@@ -22,8 +22,8 @@ from .outgoing import Outgoing, Ros2Type, own_type, stamps, standard_type, with_
 from .template import filled, template_of
 
 Columns = Mapping[str, NDArray[np.generic]]
+# First element of a covariance without an estimate, as specified by sensor_msgs/msg/Imu.
 ABSENT: Final = -1.0
-"""First element of a covariance without an estimate, as specified by sensor_msgs/msg/Imu."""
 
 
 @dataclass(frozen=True, slots=True)

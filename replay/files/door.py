@@ -19,8 +19,8 @@ from .bounded import read_pieces
 if TYPE_CHECKING:
     import pyarrow as pa
 
+# Max size of files such as tags, failure logs and entries of a journal.
 SMALL_BYTES: Final = 16 << 20
-"""Max size of files such as tags, failure logs and entries of a journal."""
 _LINK: Final = "a link, which is not followed here; delete it, or put the file in its place"
 _SPECIAL: Final = "not a regular file; delete it"
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
+# Number of hex digits in a run's name.
 SHORT: Final = 8
-"""Number of hex digits in a run's name."""
 
 
 @dataclass(frozen=True, slots=True)

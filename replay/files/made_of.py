@@ -16,10 +16,10 @@ from crosscue.replay.files.log_identity import as_row, of_row
 
 from .identity import identity_of, identity_of_all
 
+# File that `simulate` writes next to a log: it marks the log as simulated, with its settings.
 SIMULATED: Final = "simulated.json"
-"""File that `simulate` writes next to a log: it marks the log as simulated, with its settings."""
+# Inputs and settings of a result that need not be distinguished from others.
 NOTHING: Final[Mapping[str, Any]] = {}
-"""Inputs and settings of a result that need not be distinguished from others."""
 
 
 def made_of(inputs: Sequence[Path], settings: Mapping[str, object]) -> dict[str, Any]:

@@ -23,12 +23,12 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 PARTIAL: Final = ".partial"
+# Max bytes of the final name in the temporary name, which file systems limit in length.
 NAME_BYTES: Final = 200
-"""Max bytes of the final name in the temporary name, which file systems limit in length."""
+# Min time between sweeps of a folder, because a process may write thousands of files.
 SWEEP_S: Final = 1.0
-"""Min time between sweeps of a folder, because a process may write thousands of files."""
+# Errors of file systems that do not support locks.
 WITHOUT_LOCKS: Final = frozenset({errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL})
-"""Errors of file systems that do not support locks."""
 SCRATCH: Final = "crosscue-scratch-"
 
 _OURS: Final = re.compile(r"\..*\.crosscue-[0-9a-f]{16}\.partial", re.DOTALL)

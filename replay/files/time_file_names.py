@@ -7,8 +7,8 @@ from typing import Final
 
 from crosscue.replay.errors import LogFormatError
 
+# Names tried in this order inside a folder, before any ``.csv``.
 NAMES: Final = ("timestamps.txt", "times.txt", "rgb.txt")
-"""Names tried in this order inside a folder, before any ``.csv``."""
 
 
 def find_time_file(folder: Path) -> Path | None:

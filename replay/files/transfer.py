@@ -30,8 +30,8 @@ TIMEOUT_S: Final = 30.0
 _PARTIAL: Final = 206
 _RANGE_REFUSED: Final = 416
 
+# Called with a file's name, the number of bytes received, and their total number.
 Progress = Callable[[str, int, int], None]
-"""Called with a file's name, the number of bytes received, and their total number."""
 
 
 class KnownFile(Protocol):

@@ -23,23 +23,23 @@ import numpy as np
 if TYPE_CHECKING:
     from tomlkit import TOMLDocument
 
+# Max levels of nested objects and arrays; a manifest has about ten.
 MAX_DEPTH: Final = 64
-"""Max levels of nested objects and arrays; a manifest has about ten."""
+# Max characters of a YAML text, whose parser takes about 20 us for each.
 _MAX_YAML: Final = 1 << 20
-"""Max characters of a YAML text, whose parser takes about 20 us for each."""
+# A string, also one cut off by the end of the text, so that matching takes linear time.
 _STRING: Final = re.compile(rb'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
-"""A string, also one cut off by the end of the text, so that matching takes linear time."""
+# A string or a comment, also one cut off; each character is tried once.
 _TOML_QUOTED: Final = re.compile(
     r"""\"{3}[^"\\]*+(?:(?:\\.|"{1,2}(?!"))[^"\\]*+)*+(?:"{3,5}|\\?\Z)
     | '{3}[^']*+(?:'{1,2}(?!')[^']*+)*+(?:'{3,5}|\Z)
     | "[^"\\\n]*+(?:\\.[^"\\\n]*+)*+"? | '[^'\n]*+'? | \#[^\n]*+""",
     re.DOTALL | re.VERBOSE,
 )
-"""A string or a comment, also one cut off; each character is tried once."""
+# A dotted key of more levels than allowed, in a text whose strings are replaced by letters.
 _TOML_KEY: Final = re.compile(
     rf"(?<![\w-])[\w-]++(?:[ \t]*+\.[ \t]*+[\w-]++){{{MAX_DEPTH}}}", re.ASCII
 )
-"""A dotted key of more levels than allowed, in a text whose strings are replaced by letters."""
 _OPEN: Final = b"[{"
 _NO_BRACKET: Final = bytes(set(range(256)) - set(b"[]{}"))
 _TOO_DEEP: Final = f"nested over {MAX_DEPTH} levels deep"

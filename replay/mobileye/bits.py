@@ -10,8 +10,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+# Payloads, shape (N,).
 Words: TypeAlias = NDArray[np.uint64]
-"""Payloads, shape (N,)."""
 
 
 def words_of(payloads: NDArray[np.uint8]) -> Words:

@@ -25,18 +25,18 @@ from numpy.typing import NDArray
 MS: Final = 1_000_000
 WRAP_NS: Final = 256 * MS
 
+# Max drift between two clocks; a crystal is off by at most 100 parts per million.
 DRIFT: Final = 200e-6
-"""Max drift between two clocks; a crystal is off by at most 100 parts per million."""
 FIRST_EARLY_NS: Final = 128 * MS
 LAST_EARLY_NS: Final = 16 * MS
+# Number of frames after which the offset is settled. The first frame may be slow, so earlier frames
+# may be faster by up to half a wrap.
 SETTLED_AFTER: Final = 15
-"""Number of frames after which the offset is settled. The first frame may be slow, so earlier
-frames may be faster by up to half a wrap."""
+# Time without a frame after which the offset restarts, because of possible drift.
 GAP_NS: Final = 60_000 * MS
-"""Time without a frame after which the offset restarts, because of possible drift."""
 WATCHED: Final = 32
+# If none of ``WATCHED`` frames is this close to the fastest, the counter or a clock was set.
 STEP_NS: Final = 12 * MS
-"""If none of ``WATCHED`` frames is this close to the fastest, the counter or a clock was set."""
 
 WENT_BACK: Final = "the log's clock was set back, image times restart"
 LONG_GAP: Final = "a gap is too long to follow the clocks' drift, image times restart"

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from crosscue.replay.base import SchemaError, toml_tree
 
 Column: TypeAlias = NDArray[np.generic]
+# Columns of a message's fields, or of a table, by name.
 Columns: TypeAlias = dict[str, Column]
-"""Columns of a message's fields, or of a table, by name."""
 Kind: TypeAlias = Literal["real", "code", "flag"]
 Beyond: TypeAlias = Literal["refuse", "clip", "drop"]
 
+# Variants named by ``only``; a frame's variant is an index in this tuple, or ``UNKNOWN``.
 VARIANTS: Final = ("classic", "2.32", "extended", "tsr", "basic")
-"""Variants named by ``only``; a frame's variant is an index in this tuple, or ``UNKNOWN``."""
 UNKNOWN: Final = -1
+# Variant of each frame as an index in ``VARIANTS``, or ``UNKNOWN``; shape (N,).
 Variant: TypeAlias = NDArray[np.int8]
-"""Variant of each frame as an index in ``VARIANTS``, or ``UNKNOWN``; shape (N,)."""
 WORD_BITS: Final = 64
 
 

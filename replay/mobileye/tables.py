@@ -31,9 +31,9 @@ from .layout import Column, Columns, layout, unit_of
 
 LEFT: Final = 1
 RIGHT: Final = -1
+# Lateral position sent for a side without a marking, half of a usual lane's width; such a side also
+# has type 2, quality 0 and no range.
 NO_LANE_C0_M: Final = 1.875
-"""Lateral position sent for a side without a marking, half of a usual lane's width; such a side
-also has type 2, quality 0 and no range."""
 NO_LANE_TYPE: Final = 2
 
 _CUBIC: Final = ("c0_m", "c1", "c2_per_m", "c3_per_m2")

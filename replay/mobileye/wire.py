@@ -20,8 +20,8 @@ from .layout import VARIANTS, Column, Columns, Field, Message, Variant
 _TO_SI: Final[Mapping[str, float]] = {"deg": pi / 180, "deg/s": pi / 180, "km/h": 1 / 3.6}
 
 MISSING_CODE: Final = -1
+# Max distance, in steps, of a value from the raw step that it represents (float32 fields).
 _SNAP: Final = 0.05
-"""Max distance, in steps, of a value from the raw step that it represents (float32 fields)."""
 
 
 def values_of(message: Message, words: Words, variant: Variant) -> dict[str, NDArray[np.float64]]:

@@ -21,13 +21,13 @@ from crosscue.replay.base import (
     Topic,
 )
 
+# Maximum number of buses of a log; more names are a sign of damage.
 BUSES_MAX: Final = 256
-"""Maximum number of buses of a log; more names are a sign of damage."""
 
+# Number of payload bytes by DLC code (ISO 11898-1).
 FD_LENGTHS: Final = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64], np.int64)
-"""Number of payload bytes by DLC code (ISO 11898-1)."""
+# True for numbers of payload bytes that a CAN FD frame can have.
 IS_FD_LENGTH: Final = np.isin(np.arange(65), FD_LENGTHS)
-"""True for numbers of payload bytes that a CAN FD frame can have."""
 
 
 def keep_memory() -> None:

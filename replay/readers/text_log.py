@@ -23,10 +23,10 @@ from crosscue.replay.base import (
     Topic,
 )
 
+# Maximum length of a line, which bounds memory; a longer line is not a row of numbers.
 MAX_LINE: Final = 4096
-"""Maximum length of a line, which bounds memory; a longer line is not a row of numbers."""
+# Time in nanoseconds on the log's clock, and a number for each column.
 Row: TypeAlias = tuple[int, *tuple[float, ...]]
-"""Time in nanoseconds on the log's clock, and a number for each column."""
 
 
 @dataclass(frozen=True, slots=True)

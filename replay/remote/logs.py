@@ -50,6 +50,7 @@ from .ranges import RangedFile, Spool
 from .waiting import answered
 
 CHUNK_BYTES: Final = 4 << 20
+# Keys under which stores report the version of an object; the first one present is used.
 VERSION_KEYS: Final = (
     "ETag",
     "etag",
@@ -63,7 +64,6 @@ VERSION_KEYS: Final = (
     "updated",
     "created",
 )
-"""Keys under which stores report the version of an object; the first one present is used."""
 LOCK: Final = ".lock"
 SIZE: Final = ".size"
 STORE_VARIABLE: Final = "CROSSCUE_STORE"
@@ -251,11 +251,11 @@ class _Partial(Protocol):
     def close(self) -> None: ...
 
 
+# Openers of the formats that can be read in byte ranges.
 RANGED: Final = {
     ".mcap": "crosscue.replay.readers.mcap.reader:open_ranged",
     ".bag": "crosscue.replay.readers.rosbag1.reader:open_ranged",
 }
-"""Openers of the formats that can be read in byte ranges."""
 
 
 class RangedLog(Closing):

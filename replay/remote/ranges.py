@@ -30,8 +30,8 @@ AHEAD: Final = 8 << 10
 MAX_AHEAD: Final = 512 << 10
 KEPT: Final = 64
 KEPT_BYTES: Final = 32 << 20
+# Waiting times before each retry of a failed request.
 WAITS_S: Final = (0.1, 0.5, 2.0)
-"""Waiting times before each retry of a failed request."""
 
 T = TypeVar("T")
 

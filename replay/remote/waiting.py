@@ -8,8 +8,8 @@ from typing import Final, TypeVar
 from crosscue.replay.errors import LogError
 
 NOTICE_S: Final = 5.0
+# Longest time for one request, of at most 4 MiB: 70 kB/s suffice.
 LIMIT_S: Final = 60.0
-"""Longest time for one request, of at most 4 MiB: 70 kB/s suffice."""
 
 T = TypeVar("T")
 

@@ -36,10 +36,10 @@ VERSION: Final = 1
 HASH: Final = "xxh3_128"
 BLOCK_BYTES: Final = MIB
 DIGEST_BYTES: Final = 16
+# Max size of a seal file, which suffices for a log of 8 TB.
 MAX_SEAL_BYTES: Final = 256 * MIB
-"""Max size of a seal file, which suffices for a log of 8 TB."""
+# Name in the seal of a log that is one file, so that both can be renamed together.
 THE_LOG: Final = "."
-"""Name in the seal of a log that is one file, so that both can be renamed together."""
 _NAMES_SHOWN: Final = 3
 
 

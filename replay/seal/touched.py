@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
 
+# Size of blocks as a power of two: 1 MiB, as in seals.
 BLOCK_BITS: Final = 20
-"""Size of blocks as a power of two: 1 MiB, as in seals."""
 
+# Block numbers by file.
 Blocks: TypeAlias = dict[Path, set[int]]
-"""Block numbers by file."""
 
 
 class Touched:

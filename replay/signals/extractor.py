@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from crosscue.replay.decode.packets import PacketDecoder
 
 
+# Duration at a log's start that is examined to choose a clock for each topic.
 PROBE_NS: Final = 10_000_000_000
-"""Duration at a log's start that is examined to choose a clock for each topic."""
 
 
+# Readers of buses and devices as ``module:class``, imported for a drive that has one.
 READERS: Final = {
     Role.CAN: "crosscue.replay.signals.can_signals:CanSignals",
     Role.MOBILEYE: "crosscue.replay.mobileye.samples:MobileyeStream",
 }
-"""Readers of buses and devices as ``module:class``, imported for a drive that has one."""
 
 CanReader: TypeAlias = Callable[[Block], Iterator[Samples]]
 

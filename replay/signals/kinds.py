@@ -78,6 +78,8 @@ class Plan:
         return next((source for source in self.sources if signal in source.signals), None)
 
 
+# Columns of obstacles. A row with only ``burst`` starts the burst of an image, even without
+# obstacles.
 OBSTACLE_COLUMNS: Final = (
     "burst",
     "x_m",
@@ -88,8 +90,7 @@ OBSTACLE_COLUMNS: Final = (
     "valid",
     "age_frames",
 )
-"""Columns of obstacles. A row with only ``burst`` starts the burst of an image, even without
-obstacles."""
+# Columns of lanes; ``c0_m`` and ``x_end_m`` are NaN on a side without a marking.
 LANE_COLUMNS: Final = (
     "side",
     "lane_type",
@@ -100,4 +101,3 @@ LANE_COLUMNS: Final = (
     "c3_per_m2",
     "x_end_m",
 )
-"""Columns of lanes; ``c0_m`` and ``x_end_m`` are NaN on a side without a marking."""

@@ -18,8 +18,8 @@ from crosscue.replay.signals.kinds import Plan, Samples, Signal
 
 WIDTH_NS: Final = 1_000_000_000
 HORIZON_NS: Final = 60_000_000_000
+# Max disorder of the rows of one topic, or lag of their own clock, before they count as late.
 SLACK_NS: Final = 1_200_000_000
-"""Max disorder of the rows of one topic, or lag of their own clock, before they count as late."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,11 +22,11 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .segments import BEGINNING, Cause, Epoch, LogClock, Marks, Segment, Timeline
 from .stamp_watch import StampWatch
 
+# Max difference of the set-backs of two topics or logs that count as one.
 SAME_NS: Final = 2_000_000_000
-"""Max difference of the set-backs of two topics or logs that count as one."""
 
+# Reader of the wheel speeds of a block, see ``wheels_only`` in ``replay.signals.extractor``.
 WheelReader: TypeAlias = Callable[[Block], Iterable[Samples]]
-"""Reader of the wheel speeds of a block, see ``wheels_only`` in ``replay.signals.extractor``."""
 
 
 @dataclass(slots=True)

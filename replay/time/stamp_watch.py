@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 MIN_SET_BACK_NS: Final = 100_000_000
+# Min distance of a stray from both its neighbours.
 STRAY_NS: Final = 1_000_000_000
-"""Min distance of a stray from both its neighbours."""
 MAX_STRAY_ROWS: Final = 8
 LOOK_AHEAD: Final = 128
 ROWS_TO_BELIEVE: Final = 3
+# Max number of set-backs and strays of one topic; later ones are treated as late rows.
 MAX_FINDINGS: Final = 10_000
-"""Max number of set-backs and strays of one topic; later ones are treated as late rows."""
 
 
 @dataclass(frozen=True, slots=True)

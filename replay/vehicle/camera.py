@@ -11,12 +11,12 @@ from crosscue.replay.errors import VehicleError
 
 from .section import Finite, NotNegative, Positive, Section
 
+# Maximum distance of the optical center from the image's middle, as a fraction of its size.
 MAX_CENTER_OFF: Final = 0.15
-"""Maximum distance of the optical center from the image's middle, as a fraction of its size."""
+# Plausible horizontal fields of view, from a telephoto to a wide-angle lens.
 VIEW_DEG: Final = (15.0, 150.0)
-"""Plausible horizontal fields of view, from a telephoto to a wide-angle lens."""
+# Maximum relative difference of the aspect ratios of scaled images.
 MAX_ASPECT_OFF: Final = 0.01
-"""Maximum relative difference of the aspect ratios of scaled images."""
 Pixels = Annotated[int, Field(gt=0, le=65535)]
 
 

@@ -42,11 +42,11 @@ def _road(side: str, *, can_start: bool) -> CueSpec:
     )
 
 
+# Frames, of five, in which a sign must be found: sign search is tuned for precision at a low recall
+# (eq. 17).
 SIGN_FRAMES: Final = 2
-"""Frames, of five, in which a sign must be found: sign search is tuned for precision at a low
-recall (eq. 17)."""
+# Typical time for which a crossing car is visible; a later detection is another car.
 MOVES_FADE_S: Final = 2.0
-"""Typical time for which a crossing car is visible; a later detection is another car."""
 
 
 def _cars(
@@ -72,12 +72,11 @@ def _crossing(side: str) -> CueSpec:
     return _cars("cross_traffic", "cross traffic", "cars:count_crossing", 0.86, side, MOVES_FADE_S)
 
 
+# Precision on eight simulated drives with perfect boxes (``benchmarks/tracked_cars.py``). It is the
+# lower end of the 95 % interval for 184 correct of 189 cars, measured when the rule was introduced.
+# Now 189 of 190 cars are correct. The lower end would be 0.97, but frames of one car are
+# correlated.
 PAST_PRECISION: Final = 0.94
-"""Precision on eight simulated drives with perfect boxes (``benchmarks/tracked_cars.py``).
-
-It is the lower end of the 95 % interval for 184 correct of 189 cars, measured when the rule was
-introduced. Now 189 of 190 cars are correct. The lower end would be 0.97, but frames of one car are
-correlated."""
 
 
 def _cars_past(way: str) -> CueSpec:
@@ -145,9 +144,10 @@ DO_NOT_ENTER: Final = CueSpec(
     seen_frames=SIGN_FRAMES,
 )
 
+# Labels of the American and the international sign, which are equivalent.
 SAME_SIGN: Final = {"do not enter": ("do not enter", "no entry")}
-"""Labels of the American and the international sign, which are equivalent."""
 
+# Built-in cues by name, in the order of tables; the precision of signs is their tuning target.
 BUILTIN_CUES: Final[dict[str, CueSpec]] = {
     spec.name: spec
     for spec in (
@@ -169,10 +169,9 @@ BUILTIN_CUES: Final[dict[str, CueSpec]] = {
         DO_NOT_ENTER,
     )
 }
-"""Built-in cues by name, in the order of tables; the precision of signs is their tuning target."""
 
+# Every cue by name, in the order of tables and reports: built-in cues, then those of plug-ins.
 CUES: Final[dict[str, CueSpec]] = BUILTIN_CUES | dict(loaded("cue", CueSpec, BUILTIN_CUES))
-"""Every cue by name, in the order of tables and reports: built-in cues, then those of plug-ins."""
 
 
 def groups() -> dict[str, tuple[CueSpec, ...]]:

@@ -25,8 +25,8 @@ from .temporal import Temporal
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
+# Columns of ``belief.parquet``, which cannot be names of features.
 NOT_FEATURES: Final = ("t_ns", "approach", "established", "not_believed")
-"""Columns of ``belief.parquet``, which cannot be names of features."""
 
 
 class RangeFilter(Section):

@@ -25,6 +25,7 @@ class Role(Enum):
     WHEELS = "wheel speeds"
 
 
+# Roles by type name in ROS 2 spelling; ``ros2_spelling`` converts ROS 1 names.
 BY_TYPE: Final[Mapping[str, Role]] = {
     "sensor_msgs/msg/CompressedImage": Role.CAMERA,
     "sensor_msgs/msg/Image": Role.CAMERA,
@@ -46,8 +47,8 @@ BY_TYPE: Final[Mapping[str, Role]] = {
     "nav_msgs/msg/Odometry": Role.ODOMETRY,
     "geometry_msgs/msg/PoseStamped": Role.POSE,
 }
-"""Roles by type name in ROS 2 spelling; ``ros2_spelling`` converts ROS 1 names."""
 
+# Types whose rows are plain columns: ``convert`` may change the type, but not the role.
 OF_TABLES: Final[Mapping[str, Role | None]] = {
     "crosscue/Table": None,
     **{
@@ -56,7 +57,6 @@ OF_TABLES: Final[Mapping[str, Role | None]] = {
         if role in (Role.IMU, Role.MAGNETOMETER, Role.GNSS, Role.ODOMETRY, Role.POSE, Role.WHEELS)
     },
 }
-"""Types whose rows are plain columns: ``convert`` may change the type, but not the role."""
 
 
 def is_table(topic: Topic) -> bool:

@@ -14,8 +14,8 @@ from pydantic import BaseModel
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
+# Maximum number of characters of an invalid value in a message.
 GIVEN_CHARACTERS: Final = 80
-"""Maximum number of characters of an invalid value in a message."""
 
 
 def explain(error: ValidationError, text: str | None, where: str, root: type[BaseModel]) -> str:

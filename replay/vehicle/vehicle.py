@@ -42,8 +42,8 @@ Vector = tuple[Finite, Finite, Finite]
 Matrix = tuple[Vector, Vector, Vector]
 Proportion = Annotated[float, Field(ge=0.0, le=1.0)]
 Polygon = Annotated[tuple[tuple[Proportion, Proportion], ...], Field(min_length=3)]
+# ``MESSAGE.SIGNAL``, spelled as in the DBC file.
 Signal = Annotated[str, Field(pattern=r"^[^.\s]+\.[^.\s]+$")]
-"""``MESSAGE.SIGNAL``, spelled as in the DBC file."""
 
 
 class Topics(Section):
@@ -175,11 +175,10 @@ class OwnCue(Section):
     score: Proportion = 0.5
 
 
+# Name in the vehicle files that ``simulate`` writes; it makes the published belief the default.
+# Whether a log is simulated is recorded in a file next to it, see
+# ``crosscue.replay.files.made_of``.
 SIMULATED_CAR: Final = "crosscue simulated car"
-"""Name in the vehicle files that ``simulate`` writes; it makes the published belief the default.
-
-Whether a log is simulated is recorded in a file next to it, see ``crosscue.replay.files.made_of``.
-"""
 
 
 class Cues(Section):

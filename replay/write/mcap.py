@@ -23,10 +23,10 @@ from crosscue.replay.files.partial_file import PartialFile
 from crosscue.replay.readers.mcap.records import CONVERTED_FROM
 
 LIBRARY: Final = "crosscue"
+# Target size of a chunk in uncompressed bytes.
 CHUNK_BYTES: Final = 4 << 20
-"""Target size of a chunk in uncompressed bytes."""
+# Bytes of payload that are buffered and merged by time.
 WINDOW_BYTES: Final = 8 << 20
-"""Bytes of payload that are buffered and merged by time."""
 
 Compression: TypeAlias = Literal["zstd", "lz4", "none"]
 

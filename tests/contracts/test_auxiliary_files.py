@@ -24,6 +24,7 @@ from support.trees import tree
 INPUT: Final = 4
 SETTINGS: Final = 2
 
+# Command lines in which ``{gone}`` is the file, and the expected exit status.
 CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("info", "LOG"): ("{gone}", INPUT),
     ("convert", "LOG"): ("{gone} -o {out}.mcap", INPUT),
@@ -170,22 +171,22 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
         SETTINGS,
     ),
 }
-"""Command lines in which ``{gone}`` is the file, and the expected exit status."""
+# Commands that read the DBC files of a vehicle file.
 READS_DBC_FILES: Final[dict[str, str]] = {
     "decode": "{log} -o {out} --vehicle {vehicle}",
     "replay": "{log} -o {out} --vehicle {vehicle} --no-cache",
     "estimate": "{run} --vehicle {vehicle}",
     "info": "{log} --vehicle {vehicle}",
 }
-"""Commands that read the DBC files of a vehicle file."""
+# Options whose file is created if it is missing.
 WRITTEN: Final = {"--output", "--junit", "--cache", "--figure", "--sheet"}
-"""Options whose file is created if it is missing."""
+# Arguments that are not files.
 NO_FILES: Final = {"LAYOUT", "SQL"}
-"""Arguments that are not files."""
+# Commands whose arguments accept any file, or no file.
 ANY_BYTES: Final = {"seal", "model fetch", "completion"}
-"""Commands whose arguments accept any file, or no file."""
+# Arguments whose file is created if it is missing or empty.
 CREATED_IF_MISSING: Final = {("landmarks add", "DB")}
-"""Arguments whose file is created if it is missing or empty."""
+# Arguments that accept a folder; an empty folder is another error.
 FOLDERS: Final = {
     ("estimate", "--logs"), ("score", "--logs"), ("view", "--logs"),
     ("score detector", "--logs"), ("fit detector", "--logs"), ("landmarks add", "--images"),
@@ -194,7 +195,6 @@ FOLDERS: Final = {
     ("failures", "RUN"), ("browse", "RUN"), ("browse", "--logs"), ("export", "--logs"),
     ("truth import", "--export"), ("truth import", "ANNOTATIONS"),
 }  # fmt: skip
-"""Arguments that accept a folder; an empty folder is another error."""
 DAMAGE: Final[dict[str, Callable[[Path], object]]] = {
     "missing": lambda path: None,
     "empty": lambda path: path.write_bytes(b""),

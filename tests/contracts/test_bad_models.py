@@ -22,6 +22,7 @@ ROWS = np.array([[[4.0, 4.0, 20.0, 20.0, 0.9, 1.0]]], np.float32)
 OUTPUT = 'kind = "end-to-end"\nscore = 0.3\nclasses = {}\n'
 CAMERA = "version = 1\n[camera]\nfocal_px = 900.0\ncenter_px = [960.0, 540.0]\n"
 COUNTED = 'version = 1\n[cues.own.pets]\nlabels = ["dog"]\n'
+# Defects of a network for three pictures, and a part of the error line.
 BAD = {
     "nan": "net.toml: output: 1 of 1 candidates are not finite numbers; correct the card",
     "other-shape": "net.toml: output: expected (1, N, 6)",
@@ -34,7 +35,6 @@ BAD = {
     "other-camera": "outside the images of 24 x 16 pixels",
     "not-counted": "net: no cue counts any of its 2 labels (cat, dog); state what its classes mean",
 }
-"""Defects of a network for three pictures, and a part of the error line."""
 
 
 class Everything(BoxDetector):

@@ -31,6 +31,7 @@ from support.rosbag_files import START_NS, Row, write_bag, write_folder
 DECLARED = 3 * MIB
 LIMIT_MIB = 2
 
+# Arguments with which each command reads every chunk of a log, and its exit status.
 OPENS_LOGS: dict[str, tuple[str, int]] = {
     "info": ("{log}", 3),
     "convert": ("{log} -o {out}.mcap", 3),
@@ -55,9 +56,8 @@ OPENS_LOGS: dict[str, tuple[str, int]] = {
     "browse": ("{run} --truth {truth} --any-log -o {out}", 3),
     "export": ("{failures} -o {out}", 3),
 }
-"""Arguments with which each command reads every chunk of a log, and its exit status."""
+# Commands that read few pictures or none, and report only the messages that the run dropped.
 REPORTS_THE_RUN = {"score", "score detector", "fit detector", "browse", "export"}
-"""Commands that read few pictures or none, and report only the messages that the run dropped."""
 OPENS_NO_LOG: dict[str, str] = {
     "compare": "tables", "query": "tables", "tag": "texts", "merge": "tables",
     "status": "the journal", "failures": "tables",
@@ -182,6 +182,7 @@ HOLDERS: dict[str, Callable[[Path, list[tuple[str, bytes]]], Path]] = {
     ),
     "mcap": lambda folder, pictures: write_folder(folder / "cam", _rows(pictures, _ros2), "mcap"),
 }
+# Commands that decode a camera's pictures, or at least their headers, and their exit status.
 READS_CAMERA: dict[str, tuple[str, int]] = {
     "detect": ("{log} -o {out} --detectors support.gap_drive:build --no-cache", 3),
     "replay": ("{log} -o {out} --detectors support.gap_drive:build --no-cache", 3),
@@ -190,7 +191,6 @@ READS_CAMERA: dict[str, tuple[str, int]] = {
     "fit landmarks": ("{log} --database {db} --poses {truth}", 1),
     "fit signs": ("{drive} --label stop_sign", 1),
 }
-"""Commands that decode a camera's pictures, or at least their headers, and their exit status."""
 
 
 @pytest.mark.parametrize("holder", HOLDERS)
@@ -227,6 +227,7 @@ def _assert_reports_size_and_limit(capsys: pytest.CaptureFixture[str]) -> None:
     assert f"{MAX_PIXELS:,}" in output
 
 
+# Commands that decode picture files.
 READS_FILES: dict[str, str] = {
     "landmarks match": "{db} {picture}",
     "landmarks add": "{db} --images {folder} --coordinates {folder}/places.csv",
@@ -238,7 +239,6 @@ READS_FILES: dict[str, str] = {
     "train mask-rcnn": "--data {folder}/coco.json --images {folder}/images -o {out}.safetensors "
     "--steps 1 --batch 1 --check-every 1 --device cpu",
 }
-"""Commands that decode picture files."""
 
 
 @pytest.mark.parametrize("coded", CODED)
@@ -272,6 +272,7 @@ def test_oversized_picture_file_is_refused_with_status_4(
     assert not (folder / "new.toml").exists()
 
 
+# Declared input shape, metadata, and the expected message.
 SIZES: dict[str, tuple[tuple[int | str, ...], dict[str, str], str]] = {
     "size from metadata": (
         (1, 3, "h", "w"),
@@ -281,7 +282,6 @@ SIZES: dict[str, tuple[tuple[int | str, ...], dict[str, str], str]] = {
     "batch": ((100_000, 3, 640, 640), {}, "122,880,000,000 numbers, the limit is 201,326,592"),
     "side": ((1, 3, 200_000, 200_000), {}, "120,000,000,000 numbers, the limit is 201,326,592"),
 }
-"""Declared input shape, metadata, and the expected message."""
 
 
 @pytest.mark.parametrize("case", SIZES)

@@ -16,10 +16,10 @@ from crosscue.eval.runs.folder import DetectorRow, EstimateManifest, open_run
 from support.onnx_models import constant_model
 from support.pictures import picture_folder
 
+# Size of the network's input; pictures of 24 x 16 pixels are stretched to it.
 WIDTH, HEIGHT = 64, 32
-"""Size of the network's input; pictures of 24 x 16 pixels are stretched to it."""
+# Box of one car: four times as long as high in the input, and three times in the picture.
 BOX = np.array([8.0, 12.0, 56.0, 24.0])
-"""Box of one car: four times as long as high in the input, and three times in the picture."""
 VEHICLE = """version = 1
 [cars]
 kind = "pairs"

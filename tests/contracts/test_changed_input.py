@@ -18,6 +18,7 @@ from support.pictures import picture
 from support.scenes import shorten
 from support.trees import tree
 
+# Arguments, the flag that resumes or overwrites, and an option that changes the input.
 COMMANDS: dict[str, tuple[str, str, str]] = {
     "train road": (
         "--data {folder} -o {out}/net.safetensors --steps 1 --batch 1 --width 128 --device cpu",
@@ -32,7 +33,6 @@ COMMANDS: dict[str, tuple[str, str, str]] = {
     ),
     "simulate": ("A -o {out} --width 64", "--overwrite", "--seed 3"),
 }
-"""Arguments, the flag that resumes or overwrites, and an option that changes the input."""
 WRITERS = (
     "crosscue.detectors.networks.road.checkpoint.save_road",
     "crosscue.detectors.training.job.save_checkpoint",

@@ -14,10 +14,10 @@ import pytest
 from crosscue.eval import cli
 from crosscue.replay.base import one_line
 
+# Exit status for an unreadable recording, run, database, picture or annotation file.
 INPUT: Final = 4
-"""Exit status for an unreadable recording, run, database, picture or annotation file."""
+# Exit status for an unreadable file of settings.
 SETTINGS: Final = 2
-"""Exit status for an unreadable file of settings."""
 
 MISSING: Final[dict[str, tuple[str, int]]] = {
     "info": ("gone.mcap", INPUT),
@@ -82,6 +82,7 @@ READS_NOTHING: Final = {
 ALWAYS_JSON: Final = {"run schema", "truth schema"}
 PRINTS_NO_RESULT: Final = {"completion"}
 
+# Options whose value has a different kind in each command.
 NAMED_BY_COMMAND: Final = {
     "--output",
     "--classes",
@@ -93,7 +94,6 @@ NAMED_BY_COMMAND: Final = {
     "--test",
     "--to",
 }
-"""Options whose value has a different kind in each command."""
 
 STREAMS: Final = {
     "reader gone": "| true",

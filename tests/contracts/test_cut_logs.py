@@ -13,15 +13,15 @@ from crosscue.replay.logs.opening import open_log
 from support.accounted import read
 from support.every_format import EVERY_FORMAT
 
+# Formats with an index at the end of the file, without which no row can be read.
 INDEX_AT_THE_END = {"mf4", "video"}
-"""Formats with an index at the end of the file, without which no row can be read."""
+# Formats with separate files for the times of rows, and these files.
 TIME_FILES = {
     "kitti-raw": ("oxts/timestamps.txt", "image_02/timestamps.txt"),
     "comma2k19": ("processed_log/IMU/gyro/t", "processed_log/IMU/gyro/value"),
     "video": ("front.txt",),
     "images": ("timestamps.txt",),
 }
-"""Formats with separate files for the times of rows, and these files."""
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +35,8 @@ def test_every_format_has_sample_log() -> None:
     assert EVERY_FORMAT.keys() == FORMATS.keys()
 
 
+# Formats whose truncation ``info --quick`` cannot detect, and why.
 BODY_UNSEEN = {"images": "pictures are not opened"}
-"""Formats whose truncation ``info --quick`` cannot detect, and why."""
 
 
 @pytest.mark.parametrize("name", sorted(EVERY_FORMAT))

@@ -37,6 +37,7 @@ def _comma(path: Path) -> Path:
     return path
 
 
+# By format: a function that writes a small drive.
 DRIVES: Final[dict[str, Callable[[Path], Path]]] = {
     "comma2k19": _comma,
     "kitti-raw": raw_drive,
@@ -44,7 +45,6 @@ DRIVES: Final[dict[str, Callable[[Path], Path]]] = {
     "nuscenes": nuscenes_drive,
     "pandaset": pandaset_drive,
 }
-"""By format: a function that writes a small drive."""
 
 
 def test_every_data_set_has_sample_drive() -> None:

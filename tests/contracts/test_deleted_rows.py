@@ -195,6 +195,7 @@ def _pandaset(folder: Path) -> Path:
     return log
 
 
+# Formats that count their rows, and functions that write a log with one row removed.
 ONE_REMOVED: Final[dict[str, Callable[[Path], Path]]] = {
     "mcap": _mcap,
     "rosbag1": _bag,
@@ -211,13 +212,12 @@ ONE_REMOVED: Final[dict[str, Callable[[Path], Path]]] = {
     "video": _video,
     "images": _images,
 }
-"""Formats that count their rows, and functions that write a log with one row removed."""
+# Formats in which a removed row cannot be detected, with their names in the docs.
 WITHOUT_COUNTER: Final = {
     "candump": "candump",
     "asc": "ASC",
     "phone-drive": "smartphone driving data set",
 }
-"""Formats in which a removed row cannot be detected, with their names in the docs."""
 
 
 def test_every_format_is_classified_by_row_counter() -> None:

@@ -29,11 +29,12 @@ from support.public_calls import faults_in
 CODE: Final = code_of_pages()
 NOTEBOOKS: Final = code_of_notebooks()
 KINDS: Final = {"bash", "console", "python", "toml", "sql", "yaml", "text"}
+# Pages and languages of blocks that a test runs, and that test.
 EXECUTED: Final = {
     ("CONTRIBUTING.md", "python"): "tests/contracts/test_contributing.py",
     ("docs/howto/query.md", "sql"): "tests/eval/catalog/test_query_page.py",
 }
-"""Pages and languages of blocks that a test runs, and that test."""
+# Options of other programs that occur in inline code and messages, and those programs.
 OTHERS: Final = {
     "--array": "SLURM",
     "--bind": "Rerun",
@@ -43,11 +44,11 @@ OTHERS: Final = {
     "--include": "YOLOv5",
     "--serve-web": "Rerun",
 }
-"""Options of other programs that occur in inline code and messages, and those programs."""
 PACKAGES: Final = ("replay", "detectors", "fusion", "localization", "datasets", "eval")
 SHELL_PAGES: Final = sorted(
     {code.page for code in CODE if code.kind in ("bash", "console", "yaml")}
 )
+# Options of all commands and benchmarks.
 OPTIONS: Final = {
     "--version",
     *(
@@ -62,7 +63,6 @@ OPTIONS: Final = {
         for option in re.findall(r'"(--[a-z][\w-]*)"', path.read_text(encoding="utf-8"))
     ),
 }
-"""Options of all commands and benchmarks."""
 
 
 def of_kind(kind: str) -> list[Code]:

@@ -21,8 +21,8 @@ from support.pictures import picture
 from support.torchvision_files import network
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto" / "networks.md"
+# Folder in which the page expects the vehicle file and the truth of its drive.
 HOME = Path("datasets") / "real" / "pandaset_002"
-"""Folder in which the page expects the vehicle file and the truth of its drive."""
 FRAMES = 3
 
 

@@ -52,6 +52,7 @@ LINES: Final[dict[str, tuple[str, int]]] = {
 }
 ALWAYS_JSON: Final = frozenset({"truth schema", "run schema"})
 NO_JSON: Final = frozenset({"view", "completion"})
+# The same for commands that create or fit something.
 MADE: Final[dict[str, tuple[str, int]]] = {
     "fit ranges": ("photos/heights.csv --cue stop_sign", 0),
     "fit signs": ("photos/labels.csv --label yield", 1),
@@ -79,7 +80,7 @@ MADE: Final[dict[str, tuple[str, int]]] = {
         0,
     ),
 }
-"""The same for commands that create or fit something."""
+# Commands that are not run, and why.
 ELSEWHERE: Final[dict[str, str]] = {
     "demo": "simulates and replays for minutes",
     "study intersections": "simulates and replays for minutes",
@@ -90,7 +91,6 @@ ELSEWHERE: Final[dict[str, str]] = {
     "fit messages": "needs many approaches; tests/eval/fit/test_message_fit.py parses it",
     "model fetch": "needs a network's weights",
 }
-"""Commands that are not run, and why."""
 
 
 def strict(text: str) -> Any:

@@ -39,9 +39,10 @@ from support.gap_drive import (
 from support.pictures import OVERSIZED, SIDE_PX
 
 PRODUCT: Final = ("datasets", "detectors", "eval", "fusion", "localization", "replay")
+# Functions that decode or measure an encoded picture.
 DECODERS: Final = {"check", "decode", "draw_frame", "grey_of", "size_of"}
-"""Functions that decode or measure an encoded picture."""
 
+# By file that looks at a log's pictures: commands that reach it.
 LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
     "detectors/runner.py": {
         "detect": "detect {log} -o {out} --vehicle {car} --detectors grey --no-cache",
@@ -70,7 +71,7 @@ LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
     "eval/failures/export.py": {"export": "export {failures} -o {out}"},
     "eval/failures/pictures.py": {"browse": "browse {failures} -o {out}"},
 }
-"""By file that looks at a log's pictures: commands that reach it."""
+# Reasons why other files have no command in the table above.
 HOW_OTHERS_DO: Final = {
     "datasets/adapters/road_folder.py": "files that the user names",
     "detectors/images.py": "the functions themselves",
@@ -85,7 +86,6 @@ HOW_OTHERS_DO: Final = {
     "eval/vehicle/mounting.py": "a function of its own below, because it needs intrinsics",
     "localization/landmarks/images.py": "for the commands of landmarks",
 }
-"""Reasons why other files have no command in the table above."""
 
 
 def _uses_decoder(path: Path) -> bool:
@@ -118,13 +118,13 @@ def _valid(number: int) -> bytes:
     return cv2.imencode(".png", large)[1].tobytes()
 
 
+# Contents of an unusable picture and words of its reason.
 LOST: Final[dict[str, tuple[Callable[[], bytes], str]]] = {
     "oversized": (OVERSIZED["png"], f"{SIDE_PX} x {SIDE_PX}"),
     "truncated": (lambda: _valid(0)[:-100], "cut short"),
 }
-"""Contents of an unusable picture and words of its reason."""
+# Frames with such a picture.
 AT: Final = (0, 12)
-"""Frames with such a picture."""
 
 
 @pytest.fixture(scope="module", params=LOST)

@@ -15,6 +15,7 @@ from crosscue.localization.landmarks.database import LandmarkWriter
 from support.mcap_files import ChunkOf, McapFile, channel, message, schema
 
 START_NS = 1_700_000_000_000_000_000
+# Commands that need a camera, with arguments.
 NEEDS_CAMERA = {
     "truth import": "{coco} --log {log} -o {out}.json --vehicle {car}",
     "fit signs": "{drive} --label stop_sign",
@@ -23,7 +24,6 @@ NEEDS_CAMERA = {
     "replay": "{log} -o {out} --vehicle {car} --detectors support.gap_drive:build",
     "detect": "{log} -o {out} --vehicle {car} --detectors support.gap_drive:build",
 }
-"""Commands that need a camera, with arguments."""
 
 
 def _drive(folder: Path, is_cut: bool, camera: str) -> dict[str, Path]:

@@ -25,6 +25,7 @@ from support.onnx_models import bright_box_model
 from support.pictures import picture
 
 COCO: Final = "--data {labels} --images {empty} -o {out}.safetensors"
+# A command line of each command with such options, without the option to be tested.
 BASE: Final[dict[str, str]] = {
     "info": "{log}",
     "convert": "{log} -o {out}.mcap",
@@ -68,7 +69,6 @@ BASE: Final[dict[str, str]] = {
     "study field": "-o {out}",
     "demo": "-o {out} --real",
 }
-"""A command line of each command with such options, without the option to be tested."""
 
 OTHER_BASE: Final[dict[tuple[str, str], str]] = {
     ("landmarks add", "--images"): "{out}.db --coordinates {empty}/places.csv",
@@ -90,9 +90,10 @@ OTHER_BASE: Final[dict[tuple[str, str], str]] = {
 }
 
 FILE: Final = ("{gone}", "{noise}")
+# A file that is missing, one of another kind, and one nested 3,000 levels deep.
 TREE: Final = (*FILE, "{deep}")
-"""A file that is missing, one of another kind, and one nested 3,000 levels deep."""
 
+# How to spell a thing that does not exist, by option.
 NONEXISTENT: Final[dict[str, tuple[str, ...]]] = {
     "--against": ("nosuch=1",),
     "--card": TREE,
@@ -134,7 +135,6 @@ NONEXISTENT: Final[dict[str, tuple[str, ...]]] = {
     "--vehicle": TREE,
     "--where": ("nosuch=1",),
 }
-"""How to spell a thing that does not exist, by option."""
 
 OTHER_NONEXISTENT: Final[dict[tuple[str, str], tuple[str, ...]]] = {
     ("model fetch", "--from"): ("{gone}",),
@@ -143,6 +143,7 @@ OTHER_NONEXISTENT: Final[dict[tuple[str, str], tuple[str, ...]]] = {
     ("demo", "--data"): ("{gone}",),
 }
 
+# Options whose value is not the name of something that exists.
 NAMES_NOTHING: Final[dict[str, str]] = {
     "--at": "a time",
     "--by": "a tag that runs may lack; if all do, the result is empty, see test_history.py",
@@ -169,10 +170,9 @@ NAMES_NOTHING: Final[dict[str, str]] = {
     "--to": "a time",
     "--tolerance": "a pattern; one that fits nothing allows nothing",
 }
-"""Options whose value is not the name of something that exists."""
 
+# Options whose value is looked up in the log itself, or in labels of its pictures.
 NEEDS_LOG: Final = {"--topics", "--map"}
-"""Options whose value is looked up in the log itself, or in labels of its pictures."""
 
 NUMBERS: Final = ("int", "float", "metres", "_fraction")
 LOGS: Final = ("log", "bus_log", "empty_log")

@@ -10,6 +10,7 @@ import pytest
 from crosscue.eval import cli
 from support.empty_inputs import COMMANDS, empty_inputs
 
+# Commands that are tested elsewhere or have a result for any valid input.
 ELSEWHERE: dict[str, str] = {
     "replay": "test_empty_result.py", "estimate": "test_empty_result.py",
     "detect": "test_empty_result.py", "decode": "test_empty_result.py",
@@ -30,7 +31,6 @@ ELSEWHERE: dict[str, str] = {
     "model show": "prints a card", "model check": "that nothing is found is its result",
     "model fetch": "copies a file", "model init": "copies a file",
 }  # fmt: skip
-"""Commands that are tested elsewhere or have a result for any valid input."""
 
 
 def test_every_command_is_tested_or_excluded_with_reason() -> None:

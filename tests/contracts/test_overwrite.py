@@ -25,6 +25,7 @@ from support.failures import table_of_failures
 REPLAY: Final = "replay {log} -o {out} --vehicle {car} --no-cache"
 DETECT: Final = "detect {log} -o {out} --vehicle {car} --detectors grey --no-cache --draw 3"
 SIMULATE: Final = "simulate A --width 320 --fps 10 -o {out}"
+# Commands that replace a folder, with arguments.
 WRITING: Final[dict[str, str]] = {
     "replay": REPLAY,
     "detect": DETECT,
@@ -33,7 +34,7 @@ WRITING: Final[dict[str, str]] = {
     "export": "export {failures} -o {out}",
     "browse": "browse {failures} -o {out}",
 }
-"""Commands that replace a folder, with arguments."""
+# Other commands whose help names a folder, and what they do.
 BY_NAME: Final = {
     "truth": "writes a truth file of a given name",
     "model": "writes a model card of a given name",
@@ -41,7 +42,6 @@ BY_NAME: Final = {
     "demo": "writes a drive and a run, each as simulate and replay do",
     "study": "keeps finished parts, and replaces its pages file by file",
 }
-"""Other commands whose help names a folder, and what they do."""
 
 
 @pytest.fixture(scope="module")

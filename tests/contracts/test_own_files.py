@@ -24,8 +24,8 @@ from support.empty_inputs import empty_inputs
 MAIN: Final = "from crosscue.eval.cli import main; main()"
 VICTIM: Final = "years of work"
 HUGE_BYTES: Final = 1_500_000_000
+# Address space of a command that reads a run; a planted file must not fill it.
 MEMORY_BYTES: Final = 3 << 30
-"""Address space of a command that reads a run; a planted file must not fill it."""
 
 
 @pytest.fixture(scope="module")
@@ -173,6 +173,7 @@ NAMED: Final = "a file that the user names, not one that crosscue keeps"
 PACKAGE: Final = "a file of this package or of this machine"
 NEW: Final = "a new file under a random name, made exclusively, which replaces a name when complete"
 HANDLE: Final = "Arrow or Python reads a file that the door has opened"
+# Modules that open files otherwise, or folders of them, and why they may.
 PAST_THE_DOOR: Final[dict[str, str]] = {
     "datasets/adapters/": LOGS,
     "datasets/labels/": NAMED,
@@ -217,7 +218,6 @@ PAST_THE_DOOR: Final[dict[str, str]] = {
     "replay/versions.py": PACKAGE,
     "replay/write/mcap.py": NEW,
 }
-"""Modules that open files otherwise, or folders of them, and why they may."""
 
 
 def test_nothing_opens_file_of_ours_past_the_door() -> None:

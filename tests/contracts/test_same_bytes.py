@@ -27,16 +27,15 @@ NOT_COMPARED: Final[Mapping[str, str]] = {
     JOURNAL: "part of a batch, not of a run; knows files by path and time, to see what is done",
 }
 DRIVES: Final = ("A", "B")
+# Circumstances of the expected files.
 HERE: Final = {"PYTHONHASHSEED": "1", "TZ": "UTC", "LC_ALL": "C.UTF-8", "COLUMNS": "80"}
-"""Circumstances of the expected files."""
 ELSEWHERE: Final = {"PYTHONHASHSEED": "2", "TZ": "Asia/Kolkata", "LC_ALL": "C", "COLUMNS": "190"}
+# Circumstances, number of workers, and whether the detection cache is filled already. Each is in
+# another folder, with the same relative paths between drives and runs.
 VARIED: Final[Mapping[str, tuple[Mapping[str, str], str, bool]]] = {
     "other hash seed, time zone, locale and terminal": (ELSEWHERE, "1", False),
     "two drives in parallel, warm cache": (HERE, "2", True),
 }
-"""Circumstances, number of workers, and whether the detection cache is filled already.
-
-Each is in another folder, with the same relative paths between drives and runs."""
 
 
 @pytest.fixture(scope="module")

@@ -25,6 +25,7 @@ from support.range_server import Served, serving
 
 SECRET: Final = "hunter2"
 PARTS: Final = "?X-Amz-Signature=hunter2query&hunter2=1#hunter2fragment"
+# Arguments of each command that reads logs at URLs, and its exit status.
 FINE: Final[dict[str, tuple[str, int]]] = {
     "info": ("DRIVE --json -v", 0),
     "convert": ("DRIVE -o out.mcap", 0),
@@ -35,9 +36,8 @@ FINE: Final[dict[str, tuple[str, int]]] = {
     "fit odometry": ("COMPASS --vehicle ITS_CAR --truth ITS_TRUTH", 0),
     "truth from-gnss": ("COMPASS -o truth", 1),
 }
-"""Arguments of each command that reads logs at URLs, and its exit status."""
+# Commands whose LOG is text, but must be on this machine.
 LOCAL: Final = frozenset({"seal"})
-"""Commands whose LOG is text, but must be on this machine."""
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ import crosscue
 from crosscue.eval import cli
 
 ROOT: Final = Path(__file__).parents[2]
+# Public functions that each command calls.
 CALLS: Final = {
     "truth import": ("import_truth", "import_labels"),
     "score detector": ("score_detector",),
@@ -22,12 +23,10 @@ CALLS: Final = {
     "model init": ("draft_card",),
     "model check": ("check_card",),
 }
-"""Public functions that each command calls."""
 WITHOUT: Final = {"completion": "it is about the shell"}
+# Modules that a command may import: the public interface, options and safe text. Constants of other
+# modules are allowed as well, for the help.
 ALLOWED: Final = re.compile(r"crosscue(\.eval\.commands(\..+)?|\.replay\.(base|safe_text))?")
-"""Modules that a command may import: the public interface, options and safe text.
-
-Constants of other modules are allowed as well, for the help."""
 
 
 def tree_of(command: str) -> ast.Module:

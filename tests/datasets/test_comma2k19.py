@@ -154,6 +154,7 @@ def test_invalid_time_drops_only_its_row(tmp_path: Path, damaged: float) -> None
     assert dropped == ({} if is_time else {"a row without a valid time": 1})
 
 
+# Arrays of unexpected type or shape that a file might contain.
 UNEXPECTED_ARRAYS: dict[str, NDArray[np.generic]] = {
     "no columns": np.zeros(40),
     "two columns": np.zeros((40, 2)),
@@ -162,7 +163,6 @@ UNEXPECTED_ARRAYS: dict[str, NDArray[np.generic]] = {
     "complex": np.zeros((40, 3), np.complex128),
     "no row": np.zeros((0, 3)),
 }
-"""Arrays of unexpected type or shape that a file might contain."""
 
 
 def _segment(folder: Path) -> Path:

@@ -115,6 +115,7 @@ def test_add_option_keeps_approaches_and_replaces_cues(tmp_path: Path, log: Path
     assert len(load(path).cues) == 2
 
 
+# Faults of the file that do not depend on its log: it cannot be read, exit status 4.
 DAMAGED = {
     "expected whole nanoseconds",
     "no such image",
@@ -123,7 +124,6 @@ DAMAGED = {
     "expected a list",
     "expected a unique id",
 }
-"""Faults of the file that do not depend on its log: it cannot be read, exit status 4."""
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ from crosscue.detectors.catalog.recognise import guesses, read_interface
 from crosscue.replay.base import VehicleError
 from support.onnx_models import constant_model
 
+# Cells of strides 8, 16 and 32 at 256 x 128.
 CELLS = 32 * 16 + 16 * 8 + 8 * 4
-"""Cells of strides 8, 16 and 32 at 256 x 128."""
 SHAPE = (1, 3, 128, 256)
 END_TO_END = 'kind = "end-to-end"\nclasses = ["dog", "cat"]\nscore = 0.3\noverlap = 1.0'
 Table = NDArray[np.float32]
@@ -37,6 +37,7 @@ def changed(**columns: float) -> Table:
     return table
 
 
+# What is seen, with the output in which it is seen.
 GARBAGE = {
     "200 boxes cover the whole picture": changed(x0=-5.0, y0=-5.0, x1=900.0, y1=300.0),
     "200 detections have the score 0.7": changed(score=0.7),
@@ -46,7 +47,6 @@ GARBAGE = {
     "within 2 pixels of the corner": changed(x0=0.2, y0=0.3, x1=0.5, y1=0.9),
     "scores from -4 to -4": changed(score=-4.0),
 }
-"""What is seen, with the output in which it is seen."""
 
 
 def card(folder: Path, model: bytes, output: str) -> Path:

@@ -19,11 +19,11 @@ from crosscue.replay.base import UsageError
 from support.data import shared
 from support.onnx_models import constant_model
 
+# Real networks, with their class names behind the background.
 ROAD_NETWORKS = {
     "road-segmentation-adas-0001/road-segmentation-adas-0001.xml": "road,curb,mark",
     "twinlitenet/twinlitenet_best.onnx": "road",
 }
-"""Real networks, with their class names behind the background."""
 PICTURE = Path("sequences", "pandaset_002", "camera", "front_camera", "00.jpg")
 
 

@@ -18,8 +18,8 @@ from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
 from support.fusion import NONE_SEEN, SECOND_NS, drive, light, sign
 
 FRAME_NS = SECOND_NS // 10
+# Range filter of the dissertation, whose results can be computed by hand.
 DISSERTATION_FILTER = RangeFilter(sd_fraction=0.0, fade_m=0.0, begin_after=1)
-"""Range filter of the dissertation, whose results can be computed by hand."""
 
 
 def approaches(

@@ -43,8 +43,8 @@ def road(count: int, moved_m: float = 1.0) -> Situation:
     return situation({"road_left": count}, moved_m=moved_m)
 
 
+# Messages of a first positive and negative observation: 0.6 / 0.1, and (1 - 0.6) / (1 - 0.1).
 SIDE, AWAY = math.log(6.0), math.log(4.0 / 9.0)
-"""Messages of a first positive and negative observation: 0.6 / 0.1, and (1 - 0.6) / (1 - 0.1)."""
 
 
 def fades(many: float) -> float:

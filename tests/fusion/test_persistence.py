@@ -87,6 +87,7 @@ def test_cue_sends_no_message_until_seen_in_three_of_five_frames(positive: list[
     assert (max_deviation(steps) > 0.0) == enough
 
 
+# Messages of log 3 and log 9; distances fade over 10 m and times over 2 s.
 HAND_GRAPH = FactorGraph(
     (Feature("left"), Feature("right")),
     (
@@ -101,10 +102,9 @@ HAND_GRAPH = FactorGraph(
         Edge("arrow", "left", False),
     ),
 )
-"""Messages of log 3 and log 9; distances fade over 10 m and times over 2 s."""
 LOG_3 = math.log(3.0)
+# Distance with a correlation of 1/3, after which a frame counts as half an independent one.
 THIRD = 10.0 * LOG_3
-"""Distance with a correlation of 1/3, after which a frame counts as half an independent one."""
 
 
 def hand_messages(*situations: Situation) -> list[Any]:

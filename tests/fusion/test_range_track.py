@@ -18,8 +18,8 @@ from crosscue.fusion.range_track import (
 from crosscue.replay.vehicle.fusion import RangeFilter
 
 SETTINGS = RangeFilter()
+# One first measurement, 2 m ago.
 PENDING = RangeTrack(None, RangeBelief(60.0, 2.0), 1, 2.0)
-"""One first measurement, 2 m ago."""
 RIVALLED = RangeTrack(RangeBelief(50.0, 4.0), RangeBelief(80.0, 9.0), 2, 1.0)
 
 

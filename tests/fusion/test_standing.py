@@ -53,8 +53,8 @@ KINDS: Final = {
 }
 LIGHT: Final = {**dict.fromkeys(STATIC, 0), "traffic_light": 1}
 
+# What one frame shows: counts, a sign's range, a range from motion, and whether it is new.
 Look = tuple[Mapping[str, int], SignRange | None, RangePosterior | None, bool]
-"""What one frame shows: counts, a sign's range, a range from motion, and whether it is new."""
 
 RANGES_M: Final = st.floats(-5.0, 160.0)
 REFERENCES: Final = st.sampled_from([*Reference])

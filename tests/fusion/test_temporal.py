@@ -74,8 +74,8 @@ def learned(**changes: object) -> Temporal:
 
 
 Frame = tuple[dict[str, int], float, list[MeasuredRange]]
+# Index of a cell, and outgoing roads: left, none, or no intersection.
 State = tuple[int, int]
-"""Index of a cell, and outgoing roads: left, none, or no intersection."""
 CELLS, LEFT, NO_WAY, NOWHERE = 5, 0, 1, 2
 P_WAY: Final = (0.7, 0.3)
 
@@ -606,6 +606,7 @@ def test_filter_of_a_drive_receives_situations_inside_and_outside_approaches(
     assert seen[-1][0] is not seen[0][0]
 
 
+# Counts, distance and its variance, a sign's range with its variance, and ``is_new_picture``.
 SEQUENCE = st.lists(
     st.tuples(
         st.dictionaries(st.sampled_from(["sign", "road"]), st.integers(0, 2)),
@@ -617,7 +618,6 @@ SEQUENCE = st.lists(
     min_size=1,
     max_size=40,
 )
-"""Counts, distance and its variance, a sign's range with its variance, and ``is_new_picture``."""
 
 
 @given(SEQUENCE, st.floats(0.0, 0.2))

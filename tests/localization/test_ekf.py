@@ -68,8 +68,8 @@ def test_prediction_along_a_quarter_circle_matches_geometry() -> None:
 
 
 QUARTER = math.pi / 2
+# Heading north at 4 m/s. With 2 m/s2 over 0.5 s, the arc is 4 / 2 + 2 / 8 = 2.25 m long.
 START = np.array([2.0, -1.0, QUARTER, 4.0])
-"""Heading north at 4 m/s. With 2 m/s2 over 0.5 s, the arc is 4 / 2 + 2 / 8 = 2.25 m long."""
 RISE = 1.0 - 2.0 / math.pi
 
 

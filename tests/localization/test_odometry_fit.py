@@ -24,8 +24,8 @@ CAR = OdometrySettings(
 )
 TRUE = {"wheel_scale": 1.02, "gyro_bias_radps": 0.01, "yaw_rate_scale": 0.97}
 LEVER = (1.5, -0.4)
+# Number of positions that the fit uses; the others are held out.
 FITTED = 60
-"""Number of positions that the fit uses; the others are held out."""
 
 
 def positions(truth: Truth, sd_m: float, rng: np.random.Generator, lever: bool = True) -> Fixes:

@@ -13,8 +13,8 @@ from crosscue.replay.base import LogError
 from crosscue.replay.files.identity import SHARE_BYTES, identity_of, identity_of_all
 
 LARGE: int = 3 * SHARE_BYTES
+# Position between the last sample and the tail, where only an index is hashed.
 BEFORE_TAIL: int = LARGE - SHARE_BYTES // 4 - SHARE_BYTES // 64 - 3
-"""Position between the last sample and the tail, where only an index is hashed."""
 
 
 def _log(path: Path, content: bytes | bytearray = b"rows") -> Path:

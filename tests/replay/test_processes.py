@@ -62,8 +62,8 @@ if __name__ == "__main__":
     except CrosscueError as error:
         sys.exit(str(error))
 """
+# After the first worker was started: it imports modules, then works.
 MOMENTS_S: Final = (0.0, 0.03, 0.1, 0.3, 0.8)
-"""After the first worker was started: it imports modules, then works."""
 
 
 def _children(pid: int) -> list[int]:

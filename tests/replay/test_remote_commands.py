@@ -25,8 +25,8 @@ from support.range_server import Served, serving
 from support.rosbag_files import rows_of, write_bag
 
 MS = 1_000_000
+# Bytes of a log's head and tail, from which its identity is computed, and of the read-ahead.
 FIXED_BYTES = 192 << 10
-"""Bytes of a log's head and tail, from which its identity is computed, and of the read-ahead."""
 BRIGHT = "support.detecting:build"
 ARGUMENTS = {
     "info": ["info", "--json"],

@@ -435,8 +435,8 @@ def test_window_of_indexed_log_checks_only_its_blocks(tmp_path: Path, kind: str)
     assert losses(early) == [f"{log.name}: bytes 0 to {MIB}"]
 
 
+# Folder of the pictures of each format.
 _PICTURES = {"kitti-raw": "image_02/data", "pandaset": "camera/front_camera"}
-"""Folder of the pictures of each format."""
 
 
 def _window_case(kind: str, folder: Path) -> tuple[Path, Selection, dict[str, bool]]:

@@ -138,6 +138,8 @@ def test_dotted_toml_key_at_depth_limit_is_read() -> None:
 
 
 _DBC: Final = 'VERSION ""\nBU_: A\nBO_ 100 M: 8 A\n SG_ S : 0|8@1+ (1,0) [0|255] "" A\n'
+# Texts whose parsing must take time and memory in proportion to their size, and if they are read.
+# DBC files with long comments are read; the others are refused.
 BOMBS: Final[dict[str, tuple[str, Callable[[], str], bool]]] = {
     "toml dotted key": ("toml", lambda: "a." * 20_000 + "b=1", False),
     "toml table name": ("toml", lambda: "[" + "a." * 20_000 + "b]", False),
@@ -162,10 +164,6 @@ BOMBS: Final[dict[str, tuple[str, Callable[[], str], bool]]] = {
     "kcd names": ("kcd", lambda: "<Message " * 1_000_000, False),
     "sym words": ("sym", lambda: "Var " * 2_500_000, False),
 }
-"""Texts whose parsing must take time and memory in proportion to their size, and if they are read.
-
-DBC files with long comments are read; the others are refused.
-"""
 REFUSED: Final = {"toml": 2, "yaml": 3, "dbc": 4, "kcd": 4, "sym": 4}
 CPU_S: Final = 20
 MAX_MB: Final = 400

@@ -14,8 +14,8 @@ import can
 from crosscue.replay.base import DATA, ERROR, EVERYTHING, REMOTE, CanFrames, Ledger, Selection
 from crosscue.replay.logs.opening import open_log
 
+# Noon of 10 July 2015, which the day count of TRC files represents exactly.
 START_NS = 1_436_529_600_000_000_000
-"""Noon of 10 July 2015, which the day count of TRC files represents exactly."""
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
 

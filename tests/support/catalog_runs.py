@@ -14,8 +14,8 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .manifests import estimate_manifest
 from .scoring import run_folder
 
+# Threshold ``fusion.established`` of the runs in each folder.
 ESTABLISHED: Final = {"a": 0.9, "b": 0.3}
-"""Threshold ``fusion.established`` of the runs in each folder."""
 
 
 def approach_row(number: int, detected_m: float | None) -> ApproachRow:

@@ -11,6 +11,7 @@ from support.gap_drive import BEGIN, SECOND, Clock, replayed, write_drive
 from support.pictures import picture, picture_folder
 from support.rosbag_files import Row, write_folder
 
+# Commands without a result for such input, and their arguments.
 COMMANDS: dict[str, str] = {
     "truth": "{log} -o {out}",
     "truth import": "{empty}/coco.json --log {log} -o {out}.json --vehicle {car}",
@@ -35,7 +36,6 @@ COMMANDS: dict[str, str] = {
     "browse": "{empty}/failures.parquet -o {out}",
     "export": "{empty}/failures.parquet -o {out}",
 }
-"""Commands without a result for such input, and their arguments."""
 
 
 def empty_inputs(folder: Path) -> dict[str, Path]:

@@ -75,6 +75,7 @@ def _video(folder: Path) -> Path:
     return path
 
 
+# For each name in ``FORMATS``, a function that writes a log into a folder and returns its path.
 EVERY_FORMAT: Final[dict[str, Callable[[Path], Path]]] = {
     "mcap": _mcap,
     "rosbag1": lambda folder: write_bag(folder / "log.bag", rows_of(400)),
@@ -94,4 +95,3 @@ EVERY_FORMAT: Final[dict[str, Callable[[Path], Path]]] = {
     "video": _video,
     "images": lambda folder: picture_folder(folder / "front", 12, "rate_hz: 10\n"),
 }
-"""For each name in ``FORMATS``, a function that writes a log into a folder and returns its path."""

@@ -44,13 +44,13 @@ from crosscue.replay.write.convert import LogWriter
 
 SECOND: Final = 1_000_000_000
 BEGIN: Final = 1_700_000_000 * SECOND
+# Ten wheel rows and pictures per second.
 ROW: Final = SECOND // 10
-"""Ten wheel rows and pictures per second."""
 SPEED_MPS: Final = 6.0
+# Distance from the first frame to the intersection.
 START_M: Final = 70.0
-"""Distance from the first frame to the intersection."""
+# Range of distances in which the sign is visible.
 SIGN_M: Final = (8.0, 55.0)
-"""Range of distances in which the sign is visible."""
 SIZE: Final = (160, 90)
 FOCAL_PX: Final = 200.0
 BUS: Final = Topic("/can", "crosscue/CanFrames", "columns")

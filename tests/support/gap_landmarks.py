@@ -12,8 +12,8 @@ from crosscue.replay.base import Bytes
 from .gap_drive import ROW, SECOND, SPEED_MPS
 from .landmark_drive import NearnessMatcher, features_at
 
+# Distance between rows.
 STEP_M: Final = SPEED_MPS * ROW / SECOND
-"""Distance between rows."""
 
 
 class PlaceByNumber(NearnessMatcher):

@@ -22,8 +22,8 @@ from support.mcap_files import (
     schema,
 )
 
+# Parts of the ledger's integrity if a changed byte cannot be detected.
 UNCOVERED = ("no checksum covers", "checksum is wrong", "has no checksums")
-"""Parts of the ledger's integrity if a changed byte cannot be detected."""
 TOPICS = ("/imu", "/can", "/camera")
 
 

@@ -16,8 +16,8 @@ from crosscue.replay.base import DEFAULT_LIMITS, EVERYTHING, Ledger, Limits, Mes
 from crosscue.replay.readers.mcap.reader import open_mcap
 
 MAGIC = b"\x89MCAP0\r\n"
+# Log time, publish time, payload.
 Message: TypeAlias = tuple[int, int, bytes]
-"""Log time, publish time, payload."""
 
 
 def record(opcode: int, content: bytes) -> bytes:

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 
+# The child reads its peak itself, because ``getrusage`` of a child includes its parent's peak.
 _CHILD = """
 import sys
 from pathlib import Path
@@ -14,7 +15,6 @@ status = run(sys.argv[1:])
 peak = next(x for x in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in x)
 print(status, int(peak.split()[1]) // 1024)
 """
-"""The child reads its peak itself, because ``getrusage`` of a child includes its parent's peak."""
 
 
 def measured(argv: list[str], cpu_s: int | None = None) -> tuple[int, str, float]:

@@ -17,8 +17,8 @@ SIZE_PX: Final = (1600, 900)
 FOCAL_PX: Final = 1266.0
 WHEEL_RADIUS_M: Final = 0.305
 CAMERA_M: Final = (1.7, 0.0, 1.5)
+# Rotation from the camera's axes (right, down, ahead) to the vehicle's (ahead, left, up).
 OF_CAMERA: Final = (0.5, -0.5, 0.5, -0.5)
-"""Rotation from the camera's axes (right, down, ahead) to the vehicle's (ahead, left, up)."""
 
 
 def pose(seconds: float) -> tuple[float, float, float]:

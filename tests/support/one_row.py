@@ -114,6 +114,7 @@ def _speed_without_a_number(path: Path) -> None:
     file.write_text("\n".join(lines), encoding="utf-8")
 
 
+# For each format, a function that writes a log, and one that damages one row of it.
 ONE_ROW: Final[dict[str, tuple[Callable[[Path], Path], Callable[[Path], None]]]] = {
     "candump": (EVERY_FORMAT["candump"], _invalid_identifier),
     "asc": (EVERY_FORMAT["asc"], _garbled_line),
@@ -129,4 +130,3 @@ ONE_ROW: Final[dict[str, tuple[Callable[[Path], Path], Callable[[Path], None]]]]
     "nuscenes": (EVERY_FORMAT["nuscenes"], _cut_png),
     "pandaset": (EVERY_FORMAT["pandaset"], _cut_jpeg),
 }
-"""For each format, a function that writes a log, and one that damages one row of it."""

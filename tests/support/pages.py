@@ -22,6 +22,7 @@ PAGES: Final = [
 ]
 NOTEBOOKS: Final = sorted((ROOT / "notebooks").glob("*.ipynb"))
 PROGRAMS: Final = ("crosscue", "make", "pip", "pytest", "python", "sphinx-build")
+# Functions in place of programs, which record their arguments and print a number.
 PRELUDE: Final = f"""
 record() {{ printf '%s\\0' "$@" $'\\x1e' >&9; }}
 for program in {" ".join(PROGRAMS)}; do
@@ -29,7 +30,6 @@ for program in {" ".join(PROGRAMS)}; do
 done
 command_not_found_handle() {{ :; }}
 """
-"""Functions in place of programs, which record their arguments and print a number."""
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from crosscue.datasets.truth.truth import Truth
 from crosscue.detectors.base import Detections
 from crosscue.eval.scoring.truth import cue_at
 
+# Max distance of a true car's center, in units of the longer side of its box.
 MIN_NEAR = 0.5
-"""Max distance of a true car's center, in units of the longer side of its box."""
 KINDS = {
     "cross": "car on the crossroad that moves",
     "parked_cross": "car parked on the crossroad",

@@ -19,10 +19,10 @@ PHONE: Final = (
     "gyroRotationX(rad/s),gyroRotationY(rad/s),gyroRotationZ(rad/s),"
     "motionGravityX(G),motionGravityY(G),motionGravityZ(G)"
 )
+# 10:31:37 local time in a time zone five hours behind UTC.
 START_S: Final = 1_523_201_497
-"""10:31:37 local time in a time zone five hours behind UTC."""
+# Age of a position fix when the phone logs it.
 LATE_S: Final = 1.1
-"""Age of a position fix when the phone logs it."""
 
 
 def phone_drive(path: Path, count: int = 60) -> Path:

@@ -57,5 +57,5 @@ def _webp() -> bytes:
     return b"RIFF" + struct.pack("<I", len(body)) + body
 
 
+# Small pictures of ``SIDE_PX`` by ``SIDE_PX`` pixels, by coding.
 OVERSIZED: Final[dict[str, Callable[[], bytes]]] = {"png": _png, "jpeg": _jpeg, "webp": _webp}
-"""Small pictures of ``SIDE_PX`` by ``SIDE_PX`` pixels, by coding."""

@@ -42,13 +42,13 @@ class Reading:
     log: Log
 
 
+# Name, type and payload bytes of the topics in the made-up bags.
 TOPICS: Final = (
     ("/imu/data", "sensor_msgs/msg/Imu", 120),
     ("/can", "std_msgs/msg/String", 24),
     ("/camera/image", "sensor_msgs/msg/CompressedImage", 900),
     ("/gps/fix", "sensor_msgs/msg/NavSatFix", 60),
 )
-"""Name, type and payload bytes of the topics in the made-up bags."""
 
 
 def rows_of(

@@ -23,8 +23,8 @@ from crosscue.replay.files.log_identity import Identity
 from .manifests import estimated
 
 STEP_NS: Final = 100_000_000
+# Frame at which the car enters; it starts 40 m away and drives 10 m/s, 1 m per frame.
 ENTER: Final = 40
-"""Frame at which the car enters; it starts 40 m away and drives 10 m/s, 1 m per frame."""
 
 
 def at(frame: int) -> int:

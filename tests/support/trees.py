@@ -8,8 +8,8 @@ from pathlib import Path
 
 from crosscue.eval.runs.folder import TIMINGS
 
+# Files that depend on the time and place of processing.
 NO_RESULTS = {".drives", "failure.log", TIMINGS}
-"""Files that depend on the time and place of processing."""
 
 
 def tree(folder: Path) -> dict[str, str]:

@@ -11,8 +11,8 @@ import numpy as np
 
 from crosscue.replay.base import Block, Images
 
+# Grey levels between consecutive pictures; encoding errors are less than half of it.
 STEP = 9
-"""Grey levels between consecutive pictures; encoding errors are less than half of it."""
 SIZE_PX = (64, 48)
 
 

@@ -12,12 +12,12 @@ from crosscue.datasets.scenes.world import CATEGORIES
 from crosscue.detectors.rle import encode
 from crosscue.replay.base import strict_json, write_text
 
+# Category numbers and names, which are those of COCO if COCO has the class.
 COCO_IDS: Final = {
     "car": (3, "car"), "traffic_light": (10, "traffic light"), "stop_sign": (13, "stop sign"),
     "one_way_left": (101, "one way left"), "one_way_right": (102, "one way right"),
     "do_not_enter": (103, "do not enter"),
 }  # fmt: skip
-"""Category numbers and names, which are those of COCO if COCO has the class."""
 
 
 @dataclass(slots=True)

@@ -12,10 +12,10 @@ from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.detectors.overlay import write_label
 
+# Distance of the pictures before the intersection.
 BEFORE_M: Final = 25.0
-"""Distance of the pictures before the intersection."""
+# Central fraction of each picture's width and height that is shown; the rest is mostly sky.
 SHOWN: Final = 0.7
-"""Central fraction of each picture's width and height that is shown; the rest is mostly sky."""
 
 
 def contact_sheet(

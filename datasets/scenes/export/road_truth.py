@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from crosscue.datasets.scenes.rendering.camera import View
 from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M
 
+# Vertical component of a ray above which it does not meet the ground.
 SKY_UP = -0.002
-"""Vertical component of a ray above which it does not meet the ground."""
 
 
 def road_seen(

@@ -23,8 +23,8 @@ from crosscue.replay.processes import in_processes
 
 from .coco import Objects
 
+# Fraction of the pictures before the intersection; the others are within it.
 BEFORE_ENTRY: Final = 0.9
-"""Fraction of the pictures before the intersection; the others are within it."""
 
 
 def times_s(world: World, count: int, rng: np.random.Generator) -> Floats:

@@ -25,10 +25,10 @@ Int64s = NDArray[np.int64]
 NEAR_M: Final = 0.25
 OPAQUE: Final = 110
 MAX_TAPS: Final = 7
+# Max distance at which fine grain of the ground is visible.
 GRAIN_M: Final = 40.0
-"""Max distance at which fine grain of the ground is visible."""
+# Vertical component of a ray below which it meets the ground.
 HORIZON: Final = -0.002
-"""Vertical component of a ray below which it meets the ground."""
 
 
 class Kernels(NamedTuple):

@@ -17,8 +17,8 @@ from .kernels import compiled
 from .mesh import Floats, Mesh
 from .textures import smooth_noise
 
+# Max distance from the picture, in picture sizes, at which an object's outline is measured.
 MAX_ABOUT: Final = 3
-"""Max distance from the picture, in picture sizes, at which an object's outline is measured."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -199,8 +199,8 @@ def post(x: float, y: float, high: float) -> Mesh:
 LAMPS: dict[str, Rgb] = {
     "red": (1.0, 0.14, 0.10), "yellow": (1.0, 0.74, 0.12), "green": (0.16, 1.0, 0.58),
 }  # fmt: skip
+# Width and height of a traffic light's head.
 HEAD_M = (0.36, 1.06)
-"""Width and height of a traffic light's head."""
 
 
 def light_head(state: str) -> Mesh:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from .signs import WIDTH_M, Rgba, sign
 
 LEVELS: Final = 9
+# Width and height of the wall that one house-front texture covers.
 FRONT_M: Final = (8.0, 6.0)
-"""Width and height of the wall that one house-front texture covers."""
 
 
 @dataclass(slots=True)

@@ -28,23 +28,23 @@ from crosscue.detectors.cues.observed import Judged, Place, Sides, Ways
 from crosscue.detectors.cues.tracked.motion import HEIGHT_FRACTION, CarMotion
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
+# Bearing beyond which a car along the street looks as long as one across it.
 MAX_BEARING: Final = 0.6
-"""Bearing beyond which a car along the street looks as long as one across it."""
 SIGMAS: Final = 3.0
+# Minimum magnitude of the mean nose: three of four frames agree.
 MIN_NOSE: Final = 0.5
-"""Minimum magnitude of the mean nose: three of four frames agree."""
+# Number of standard deviations for a one-sided probability of 86 %. It applies to a car at the
+# limit; most cars that count are further past it (``PAST_PRECISION`` in the table of cues).
 LIKELY: Final = 1.08
-"""Number of standard deviations for a one-sided probability of 86 %. It applies to a car at the
-limit; most cars that count are further past it (``PAST_PRECISION`` in the table of cues)."""
+# Minimum speed along the road, in its standard deviations. It is lower than for cross traffic,
+# because a standing car of unusual height that appears to move is on that road, too.
 COMES_OR_GOES: Final = 2.0
-"""Minimum speed along the road, in its standard deviations. It is lower than for cross traffic,
-because a standing car of unusual height that appears to move is on that road, too."""
+# Minimum width over height of a car seen from the front or rear; a sedan has 1.2, a van 1.0. A
+# narrower box shows a part of a car, often with the object that hides the rest. Its height is not
+# the car's, and the car appears to move as more of it becomes visible.
 MIN_LONG: Final = 1.0
-"""Minimum width over height of a car seen from the front or rear; a sedan has 1.2, a van 1.0. A
-narrower box shows a part of a car, often with the object that hides the rest. Its height is not
-the car's, and the car appears to move as more of it becomes visible."""
+# Maximum of speed across over speed along; a car at more than 27 degrees to the road turns.
 MAX_SLANT: Final = 0.5
-"""Maximum of speed across over speed along; a car at more than 27 degrees to the road turns."""
 
 
 def crossing(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:

@@ -20,15 +20,15 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+# Height of a typical car; it varies by 15 %, from 1.4 (sports car) to 1.8 (van).
 CAR_HEIGHT_M: Final = 1.55
-"""Height of a typical car; it varies by 15 %, from 1.4 (sports car) to 1.8 (van)."""
 HEIGHT_FRACTION: Final = 0.15
+# Prior standard deviation of a car's speed.
 USUAL_MPS: Final = 10.0
-"""Prior standard deviation of a car's speed."""
+# Prior standard deviation of sideways speed on the ego vehicle's road: 10 m/s at 2 degrees.
 ALONG_ASIDE_MPS: Final = 0.3
-"""Prior standard deviation of sideways speed on the ego vehicle's road: 10 m/s at 2 degrees."""
+# Sum of squared residuals per degree of freedom above which the motion is not steady.
 MAX_MISFIT: Final = 4.0
-"""Sum of squared residuals per degree of freedom above which the motion is not steady."""
 
 
 class Observation(NamedTuple):

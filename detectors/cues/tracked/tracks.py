@@ -31,32 +31,32 @@ from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.detectors.ranging.object_tracks import Motion, iou
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
+# Constant part of the standard deviation of a box's height.
 BOX_PX: Final = 1.0
-"""Constant part of the standard deviation of a box's height."""
+# Part of that standard deviation proportional to the height; the two add in squares.
 BOX_FRACTION: Final = 0.03
-"""Part of that standard deviation proportional to the height; the two add in squares."""
+# Maximum speed of a car between two frames; a faster one is a different car.
 FASTEST_MPS: Final = 25.0
-"""Maximum speed of a car between two frames; a faster one is a different car."""
+# Maximum distance of oncoming and outgoing cars, unless a car farther away is large enough.
 PAST_WITHIN_M: Final = 120.0
-"""Maximum distance of oncoming and outgoing cars, unless a car farther away is large enough."""
+# Minimum height of a car farther away than ``PAST_WITHIN_M``. A pixel is then 7 % of the height,
+# less than half of the spread of car heights.
 FAR_PX: Final = 15.0
-"""Minimum height of a car farther away than ``PAST_WITHIN_M``. A pixel is then 7 % of the height,
-less than half of the spread of car heights."""
+# Replaces ``BOX_FRACTION`` for a car whose lower end is hidden.
 HIDDEN_FRACTION: Final = 0.15
-"""Replaces ``BOX_FRACTION`` for a car whose lower end is hidden."""
+# Minimum intersection over union of a car's box with the predicted box.
 MIN_OVERLAP: Final = 0.4
-"""Minimum intersection over union of a car's box with the predicted box."""
+# Weight of the newest step in the smoothed speed of a box's edges, because boxes jitter.
 NEWEST: Final = 0.5
-"""Weight of the newest step in the smoothed speed of a box's edges, because boxes jitter."""
+# Maximum difference of one car's heights in two frames, in standard deviations, apart from its
+# motion.
 ERRORS: Final = 2.0
-"""Maximum difference of one car's heights in two frames, in standard deviations, apart from its
-motion."""
+# Maximum ratio of one car's heights in consecutive frames.
 GROWTH: Final = 1.4
-"""Maximum ratio of one car's heights in consecutive frames."""
+# Distance to the picture's edge within which a box counts as cut.
 BORDER_PX: Final = 2.0
-"""Distance to the picture's edge within which a box counts as cut."""
+# Fraction of a box's lower end behind another car above which its height is not the car's.
 MAX_COVERED: Final = 0.3
-"""Fraction of a box's lower end behind another car above which its height is not the car's."""
 
 
 @dataclass(slots=True)

@@ -25,8 +25,8 @@ from .network import Plan, build_network
 KEY: Final = "crosscue"
 VERSION: Final = 1
 MAX_BYTES: Final = 2 << 30
+# Usual suffixes of pickles.
 _PICKLES: Final = frozenset({".pth", ".pt", ".pkl", ".pickle", ".bin", ".ckpt", ".joblib", ".npy"})
-"""Usual suffixes of pickles."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 

@@ -20,15 +20,15 @@ from crosscue.replay.errors import VehicleError, one_line
 from .checkpoint import Checkpoint, Facts
 from .network import Plan, build_network
 
+# Names of networks and of torchvision's weights for them.
 COCO_NETWORKS: Final[Mapping[str, str]] = {
     "resnet50": "MaskRCNN_ResNet50_FPN_Weights",
     "resnet50-v2": "MaskRCNN_ResNet50_FPN_V2_Weights",
 }
-"""Names of networks and of torchvision's weights for them."""
+# Networks that run with epsilon 0 in normalisation, because they were trained with it.
 NO_EPSILON: Final = frozenset({"resnet50"})
-"""Networks that run with epsilon 0 in normalisation, because they were trained with it."""
+# Width to which torchvision scales a 16:9 picture.
 WIDTH_PX: Final = 1333
-"""Width to which torchvision scales a 16:9 picture."""
 
 
 def load_coco(name: str) -> Checkpoint:

@@ -16,11 +16,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 MIN_CHANNELS: Final = 48
+# Number of pixels below which direct convolution is as fast. Measured with 32 to 512 channels and
+# 100 to 24,000 pixels.
 MIN_PIXELS: Final = 256
-"""Number of pixels below which direct convolution is as fast.
-
-Measured with 32 to 512 channels and 100 to 24,000 pixels.
-"""
 
 
 def for_cpu(network: Any) -> Any:

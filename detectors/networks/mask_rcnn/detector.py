@@ -38,8 +38,8 @@ from .openvino import OpenVinoParts
 from .parts import Parts, TorchParts, detected
 from .screening import MIN_PROPOSALS, ScreenedParts, can_screen
 
+# Incremented when the same pixels, weights and settings yield different numbers than before.
 VERSION: Final = 3
-"""Incremented when the same pixels, weights and settings yield different numbers than before."""
 EMBEDDED: Final = "embedded"
 GPU_BATCH: Final = 8
 PROPOSALS: Final = 100
@@ -80,12 +80,9 @@ def build(**given: Any) -> Detector:
     return detector_of(checkpoint_named(settings.network), settings, device)
 
 
+# Thresholds of the dissertation. They apply to its network, which is torchvision's for COCO, and to
+# the embedded network, which replaces it. Scores of other networks are not comparable.
 SOURCE_SCORES: Final = {"stop sign": 0.9, "traffic light": 0.9, "car": 0.95}
-"""Thresholds of the dissertation.
-
-They apply to its network, which is torchvision's for COCO, and to the embedded network, which
-replaces it. Scores of other networks are not comparable.
-"""
 
 
 def checkpoint_named(name: str) -> Checkpoint:

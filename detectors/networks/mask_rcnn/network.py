@@ -18,18 +18,18 @@ from torch.nn import functional
 from crosscue.detectors.settings import Proportion, Settings
 
 Architecture = Literal["compact", "resnet50", "resnet50-v2"]
+# Number of channels of the compact network's pyramid and heads.
 CHANNELS: Final = 64
-"""Number of channels of the compact network's pyramid and heads."""
 MEAN: Final = (0.485, 0.456, 0.406)
+# Mean and standard deviation of red, green and blue, as torchvision's weights expect them.
 SPREAD: Final = (0.229, 0.224, 0.225)
-"""Mean and standard deviation of red, green and blue, as torchvision's weights expect them."""
+# Multiple to which pictures are padded, as in torchvision.
 STRIDE: Final = 32
-"""Multiple to which pictures are padded, as in torchvision."""
 ANCHORS_PX: Final = ((6, 11), (20, 36), (64, 112), (176, 288))
+# Height over width of the anchors: a car from the side, a sign, an upright light.
 ASPECTS: Final = (0.45, 1.0, 2.6)
-"""Height over width of the anchors: a car from the side, a sign, an upright light."""
+# Number of boxes per level before suppression; torchvision's default.
 MAX_BEFORE_SUPPRESSION: Final = 1000
-"""Number of boxes per level before suppression; torchvision's default."""
 
 
 class Plan(Settings):

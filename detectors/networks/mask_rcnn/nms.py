@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Boxes = NDArray[np.float32]
+# Number of boxes up to which torchvision separates levels by offsets, with other rounding.
 FEW: Final = 1000
-"""Number of boxes up to which torchvision separates levels by offsets, with other rounding."""
 
 
 def likeliest_apart(

@@ -22,8 +22,8 @@ from crosscue.replay.base import Bytes, VehicleError, one_line
 from .network import MEAN, SPREAD, STRIDE
 from .parts import Body
 
+# Maximum number of compiled bodies; a camera has one size, and a drive has few cameras.
 KEPT_SIZES: Final = 4
-"""Maximum number of compiled bodies; a camera has one size, and a drive has few cameras."""
 
 
 class OpenVinoParts:

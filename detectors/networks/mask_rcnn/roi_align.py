@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Grid = NDArray[np.float32]
+# Value added to a level before it is rounded down, as in torchvision.
 _ROUNDING: Final = 1e-6
-"""Value added to a level before it is rounded down, as in torchvision."""
 
 
 class Pooler:

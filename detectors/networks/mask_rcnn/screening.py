@@ -16,14 +16,14 @@ from torch.nn import functional
 
 from .parts import TorchParts
 
+# Number of proposals above which screening saves time.
 MIN_PROPOSALS: Final = 200
-"""Number of proposals above which screening saves time."""
+# Rank of the approximation, as a fraction of the layer's outputs.
 RANK: Final = 3 / 16
-"""Rank of the approximation, as a fraction of the layer's outputs."""
+# Maximum error of an approximate score, in log-odds, that does not lose a detection.
 MARGIN: Final = 2.5
-"""Maximum error of an approximate score, in log-odds, that does not lose a detection."""
+# Interval of proposals that always get exact scores, to measure the approximation's error.
 CHECKED: Final = 40
-"""Interval of proposals that always get exact scores, to measure the approximation's error."""
 
 
 def can_screen(network: Any) -> bool:

@@ -25,8 +25,8 @@ from crosscue.detectors.settings import Settings, identity_of, settings_of
 from .checkpoint import RoadCheckpoint, load_road
 from .network import embedded_path, logits_of
 
+# Incremented when the same pixels, weights and settings yield a different mask than before.
 VERSION: Final = 1
-"""Incremented when the same pixels, weights and settings yield a different mask than before."""
 
 
 class RoadSettings(Settings):

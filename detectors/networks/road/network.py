@@ -15,8 +15,8 @@ from torch.nn import functional
 
 from crosscue.detectors.weights_file import embedded
 
+# Number of channels at 1/2, 1/4, 1/8 and 1/16 of the input's size.
 WIDTHS: Final = (16, 32, 64, 96)
-"""Number of channels at 1/2, 1/4, 1/8 and 1/16 of the input's size."""
 DILATIONS: Final = (1, 2, 4, 1)
 
 

@@ -36,6 +36,7 @@ _STEP: Final = {
     "t_ns": Column("BIGINT", "log time"),
     "approach": Column("BIGINT", "number of the approach in its run; null between approaches"),
 }
+# Tables of the index, by name.
 INDEXED: Final[Mapping[str, Mapping[str, Column]]] = {
     "runs": {
         **_RUN,
@@ -110,7 +111,7 @@ INDEXED: Final[Mapping[str, Mapping[str, Column]]] = {
         "reason": Column("VARCHAR", "why the run is left out"),
     },
 }
-"""Tables of the index, by name."""
+# Tables of the runs themselves, by name.
 OWN: Final[Mapping[str, Mapping[str, Column]]] = {
     "cues": {
         **_STEP,
@@ -178,19 +179,18 @@ OWN: Final[Mapping[str, Mapping[str, Column]]] = {
         "straight": Column("DOUBLE", "probability"),
     },
 }
-"""Tables of the runs themselves, by name."""
+# Path of a table in a run, if it is not stored under its own name.
 FILES: Final[Mapping[str, str]] = {
     "scores": "score/by_drive.parquet",
     "cue_frames": "score/cue_frames.parquet",
     "curves": "score/curves.parquet",
 }
-"""Path of a table in a run, if it is not stored under its own name."""
+# SQL of the tables that are computed from a file.
 VIEWS: Final[Mapping[str, str]] = {
     "scores": "select run, log, metric, kind, total, rows, case kind when 'sum' then total "
     "when 'rms' then sqrt(total / nullif(rows, 0)) else total / nullif(rows, 0) end as value "
     "from {table}",
 }
-"""SQL of the tables that are computed from a file."""
 
 
 def arrow_schema(columns: Mapping[str, Column]) -> pa.Schema:

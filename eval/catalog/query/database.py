@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import duckdb
     import pyarrow as pa
 
+# Settings, in the order in which they must be set.
 LOCKED: Final[Mapping[str, str]] = {
     "temp_directory": "''",
     "autoinstall_known_extensions": "false",
@@ -31,9 +32,8 @@ LOCKED: Final[Mapping[str, str]] = {
     "enable_external_access": "false",
     "lock_configuration": "true",
 }
-"""Settings, in the order in which they must be set."""
+# Max characters of DuckDB's messages, which may quote long values.
 MAX_LINE: Final = 300
-"""Max characters of DuckDB's messages, which may quote long values."""
 _QUOTED: Final = re.compile(r'"([^"]+)"')
 _SCHEMA: Final = "crosscue query --schema lists all"
 

@@ -31,15 +31,15 @@ if TYPE_CHECKING:
     import pyarrow as pa
     import pyarrow.fs
 
+# Name of the folder of the index.
 NAME: Final = ".catalog"
-"""Name of the folder of the index."""
+# Max size of a manifest, and of the index.
 MAX_BYTES: Final = 256 << 20
-"""Max size of a manifest, and of the index."""
 ENTRIES: Final = "entries"
 HALF: Final = "no manifest.json: cut short, or still being made; replay again"
 KEPT: Final = ("runs", "approaches", "dropped")
+# Version of the index; it changes with the list of columns.
 _MARK: Final = hashlib.sha256(repr((1, INDEXED)).encode()).hexdigest()
-"""Version of the index; it changes with the list of columns."""
 
 
 class Runs(Protocol):

@@ -18,12 +18,12 @@ from crosscue.replay.base import (
 if TYPE_CHECKING:
     import pyarrow.fs
 
+# Max depth of runs below the searched folder, local or on a store.
 DEPTH: Final = 6
-"""Max depth of runs below the searched folder, local or on a store."""
 SCORED: Final = "metrics.json"
 SCORE: Final = "score"
+# Files of a run that are not tables.
 BESIDE: Final = (TAGS, FAILURE, TIMINGS)
-"""Files of a run that are not tables."""
 
 Stamp: TypeAlias = tuple[int, int, int, int]
 CUT_SHORT: Final[Stamp] = (0, 0, 0, 0)

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 WORKERS: Final = 8
 SCORE: Final = "score/"
+# Columns of a table without a readable file, whose own columns are unknown.
 ONLY_RUN: Final = {"run": OWN["cues"]["run"]}
-"""Columns of a table without a readable file, whose own columns are unknown."""
 
 
 def file_of(table: str) -> str:

@@ -35,8 +35,8 @@ Row: TypeAlias = dict[str, Any]
 M = TypeVar("M", bound=BaseModel)
 JUDGED: Final = "score/approaches.parquet"
 _EPOCH: Final = datetime(1970, 1, 1)
+# Stages of folders that are not runs of a single drive.
 NOT_A_RUN: Final = frozenset({"merged", "decode"})
-"""Stages of folders that are not runs of a single drive."""
 
 
 class _Head(BaseModel):

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     import pyarrow.fs
 
 T = TypeVar("T")
+# Names of an object's modification time in various stores; the first that exists is used.
 TIMES: Final = ("LastModified", "last_modified", "mtime", "updated", "created")
-"""Names of an object's modification time in various stores; the first that exists is used."""
+# Fields that change when an object is replaced.
 VERSIONS: Final = ("ETag", "etag", "version_id", "generation", "md5Hash", *TIMES)
-"""Fields that change when an object is replaced."""
 
 Infos = Mapping[str, Mapping[str, Any]]
 

@@ -19,10 +19,10 @@ from .threshold import best_bound, fewest_detections, lower_bound, round_between
 CalibrationKind: TypeAlias = Literal["platt", "isotonic", "none"]
 CALIBRATIONS: Final[tuple[CalibrationKind, ...]] = ("platt", "isotonic", "none")
 NOT_LABELLED: Final = "not labelled"
+# Min number of labelled boxes to fit a class.
 MIN_LABELS: Final = 20
-"""Min number of labelled boxes to fit a class."""
+# Min number of right and of wrong detections to calibrate scores.
 MIN_EACH: Final = 10
-"""Min number of right and of wrong detections to calibrate scores."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -39,8 +39,8 @@ from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
+# Min number of points of a landmark; pictures of a blank wall or at night have fewer.
 MIN_POINTS: Final = 20
-"""Min number of points of a landmark; pictures of a blank wall or at night have fewer."""
 MAX_GAP_NS: Final = 500_000_000
 MAX_COORDINATE_BYTES: Final = 256 << 20
 

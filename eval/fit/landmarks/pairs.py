@@ -23,8 +23,8 @@ from crosscue.replay.base import MIB, AnnotationError, Ledger, LogError, read_at
 
 MAX_PAIRS: Final = 1_000_000
 MAX_PAIR_BYTES: Final = 256 * MIB
+# Near pictures whose directions differ by more than this are not used as a pair.
 SAME_TURN_RAD: Final = math.pi / 4
-"""Near pictures whose directions differ by more than this are not used as a pair."""
 _LABELS: Final = {"1": True, "0": False, "true": True, "false": False}
 
 

@@ -24,12 +24,12 @@ from crosscue.replay.base import (
 
 MAX_BYTES: Final = 256 * MIB
 LABELS: Final[Mapping[str, str]] = {"stop_sign": "stop sign", "traffic_light": "traffic light"}
+# Column of true ranges by cue: stop signs are at the intersection's start, lights at its end.
 REFERENCES: Final[Mapping[str, str]] = {"stop_sign": "start_m", "traffic_light": "end_m"}
-"""Column of true ranges by cue: stop signs are at the intersection's start, lights at its end."""
+# Min visible fraction of an object; the height of an occluded one does not show its range.
 MIN_VISIBLE: Final = 0.9
-"""Min visible fraction of an object; the height of an occluded one does not show its range."""
+# Max time difference between a detection and its true range.
 NEAREST_NS: Final = 20_000_000
-"""Max time difference between a detection and its true range."""
 
 
 class RangePairs(NamedTuple):

@@ -23,8 +23,8 @@ COLUMNS: Final = ("picture", "label", "x0", "y0", "x1", "y1")
 MAX_BYTES: Final = 64 * MIB
 _WANTED: Final = "give a CSV or COCO file of boxes, or a drive's folder"
 
+# Boxes (x0, y0, x1, y1) in pixels by label.
 Boxes = dict[str, list[tuple[float, float, float, float]]]
-"""Boxes (x0, y0, x1, y1) in pixels by label."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,8 +29,8 @@ from crosscue.replay.base import (
     write_text,
 )
 
+# Supported tasks in the metadata of Ultralytics' exports.
 _TASKS: Final = ("detect", "segment")
-"""Supported tasks in the metadata of Ultralytics' exports."""
 _MAX_TASK_CHARACTERS: Final = 40
 
 

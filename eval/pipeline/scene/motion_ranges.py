@@ -41,17 +41,15 @@ from crosscue.replay.vehicle.vehicle import TRAFFIC_LIGHT, Vehicle
 
 from .usable import MEASURED, Usable, source_of, usable
 
+# Min difference of two clearly different ranges, in standard deviations.
 CLEARLY: Final = 2.0
-"""Min difference of two clearly different ranges, in standard deviations."""
+# Max distance of a light behind the nearest one at the same intersection.
 WIDEST_M: Final = 60.0
-"""Max distance of a light behind the nearest one at the same intersection."""
+# Min distance between two groups, the width of a two-lane street with its kerbs.
 NARROWEST_M: Final = 8.0
-"""Min distance between two groups, the width of a two-lane street with its kerbs."""
+# Observations after which an object competes with any other. Below, it competes only with objects
+# observed at most twice as often.
 PERSISTS: Final = 10
-"""Observations after which an object competes with any other.
-
-Below, it competes only with objects observed at most twice as often.
-"""
 ONE_GROUP: Final = "frames with only one group of lights"
 ONLY_AWAY: Final = "frames with only lights that do not face the ego vehicle"
 

@@ -40,13 +40,13 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 ROWS_HELD: Final = 8192
+# Min fraction of the time between two frames that odometry must cover to measure the distance.
 COVERED: Final = 0.9
-"""Min fraction of the time between two frames that odometry must cover to measure the distance."""
+# Feature columns of ``belief.parquet``, unless the vehicle file's graph has others.
 FEATURES: Final = ("intersection", "left", "right", "straight")
-"""Feature columns of ``belief.parquet``, unless the vehicle file's graph has others."""
 
+# Callback for a batch of a table: its name and columns.
 Sink = Callable[[str, dict[str, list[Any]]], None]
-"""Callback for a batch of a table: its name and columns."""
 
 
 def nothing_past(_t_ns: int) -> PastCues | None:

@@ -13,14 +13,14 @@ from crosscue.detectors.cues.candidates import BELOW_SCORE, NO_CURVE
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.vehicle import STOP_SIGN, TRAFFIC_LIGHT, Vehicle
 
+# Margin at the picture's edge; the height of a sign within it is truncated.
 BORDER_PX: Final = 2.0
-"""Margin at the picture's edge; the height of a sign within it is truncated."""
 
 Source = Literal["curve", "motion"]
 NO_HEIGHT: Final = "no height"
 CUT: Final = "cut by the picture's edge"
+# Cues of the dissertation whose detections measure a range, with its reference.
 MEASURED: Final = ((STOP_SIGN, Reference.START), (TRAFFIC_LIGHT, Reference.END))
-"""Cues of the dissertation whose detections measure a range, with its reference."""
 
 
 def source_of(vehicle: Vehicle, cue: str) -> Source | None:

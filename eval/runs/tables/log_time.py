@@ -21,8 +21,8 @@ from crosscue.replay.time.segments import Cause, Timeline
 if TYPE_CHECKING:
     import pyarrow as pa
 
+# Columns that every table has in addition to its own.
 LABELS: Final = frozenset({"segment", "log_t_ns"})
-"""Columns that every table has in addition to its own."""
 
 
 @dataclass(frozen=True, slots=True)

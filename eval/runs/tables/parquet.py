@@ -19,8 +19,8 @@ from crosscue.replay.files.partial_file import PartialFile
 if TYPE_CHECKING:
     import pyarrow as pa
 
+# Rows of a table buffered before they are written.
 GROUP_ROWS: Final = 8192
-"""Rows of a table buffered before they are written."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,8 +34,8 @@ from .matching import NOBODY, Boxes
 OTHER_LOG: Final = "images that are not in the run"
 OTHER_CLASS: Final = "boxes of classes that the detector does not report"
 OTHER_LABEL: Final = "on a better one with another label"
+# Max time between a picture and its frame, as a fraction of the time between frames.
 FAR: Final = 0.4
-"""Max time between a picture and its frame, as a fraction of the time between frames."""
 _FOUND: Final = ("log_t_ns", "detector", "label", "score", "x0", "y0", "x1", "y1", "range_m")
 
 

@@ -20,10 +20,10 @@ Int64s: TypeAlias = NDArray[np.int64]
 
 
 Bools: TypeAlias = NDArray[np.bool_]
+# COCO's overlap thresholds; average precision is the mean over them.
 OVERLAPS: Final = np.linspace(0.5, 0.95, 10)
-"""COCO's overlap thresholds; average precision is the mean over them."""
+# Max detections of one class in one picture, as in COCO; those of lower scores are left out.
 MAX_DETECTIONS: Final = 100
-"""Max detections of one class in one picture, as in COCO; those of lower scores are left out."""
 NOBODY: Final = -1
 
 
@@ -102,12 +102,12 @@ class Part:
 
 
 ALL: Final = Part("all")
+# COCO's sizes, in pixels of the camera's picture.
 SIZES: Final = (
     Part("small", (0.0, 32.0**2)),
     Part("medium", (32.0**2, 96.0**2)),
     Part("large", (96.0**2, 1e10)),
 )
-"""COCO's sizes, in pixels of the camera's picture."""
 RANGES: Final = tuple(
     Part(f"{low:g} to {high:g} m" if np.isfinite(high) else f"over {low:g} m", ranges_m=(low, high))
     for low, high in ((0.0, 20.0), (20.0, 40.0), (40.0, 60.0), (60.0, np.inf))

@@ -36,8 +36,8 @@ UNLIKELY: Final = "never probable enough"
 NOT_LOOKED_FOR: Final = "not looked for"
 BRIEF: Final = f"for fewer than {CONFIRM_FRAMES} frames"
 WRONG_RANGE: Final = "range outside its 95 % interval"
+# All full detections of the dissertation were at least this far away.
 NEAR_M: Final = 8.0
-"""All full detections of the dissertation were at least this far away."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,8 @@ from crosscue.eval.scoring.intervals import Mean, Proportion, fraction, mean
 from crosscue.eval.scoring.pooling import cluster_numbers, first_reasons, summed
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
 
+# Probabilities are clipped to this and one minus this for the log score.
 CLIP: Final = 1e-6
-"""Probabilities are clipped to this and one minus this for the log score."""
 BINS: Final = 10
 SILENT: Final = "frames ahead of an intersection without any belief"
 

@@ -38,8 +38,8 @@ from crosscue.replay.vehicle.vehicle import CUES, Scoring
 Reading = Scoring
 
 
+# Min visible fraction of an object that counts in ``recall_seen``.
 SEEN: Final = 0.5
-"""Min visible fraction of an object that counts in ``recall_seen``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

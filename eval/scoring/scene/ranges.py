@@ -25,8 +25,8 @@ from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
 from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.fusion.intersection_range import RangeBelief, predict, smooth
 
+# Squared jump of a range, in units of its variance, above which the filter has restarted.
 RESTART_NIS: Final = 25.0
-"""Squared jump of a range, in units of its variance, above which the filter has restarted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

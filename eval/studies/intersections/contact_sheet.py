@@ -17,11 +17,11 @@ from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.base import Bytes, Int64s, write_bytes
 
+# True distance to the intersection of the frame.
 AWAY_M: Final = 18.0
-"""True distance to the intersection of the frame."""
 TILE_PX: Final = (480, 270)
+# Magnification of text and lines before a frame is reduced to its tile.
 ENLARGE: Final = 2.0
-"""Magnification of text and lines before a frame is reduced to its tile."""
 QUALITY: Final = 80
 
 

@@ -22,10 +22,10 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .tables import StudyScores
 
+# Settings of scores that are compared with the published distances.
 AS_PUBLISHED: Final = ScoreSettings(detection="published")
-"""Settings of scores that are compared with the published distances."""
+# Min number of intersections, so that messages are learned at two others or more.
 MIN_PLACES: Final = 3
-"""Min number of intersections, so that messages are learned at two others or more."""
 
 
 def score_study(out: Path, names: Sequence[str], *, attribution: bool = True) -> StudyScores:

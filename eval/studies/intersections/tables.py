@@ -37,11 +37,11 @@ class StudyScores:
     difference: dict[str, BeliefDifference]
 
 
+# Single runs in the dissertation's text: metres at detection and at full detection.
 PUBLISHED_RUNS: Final[Mapping[str, tuple[float, float]]] = {
     "E-01": (38.6, 19.8), "F-05": (41.2, 29.4), "A-07": (75.2, 30.1), "B-10": (47.7, 17.6),
     "G-03": (43.5, 9.8), "E-07": (8.2, 7.6), "D-10": (30.1, 11.8),
 }  # fmt: skip
-"""Single runs in the dissertation's text: metres at detection and at full detection."""
 
 Row = dict[str, Any]
 

@@ -16,26 +16,23 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .drives import StudyDrive
 from .score import FEATURES, THRESHOLD, DriveBelief
 
+# Kinds of beliefs that are compared. The fourth is the third with the training layouts' frequencies
+# as priors, which ``temporal`` also learns.
 KINDS: Final = ("source", "persistent", "calibrated", "calibrated, base rates", "temporal")
-"""Kinds of beliefs that are compared.
-
-The fourth is the third with the training layouts' frequencies as priors, which ``temporal`` also
-learns.
-"""
+# The belief over time, also outside approaches, where the other kinds have no belief.
 EVERYWHERE: Final = "temporal, every picture"
-"""The belief over time, also outside approaches, where the other kinds have no belief."""
+# The rules for real roads, by section of the vehicle file.
 REAL_ROADS: Final[Mapping[str, Mapping[str, str]]] = {
     "regions": {"kind": "ground"},
     "cars": {"kind": "tracks"},
     "fusion": {"kind": "persistent"},
 }
-"""The rules for real roads, by section of the vehicle file."""
+# Section of each rule, and its values without the rule.
 RULES: Final[Mapping[str, tuple[str, str]]] = {
     "range-anchored regions": ("regions", "picture"),
     "motion-compensated trackers": ("cars", "pairs"),
     "persistence": ("fusion", "source"),
 }
-"""Section of each rule, and its values without the rule."""
 
 
 def believed(

@@ -20,8 +20,8 @@ from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit, fit_te
 
 from .drives import StudyDrive
 
+# Annotated approaches by drive.
 Annotations = Mapping[str, Sequence[Any]]
-"""Annotated approaches by drive."""
 
 
 class Learned(NamedTuple):

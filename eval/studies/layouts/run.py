@@ -21,11 +21,11 @@ from .report import LayoutFiles, LayoutScores, tables_of, write_layout_study
 from .settings import LayoutStudy, Perception
 from .study import score_study
 
+# Source of the recorded images, and detectors, by perception.
 SEEN_BY: Final = {
     "pixels": SPARSE_AND_EMBEDDED,
     "faults": (LABEL_IMAGES, DETECTORS),
 }
-"""Source of the recorded images, and detectors, by perception."""
 IN_WORDS: Final = {"pixels": "perceived by networks", "faults": "simulated detectors, no network"}
 
 

@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 SUCCESS: Final = 0.8
 STRAIGHT: Final = "straight to goal"
 PUBLISHED_EXTRA: Final = {"landmark to landmark": 0.31, "hybrid": 0.15}
+# Landmarks per km2, detection rate, and the distance that 8 of 10 field tests reached.
 PUBLISHED_POINT: Final = (0.55, 0.6, 6900.0)
-"""Landmarks per km2, detection rate, and the distance that 8 of 10 field tests reached."""
 CITY_BORDERS_KM2: Final = (0.0, 25.0, 50.0, 75.0, 401.0)
+# Density from which on the dissertation makes no claim about strategies.
 DENSE_PER_KM2: Final = 10.0
-"""Density from which on the dissertation makes no claim about strategies."""
 NOTES: Final = (
     "Range: the straight distance from start to goal at which a logistic curve through all drives "
     "of a cell falls to 80 % success; 'beyond': not within the farthest goal in cities of at most "

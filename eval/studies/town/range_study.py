@@ -27,19 +27,19 @@ from .settings import UNTIL_LOST, RangeStudy, changed
 if TYPE_CHECKING:
     import pyarrow as pa
 
+# Mean distance at loss by compass 2-sigma in degrees; infinite if never lost.
 PUBLISHED_M: Final = {10.0: math.inf, 20.0: 20_800.0, 30.0: 9_300.0, None: 300.0}
-"""Mean distance at loss by compass 2-sigma in degrees; infinite if never lost."""
 CALIBRATED_DEG: Final = 30.0
+# Factors of the study's slip.
 SLIPS: Final = (0.5, 1.0, 2.0, 3.0)
-"""Factors of the study's slip."""
+# Factors of the study's compass interval.
 INTERVALS: Final = (0.6, 0.8, 0.95, 1.0, 1.25, 1.6)
-"""Factors of the study's compass interval."""
+# Compasses whose published range was not used for calibration and is finite.
 PREDICTED: Final = (20.0, None)
-"""Compasses whose published range was not used for calibration and is finite."""
+# Number of the study's drives per drive of each choice.
 FRACTION: Final = 10
-"""Number of the study's drives per drive of each choice."""
+# Block of seeds that no case of the study uses.
 BLOCK: Final = 1000
-"""Block of seeds that no case of the study uses."""
 CALIBRATION_SEED: Final = 424_242
 CALIBRATION_DRIVES: Final = 2_000
 

@@ -29,10 +29,10 @@ from crosscue.replay.decode.ros.walk import CDR_PADDING, Bools, Rows, gather, wa
 
 CDR_BE: Final = 0x0000
 CDR_LE: Final = 0x0001
+# Key of the layout of messages that end in bytes.
 ANY_LENGTH: Final = -1
-"""Key of the layout of messages that end in bytes."""
+# Encapsulations that DDS defines and that are not supported; any other number means damage.
 OTHER_CODINGS: Final = (0x0002, 0x0003, *range(0x0006, 0x000C))
-"""Encapsulations that DDS defines and that are not supported; any other number means damage."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from typing import Final
 from crosscue.replay.base import DEFAULT_LIMITS, Limits, SchemaError
 from crosscue.replay.decode.ros.type_names import ros2_spelling
 
+# NumPy codes of primitive types; ``byte`` is signed and ``char`` is not, in ROS 1 and ROS 2.
 PRIMITIVES: Final[Mapping[str, str]] = {
     "bool": "u1",
     "byte": "i1",
@@ -31,12 +32,11 @@ PRIMITIVES: Final[Mapping[str, str]] = {
     "float32": "f4",
     "float64": "f8",
 }
-"""NumPy codes of primitive types; ``byte`` is signed and ``char`` is not, in ROS 1 and ROS 2."""
 
 TIME: Final = "builtin_interfaces/msg/Time"
 DURATION: Final = "builtin_interfaces/msg/Duration"
+# Max size of IDL text; its general parser takes about a second for this size.
 IDL_BYTES: Final = 64 << 10
-"""Max size of IDL text; its general parser takes about a second for this size."""
 
 
 class Shape(Enum):
@@ -273,6 +273,7 @@ def well_known(type_name: str) -> Definitions | None:
     return found
 
 
+# Types outside the ROS 2 distribution; field names and order define the wire format.
 _OWN: Final[Mapping[str, str]] = {
     "can_msgs/msg/Frame": (
         "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\n"
@@ -285,4 +286,3 @@ _OWN: Final[Mapping[str, str]] = {
         "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
     ),
 }
-"""Types outside the ROS 2 distribution; field names and order define the wire format."""

@@ -28,8 +28,8 @@ from crosscue.replay.decode.ros.definition import (
 MAX_DEPTH: Final = 32
 MAX_STEPS: Final = 20_000
 HEADER: Final = "std_msgs/msg/Header"
+# Name of the byte that represents an empty message on the wire; it holds no value.
 FILLER: Final = "structure_needs_at_least_one_member"
-"""Name of the byte that represents an empty message on the wire; it holds no value."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,11 +19,11 @@ from crosscue.replay.columns import Bytes, Int64s, Messages
 from crosscue.replay.decode.ros.plan import Items, Plan, Run, Step, Text
 from crosscue.replay.decode.ros.walk import Bools
 
+# Max size of a message for this path; longer messages are few, and copying them costs more than
+# parsing them.
 MAX_BYTES: Final = 4096
-"""Max size of a message for this path; longer messages are few, and copying them costs more than
-parsing them."""
+# Number of bytes compared at once.
 PROBE: Final = 8
-"""Number of bytes compared at once."""
 MAX_ITEMS: Final = 64
 LAYOUTS_KEPT: Final = 16
 

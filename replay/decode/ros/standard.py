@@ -39,13 +39,13 @@ from crosscue.replay.decode.ros.plan import Plan
 from crosscue.replay.decode.ros.walk import Bools, gather
 
 Decoded: TypeAlias = CanFrames | Table | Images
+# Messages that fit their definition but cannot be used, and the reason for the ledger.
 Doubt: TypeAlias = tuple[Bools, str]
-"""Messages that fit their definition but cannot be used, and the reason for the ledger."""
 
 FD_BYTES: Final = 64
 MAX_SIDE_PX: Final = 65_535
+# OpenCV's largest distortion model.
 LENS_COEFFICIENTS: Final = 14
-"""OpenCV's largest distortion model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +93,8 @@ def _table(**sources: str) -> Kind:
     return Kind(tuple(sources.values()), build)
 
 
+# Mask of the bytes that a frame carries, by its length.
 _CARRIED: Final = np.where(np.arange(8) < np.arange(9)[:, None], 255, 0).astype(np.uint8)
-"""Mask of the bytes that a frame carries, by its length."""
 
 
 def _can_frame(fields: Fields) -> CanFrames:
@@ -329,8 +329,8 @@ def generic(fields: Fields) -> Table:
     return Table(columns)
 
 
+# Prefix of the types that ``crosscue convert`` creates for tables, with columns as fields.
 OWN_TYPES: Final = "crosscue_msgs/msg/"
-"""Prefix of the types that ``crosscue convert`` creates for tables, with columns as fields."""
 
 
 def own_table(fields: Fields) -> Table:
@@ -347,8 +347,8 @@ def kind_of(type_name: str) -> Kind:
     return Kind((), own_table if type_name.startswith(OWN_TYPES) else generic)
 
 
+# Paths of the sensor's time in a message; the first one found is used.
 STAMPS: Final = ("header.stamp", "timestamp", "stamp")
-"""Paths of the sensor's time in a message; the first one found is used."""
 
 
 def header_ns(fields: Fields) -> Int64s | None:

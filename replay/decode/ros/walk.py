@@ -19,10 +19,10 @@ from crosscue.replay.decode.ros.plan import Items, Plan, Run, Step, Text, jumped
 Bools = NDArray[np.bool_]
 Rows = NDArray[np.intp]
 
+# Max steps for nested items of varying size in one block, which bounds the time for any log.
 MAX_ITEM_STEPS: Final = 50_000
-"""Max steps for nested items of varying size in one block, which bounds the time for any log."""
+# Max bytes of padding after a CDR message, to a multiple of four.
 CDR_PADDING: Final = 3
-"""Max bytes of padding after a CDR message, to a multiple of four."""
 
 
 @dataclass(slots=True, eq=False)

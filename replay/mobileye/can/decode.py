@@ -55,8 +55,8 @@ _LANE_PARTS: Final = {
     "next_lanes": ("next_lane_a", "next_lane_b"),
 }
 REPEATED_STATUS: Final = "repeated status frame"
+# Known protocol versions with status frames of 6 bytes.
 KNOWN_PROTOCOLS: Final = (1, 3)
-"""Known protocol versions with status frames of 6 bytes."""
 
 
 class Statuses:

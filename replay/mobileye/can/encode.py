@@ -30,10 +30,10 @@ from crosscue.replay.mobileye.settings import DEFAULTS, MobileyeSettings
 from crosscue.replay.mobileye.tables import floats, instance_of_lane, table_block, to_device
 from crosscue.replay.mobileye.wire import words_from
 
+# Approximate duration of a frame of 8 bytes at 500 kbit/s.
 FRAME_NS: Final = 250_000
-"""Approximate duration of a frame of 8 bytes at 500 kbit/s."""
+# Default time from image to status frame, a plausible value that was not measured.
 LATENCY_NS: Final = 80 * MS
-"""Default time from image to status frame, a plausible value that was not measured."""
 
 _OBSTACLE_PARTS: Final = ("obstacle_a", "obstacle_b", "obstacle_c")
 _LANE_PARTS: Final = {

@@ -19,11 +19,11 @@ def _mask(*bits: int) -> np.uint64:
     return np.uint64(sum(1 << b for b in bits))
 
 
+# Bits that only the extended family defines: sound suppressed, left and right crossing.
 ONLY_EXTENDED: Final = _mask(7, 36, 37)
-"""Bits that only the extended family defines: sound suppressed, left and right crossing."""
+# Bits that only the TSR family defines: zero speed, high beam, error (inverted, so usually set),
+# reminders, TSR, repeatable headway.
 ONLY_TSR: Final = _mask(13, 14, 15, *range(24, 32), *range(43, 51), 58)
-"""Bits that only the TSR family defines: zero speed, high beam, error (inverted, so usually set),
-reminders, TSR, repeatable headway."""
 
 
 class FamilyEvidence:

@@ -43,8 +43,9 @@ NO_COUNTERPART: Final = "message without a known counterpart on CAN"
 LACKS_FIELDS: Final = "message lacks fields of its type"
 NOT_COLUMNS: Final = "message was not decoded to columns"
 
+# Messages whose sign is determined, and their names in notices.
 _SIDED: Final = (("LkaLane", "lanes"), ("AftermarketLane", "aftermarket lanes"))
-"""Messages whose sign is determined, and their names in notices."""
+# Variant whose fields the messages have.
 _VARIANT_OF: Final[Mapping[str, str]] = {
     "status": "classic",
     "lane_details": "classic",
@@ -52,7 +53,6 @@ _VARIANT_OF: Final[Mapping[str, str]] = {
     "warnings": "extended",
     "sign": "basic",
 }
-"""Variant whose fields the messages have."""
 
 
 class RosMobileye:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from crosscue.replay.mobileye.settings import LaneSign
 
+# Number of votes required, about 3 s of lanes on both sides. That is longer than a lane change, in
+# which lanes are on the wrong side.
 VOTES_WANTED: Final = 50
-"""Number of votes required, about 3 s of lanes on both sides. That is longer than a lane change, in
-which lanes are on the wrong side."""
 USABLE_QUALITY: Final = 2
 CLEAR_OF_MIDDLE_M: Final = 0.3
 

@@ -25,19 +25,19 @@ MAGIC: Final = b"LOBJ"
 PADDING_MAX: Final = 8
 BASE_BYTES: Final = 16
 CONTAINER: Final = 10
+# Object type that the file header does not count.
 RESTORE_POINT: Final = 115
-"""Object type that the file header does not count."""
+# Maximum plausible object type; no known type is above 150.
 TYPE_MAX: Final = 255
-"""Maximum plausible object type; no known type is above 150."""
+# Number of bytes after an object that are too few to detect the next one.
 _UNSEEN_MAX: Final = BASE_BYTES + PADDING_MAX
-"""Number of bytes after an object that are too few to detect the next one."""
 _PLACES_KEPT: Final = 5
 _SIGNATURE: Final = int.from_bytes(MAGIC, "little")
 _EXTENDED: Final = 0x80000000
 _ID_MASK: Final = 0x1FFFFFFF
 _TEN_MICROSECONDS: Final = 1
+# Maximum time from the start, 36 years; a later time is damage.
 _NANOS_MAX: Final = 1 << 60
-"""Maximum time from the start, 36 years; a later time is damage."""
 
 
 @dataclass(slots=True)

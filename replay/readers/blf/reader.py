@@ -48,14 +48,14 @@ _HEADER_MAX: Final = 4096
 _BASE: Final = struct.Struct("<4sHHLL")
 _CONTAINER: Final = struct.Struct("<H6xL4x")
 _STORED, _DEFLATED = 0, 2
+# Number of containers examined for bus names before the log is read.
 _PEEKED: Final = 8
-"""Number of containers examined for bus names before the log is read."""
+# Number of decompressed bytes that are parsed at a time.
 STREAM_BYTES: Final = 1 << 20
-"""Number of decompressed bytes that are parsed at a time."""
 _SCAN_BYTES: Final = 1 << 20
 _PIECE_BYTES: Final = 1 << 16
+# Maximum number of bytes read from damaged containers, as a multiple of the file's size.
 _WASTE: Final = 8
-"""Maximum number of bytes read from damaged containers, as a multiple of the file's size."""
 _NOT_READ: Final = "outside the window"
 NOT_CLOSED: Final = "file was not closed by its writer"
 _UNCLOSED: Final = "the writer never closed the file: what it had not yet written is missing"

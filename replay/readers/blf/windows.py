@@ -17,16 +17,16 @@ from crosscue.replay.base import Selection
 
 from .objects import BASE_BYTES, CONTAINER, FRAME_TYPES, MAGIC, PADDING_MAX
 
+# Maximum time by which frames of several channels are out of order.
 SLACK_NS: Final = 1_200_000_000
-"""Maximum time by which frames of several channels are out of order."""
 _HEAD: Final = struct.Struct("<4sHHLLH6xL4x")
 _OBJECT: Final = struct.Struct("<4sHHLLLLQ")
 _STORED, _DEFLATED = 0, 2
 _PEEKED_BYTES: Final = 1024
 _INFLATED_BYTES: Final = 4096
 _TICK_NS: Final = {1: 10_000, 2: 1}
+# Size of an object's header in bytes, by version.
 _HEADERS: Final = {1: 32, 2: 40}
-"""Size of an object's header in bytes, by version."""
 
 
 class _Container(NamedTuple):

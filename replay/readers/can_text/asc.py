@@ -66,11 +66,11 @@ _DATE: Final = re.compile(
     r"\s*([ap]m)?\s+(\d{4})\s*",
     re.IGNORECASE,
 )
+# English and German, the languages that the writing tools use.
 _MONTHS: Final = {
     "jan": 1, "feb": 2, "mar": 3, "mär": 3, "mrz": 3, "apr": 4, "may": 5, "mai": 5, "jun": 6,
     "jul": 7, "aug": 8, "sep": 9, "oct": 10, "okt": 10, "nov": 11, "dec": 12, "dez": 12,
 }  # fmt: skip
-"""English and German, the languages that the writing tools use."""
 _HEADER_DATE: Final = re.compile(r"date\s+(.*)", re.IGNORECASE)
 _HEADER_BASE: Final = re.compile(
     r"base\s+(hex|dec)(?:\s+timestamps\s+(absolute|relative))?\s*", re.IGNORECASE
@@ -90,8 +90,8 @@ _EVENT: Final = re.compile(
 _ERROR: Final = re.compile(r"(\S+)\s+ErrorFrame(?:\s.*)?", re.IGNORECASE)
 _FD_ERROR: Final = re.compile(r"CANFD\s+(\S+)\s+[RT]x\s+ErrorFrame(?:\s.*)?", re.IGNORECASE)
 _SECOND: Final = re.compile(r"\d[.,]\d{1,9}\s+(?:CANFD\s+)?\S+\s(?:.*\s)?[RT]x\s")
+# Maximum time between two lines; a longer one is damage.
 _STEP_MAX_NS: Final = 86_400 * NANOS
-"""Maximum time between two lines; a longer one is damage."""
 _IDENTIFIER: Final = re.compile(r"([0-9A-Fa-f]{1,10})([xX]?)")
 _TWO_HEX: Final = re.compile(r"[0-9A-Fa-f]{2}")
 NOT_UNDERSTOOD: Final = "line not understood"

@@ -53,8 +53,8 @@ _BYTE: Final = np.uint64(0xFF)
 _FIVE_BYTES: Final = np.uint64(40)
 ERROR_FLAG: Final = 0x20000000
 NOT_A_FRAME: Final = "line is not a candump frame"
+# Maximum number of different lengths of the time field in a chunk for the fast parser.
 _TIME_WIDTHS: Final = 12
-"""Maximum number of different lengths of the time field in a chunk for the fast parser."""
 IS_INTERFACE: Final = re.compile(rb"[A-Za-z0-9_.:@-]{1,16}")
 
 _TIME: Final = rb"\((\d+)\.(\d+)\)"

@@ -45,8 +45,8 @@ from .digits import Bools, payload8, payload64, spaced8
 from .lines import Lines, Overlong, Tail, lines_of
 
 HEAD_BYTES: Final = 64 << 10
+# Maximum length of a line that is parsed by ``slow``.
 LINE_MAX: Final = 8192
-"""Maximum length of a line that is parsed by ``slow``."""
 _CONTROL: Final = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 _EXCERPT: Final = 60
 _DOS_END: Final = b"\x1a"

@@ -26,8 +26,8 @@ Bools: TypeAlias = NDArray[np.bool_]
 FRONT: Final = 32
 BACK: Final = 256
 NANOS: Final = 1_000_000_000
+# Maximum time, in the year 2116. The sum of a start and an offset below it does not overflow.
 TIME_MAX_NS: Final = 1 << 62
-"""Maximum time, in the year 2116. The sum of a start and an offset below it does not overflow."""
 SECONDS_MAX: Final = TIME_MAX_NS // NANOS - 1
 OUT_OF_RANGE: Final = "time of the year 2116 or later, which is out of range"
 
@@ -264,8 +264,8 @@ def payload64(buffer: Bytes, start: Int64s, length: Int64s, gap: int | None) -> 
     return np.where(inside, (high << 4) | (low & 15), np.uint8(0)), ok
 
 
+# Maximum length, in bytes, of the names that ``labels`` distinguishes.
 LABEL_MAX: Final = 16
-"""Maximum length, in bytes, of the names that ``labels`` distinguishes."""
 _NAMES_MAX: Final = 64
 
 

@@ -170,10 +170,10 @@ _ONE: Final = np.uint64(1)
 _TO_HIGH: Final = _ONES * np.uint64(0x80 - 0x21)
 _SEVEN: Final = np.uint64(7)
 _FIFTY_SIX: Final = np.uint64(56)
+# Multiplier that maps ``1 << 8 * k`` to a word with the highest byte ``k``.
 _PLACES: Final = np.uint64(0x0001020304050607)
-"""Multiplier that maps ``1 << 8 * k`` to a word with the highest byte ``k``."""
+# Multiplier that packs eight bytes of 0 or 1 into the highest byte, the first byte lowest.
 _TO_BITS: Final = np.uint64(0x0102040810204080)
-"""Multiplier that packs eight bytes of 0 or 1 into the highest byte, the first byte lowest."""
 _BITMAP_WORDS: Final = 6
 _IN_BITMAP: Final = np.uint64((1 << 8 * _BITMAP_WORDS) - 1)
 _STEPS_MAX: Final = 64

@@ -19,8 +19,8 @@ from .digits import Bools
 MISSING: Final = "message numbers missing"
 MISFIT: Final = "message number does not fit between its neighbors"
 GO_BACK: Final = "message numbers repeat or go back"
+# Number of latest gaps that a later row may close; only nearby rows are out of order.
 _GAPS_KEPT: Final = 8
-"""Number of latest gaps that a later row may close; only nearby rows are out of order."""
 _PLACES_KEPT: Final = 5
 
 

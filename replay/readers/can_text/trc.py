@@ -56,8 +56,8 @@ _HEX_ID: Final = re.compile(r"[0-9A-Fa-f]{1,8}")
 _PAIR: Final = re.compile(r"[0-9A-Fa-f]{2}")
 _DATA_TYPES: Final = ("DT", "FD", "FB", "FE", "BI")
 _NO_FRAME_TYPES: Final = ("WARNG", "ST", "EC", "EV", "BUS", "BUSST", "ERRCT", "EVENT")
+# Days from 30 December 1899 to 1 January 1970.
 _EPOCH_DAYS: Final = 25_569
-"""Days from 30 December 1899 to 1 January 1970."""
 _DAY_NS: Final = 86_400 * NANOS
 NOT_UNDERSTOOD: Final = "line not understood"
 

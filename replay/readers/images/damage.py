@@ -8,18 +8,18 @@ from typing import Final
 
 _PNG_HEAD: Final = 8
 _JPEG_END: Final = b"\xff\xd9"
+# Number of bytes searched for the end marker, because cameras append padding and metadata.
 _JPEG_TAIL: Final = 4096
-"""Number of bytes searched for the end marker, because cameras append padding and metadata."""
 
 CUT: Final = "picture cut short"
 DAMAGED: Final = "picture damaged (checksum)"
 
+# Checks of ``damage_of`` by coding, for the summary of a log.
 CHECKED: Final = {
     "png": "PNG: every chunk's CRC verified",
     "jpeg": "JPEG: no checksum, end marker seen",
     "webp": "WebP: no checksum, length compared",
 }
-"""Checks of ``damage_of`` by coding, for the summary of a log."""
 
 
 def damage_of(picture: bytes, coding: str) -> str | None:

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from av.bitstream import BitStreamFilterContext
     from av.container import InputContainer
 
+# FFmpeg's demuxers by suffix; none is probed, because some demuxers open other files.
 DEMUXERS: Final = {
     ".mp4": "mov",
     ".mov": "mov",
@@ -55,7 +56,6 @@ DEMUXERS: Final = {
     ".hevc": "hevc",
     ".h264": "h264",
 }
-"""FFmpeg's demuxers by suffix; none is probed, because some demuxers open other files."""
 WITHOUT_TIMES: Final = frozenset({".hevc", ".h264"})
 CODINGS: Final = {"h264": "h264", "hevc": "h265", "av1": "av1", "mjpeg": "jpeg", "png": "png"}
 TO_ANNEX_B: Final = {"h264": "h264_mp4toannexb", "hevc": "hevc_mp4toannexb"}

@@ -21,10 +21,10 @@ from .records import BrokenRecordError
 WINDOW: Final = 64 << 10
 PIECE: Final = 1 << 20
 STEP: Final = 256 << 10
+# Maximum number of buffers kept for reuse.
 KEPT: Final = 8
-"""Maximum number of buffers kept for reuse."""
+# Maximum size of a buffer that is kept for reuse.
 KEPT_BYTES: Final = 8 << 20
-"""Maximum size of a buffer that is kept for reuse."""
 
 
 class Buffers:

@@ -17,10 +17,10 @@ from crosscue.replay.readers.mcap.chunks.rows import Definition
 
 from .records import CHANNEL, Channel, Schema, read_channel, read_schema
 
+# Topic of messages whose channel is not declared.
 UNKNOWN: Final = ""
-"""Topic of messages whose channel is not declared."""
+# Name of a topic whose stored name is empty.
 UNNAMED: Final = "(unnamed)"
-"""Name of a topic whose stored name is empty."""
 
 
 class TopicBook:

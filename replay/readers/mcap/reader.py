@@ -32,8 +32,8 @@ from .segments import Segment, find_segments, has_whole_summary
 from .window import find_window
 
 HEADER_GUESS: Final = 64
+# Number of bytes at the end of a remote file that are fetched at once.
 SUMMARY_GUESS: Final = 64 << 10
-"""Number of bytes at the end of a remote file that are fetched at once."""
 
 
 class McapLog(Closing):

@@ -35,14 +35,15 @@ METADATA_INDEX: Final = 0x0D
 SUMMARY_OFFSET: Final = 0x0E
 DATA_END: Final = 0x0F
 
+# Header of every record: operation code and length of the content.
 PREFIX: Final = struct.Struct("<BQ")
-"""Header of every record: operation code and length of the content."""
 FOOTER_SIZE: Final = PREFIX.size + 20
 DATA_END_SIZE: Final = PREFIX.size + 4
+# Key of ``Topic.converted_from`` in a channel's metadata.
 CONVERTED_FROM: Final = "crosscue.converted_from"
-"""Key of ``Topic.converted_from`` in a channel's metadata."""
 COMPRESSIONS: Final = frozenset({"", "lz4", "zstd"})
 
+# The first 31 bytes of a message record, as in the file.
 MESSAGE_HEAD: Final = np.dtype(
     [
         ("opcode", "u1"),
@@ -53,14 +54,13 @@ MESSAGE_HEAD: Final = np.dtype(
         ("publish", "<u8"),
     ]
 )
-"""The first 31 bytes of a message record, as in the file."""
 INDEX_ENTRY: Final = np.dtype([("log", "<u8"), ("offset", "<u8")])
 MESSAGE_FIXED: Final = MESSAGE_HEAD.itemsize - PREFIX.size
 _INDEX_HEAD: Final = struct.Struct("<HI")
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 CHUNK_FIXED: Final = 40
+# Maximum size of a chunk record before its compressed records.
 MAX_HEAD: Final = PREFIX.size + CHUNK_FIXED + 32
-"""Maximum size of a chunk record before its compressed records."""
 
 
 class BrokenRecordError(LogFormatError):
@@ -299,6 +299,8 @@ class Heads:
     publish: NDArray[np.uint64]
 
 
+# Header of a message record and the byte before it, so that every field is aligned; the length's
+# upper two bytes and the channel number are one field.
 _BEHIND_A_BYTE: Final = np.dtype(
     {
         "names": ["size", "opcode", "number", "channel", "sequence", "log", "publish"],
@@ -307,8 +309,6 @@ _BEHIND_A_BYTE: Final = np.dtype(
         "itemsize": 32,
     }
 )
-"""Header of a message record and the byte before it, so that every field is aligned; the length's
-upper two bytes and the channel number are one field."""
 
 
 def heads_at(buffer: Bytes, offsets: NDArray[np.int64]) -> Heads:

@@ -56,11 +56,11 @@ from .records import (
     read_message_index,
 )
 
+# Maximum number of bytes outside chunks read at once, unless one record is larger.
 RUN_BYTES: Final = 4 << 20
-"""Maximum number of bytes outside chunks read at once, unless one record is larger."""
 STOPS_A_RUN: Final = ~opcodes(SCHEMA, CHANNEL, MESSAGE)
+# Maximum size of records that are checked completely (metadata and similar).
 SMALL: Final = 1 << 20
-"""Maximum size of records that are checked completely (metadata and similar)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

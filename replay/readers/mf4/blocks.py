@@ -19,10 +19,10 @@ HEAD_BYTES: Final = 24
 _LINKS_MAX: Final = 100_000
 _BLOCK_MAX: Final = 1 << 20
 _TEXT_MAX: Final = 1 << 16
+# Maximum number of blocks in a chain of links; a longer chain is circular.
 _CHAIN_MAX: Final = 200_000
-"""Maximum number of blocks in a chain of links; a longer chain is circular."""
+# Number of bytes read at once, because loggers write descriptive blocks close together.
 _WINDOW: Final = 1 << 16
-"""Number of bytes read at once, because loggers write descriptive blocks close together."""
 _TX: Final = re.compile(rb"<TX[^>]*>(.*?)</TX>", re.DOTALL)
 _DATA: Final = (b"##DT", b"##SD", b"##RD")
 
@@ -36,8 +36,8 @@ LAST_DATA_LENGTH: Final = 0x04
 LAST_REDUCED_LENGTH: Final = 0x08
 LAST_DATA_LIST: Final = 0x10
 VARIABLE_BYTES: Final = 0x20
+# Flags of an unfinalized file for the parts that the logger did not write.
 VARIABLE_OFFSETS: Final = 0x40
-"""Flags of an unfinalized file for the parts that the logger did not write."""
 
 
 class BrokenBlockError(Exception):

@@ -68,8 +68,8 @@ from .variable import GroupValues, StoredValues, VariableValues
 
 _NAMES_SHOWN: Final = 5
 _PEEK_ROWS: Final = 4096
+# Size of the units of records that are read or skipped when a time range is selected.
 _CHUNK_BYTES: Final = 1 << 16
-"""Size of the units of records that are read or skipped when a time range is selected."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,17 +22,17 @@ from .blocks import VLSD_GROUP, DataGroup, Group
 from .stream import Stream
 
 _WALK_BYTES: Final = 1 << 20
+# Number of parsed pieces kept in memory, because values are close to their records.
 _KEPT: Final = 3
-"""Number of parsed pieces kept in memory, because values are close to their records."""
+# Number of records parsed by the plain loop before Numba is imported.
 PATIENCE: Final = 3_000_000
-"""Number of records parsed by the plain loop before Numba is imported."""
+# Padding after a piece in bytes, so that every value can be read with this width.
 PADDING: Final = 64
-"""Padding after a piece in bytes, so that every value can be read with this width."""
 LAST_CUT: Final = "last record is cut"
+# Minimum number of records in a run.
 _FEW: Final = 16
-"""Minimum number of records in a run."""
+# Number of records in a run after which the next run is searched at once.
 _MANY: Final = 500
-"""Number of records in a run after which the next run is searched at once."""
 _LENGTH: Final = struct.Struct("<L")
 
 

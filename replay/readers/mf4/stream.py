@@ -12,8 +12,8 @@ from isal import isal_zlib
 from .blocks import Blocks, BrokenBlockError, Stretch
 
 _DAMAGED: Final = cast("type[Exception]", isal_zlib.error)
+# Number of decompressed blocks kept, because a record may extend over two blocks.
 _KEPT: Final = 3
-"""Number of decompressed blocks kept, because a record may extend over two blocks."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ Bytes: TypeAlias = NDArray[np.uint8]
 Int64s: TypeAlias = NDArray[np.int64]
 
 _SPAN: Final = 4 << 20
+# Maximum number of windows of ``_SPAN`` bytes with the values of one block of records.
 _WINDOWS_MAX: Final = 64
-"""Maximum number of windows of ``_SPAN`` bytes with the values of one block of records."""
 
 
 class VariableValues(Protocol):

@@ -40,12 +40,10 @@ from .records import (
 )
 from .window import BagWindow, find_bag_window
 
+# Size of the buffers into which chunks are copied, unless a chunk is larger. NumPy requests huge
+# pages from 4 MiB on. Separate buffers for all chunks would take more time for page faults than the
+# copies take.
 BATCH_BYTES: Final = BLOCK_BYTES // 2
-"""Size of the buffers into which chunks are copied, unless a chunk is larger.
-
-NumPy requests huge pages from 4 MiB on. Separate buffers for all chunks would take more time for
-page faults than the copies take.
-"""
 
 DAMAGED_RECORD: Final = "damaged record"
 OTHER_TYPE: Final = "another message type on the same topic"

@@ -40,13 +40,13 @@ CUT: Final = "file is cut"
 TOO_LARGE: Final = "chunk over the size limit"
 TOO_MANY: Final = "more records in a chunk than the limit"
 
+# Length of a message record's header with op, conn and time, in any order.
 _HEADER: Final = 38
-"""Length of a message record's header with op, conn and time, in any order."""
 _HEAD: Final = 4 + _HEADER + 4
 _U32 = struct.Struct("<I")
 _FIRST_RUN: Final = 16
+# Number of consecutive plausible messages accepted after damaged bytes without an index.
 _IN_A_ROW: Final = 3
-"""Number of consecutive plausible messages accepted after damaged bytes without an index."""
 _DAY_NS: Final = 86_400 * 10**9
 _LONGEST_RUN: Final = 65_536
 

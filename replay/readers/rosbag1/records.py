@@ -28,8 +28,8 @@ CHUNK: Final = 5
 CHUNK_INFO: Final = 6
 CONNECTION: Final = 7
 
+# Maximum plausible length of a record header; real headers are shorter than a kilobyte.
 HEADER_BYTES: Final = 1 << 20
-"""Maximum plausible length of a record header; real headers are shorter than a kilobyte."""
 
 _U32 = struct.Struct("<I")
 _U64 = struct.Struct("<Q")

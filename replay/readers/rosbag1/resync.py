@@ -23,13 +23,13 @@ from .records import (
     record_at,
 )
 
+# Number of consecutive plausible records that are accepted, or fewer up to the file's end.
 IN_A_ROW: Final = 3
-"""Number of consecutive plausible records that are accepted, or fewer up to the file's end."""
 _SEARCHED_AT_ONCE: Final = 4 << 20
 _OP: Final = b"\x04\x00\x00\x00op="
 _BEFORE_OP: Final = 128
+# Maximum header length of a record at which reading resumes.
 _HEADER_MAX: Final = 256
-"""Maximum header length of a record at which reading resumes."""
 _DAY_NS: Final = 86_400 * 10**9
 _FIELD: Final = re.compile(
     rb"(.{4})(op|conn|time|compression|size|ver|count|topic|chunk_pos|start_time|end_time)=",

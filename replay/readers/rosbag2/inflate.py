@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from crosscue.replay.base import BLOCK_BYTES, Bytes, Int64s, Limits, Messages
 
+# First bytes of a zstd frame as a little-endian number; no CDR message starts with them.
 ZSTD_MAGIC: Final = 0xFD2FB528
-"""First bytes of a zstd frame as a little-endian number; no CDR message starts with them."""
 
 DAMAGED: Final = "damaged compressed message"
 _WINDOW_BYTES: Final = 1 << 27

@@ -12,8 +12,8 @@ import numpy as np
 
 from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Block, Messages
 
+# Maximum payload bytes held back; beyond it, rows are yielded before their order is certain.
 HELD_BYTES: Final = 16 * BLOCK_BYTES
-"""Maximum payload bytes held back; beyond it, rows are yielded before their order is certain."""
 
 _EARLIEST: Final = -(2**63)
 _LATEST: Final = 2**63 - 1

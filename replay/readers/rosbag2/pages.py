@@ -24,13 +24,13 @@ from crosscue.replay.base import BLOCK_BYTES, MIB, Bytes, Int64s, Limits, Messag
 from .sqlite import FAULTS, Database
 from .tables import fetched
 
+# Name, type, position in the primary key and kind of each column of the messages table.
 _COLUMNS: Final = (
     ("id", "INTEGER", 1, 0),
     ("topic_id", "INTEGER", 0, 0),
     ("timestamp", "INTEGER", 0, 0),
     ("data", "BLOB", 0, 0),
 )
-"""Name, type, position in the primary key and kind of each column of the messages table."""
 _INTERIOR: Final = 5
 _LEAF: Final = 13
 _LEAF_HEAD: Final = 8
@@ -38,13 +38,13 @@ _INTERIOR_HEAD: Final = 12
 _DEEPEST: Final = 20
 _LOT_BYTES: Final = BLOCK_BYTES // 2
 _CHAIN_BYTES: Final = 1 << 20
+# Number of zeros after the last page, so that a cell that exceeds its page can be examined.
 _PADDING: Final = 256
-"""Number of zeros after the last page, so that a cell that exceeds its page can be examined."""
 _VARINT_BYTES: Final = 9
+# Size of an integer in bytes by its serial type; -1 if the type is not an integer.
 _INTEGER_BYTES: Final = np.array([-1, 1, 2, 3, 4, 6, 8, -1, 0, 0] + [-1] * 246, np.int64)
-"""Size of an integer in bytes by its serial type; -1 if the type is not an integer."""
+# Serial type of the integer 1, which is stored in zero bytes.
 _ONE: Final = 9
-"""Serial type of the integer 1, which is stored in zero bytes."""
 _FIRST_BLOB: Final = 12
 
 

@@ -48,8 +48,8 @@ class RowColumns:
         return len(self.ids) + len(self.odd)
 
 
+# Row id, topic id, timestamp and payload; a file may have any type in the last three.
 Row: TypeAlias = tuple[int, Any, Any, Any]
-"""Row id, topic id, timestamp and payload; a file may have any type in the last three."""
 
 
 @dataclass(slots=True)

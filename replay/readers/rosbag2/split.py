@@ -31,8 +31,8 @@ STORED: Final = (".db3", ".mcap")
 PACKED: Final = ".zstd"
 PACKED_DAMAGED: Final = "compressed file"
 
+# Maximum size of a zstd frame's header (RFC 8878, 3.1.1).
 _HEAD_BYTES: Final = 18
-"""Maximum size of a zstd frame's header (RFC 8878, 3.1.1)."""
 _READ_BYTES: Final = MIB
 _FED_BYTES: Final = 1024
 _WINDOW_BYTES: Final = 1 << 27

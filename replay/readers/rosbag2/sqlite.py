@@ -22,8 +22,8 @@ from crosscue.replay.files.partial_file import Scratch
 from .wal import check_wal
 
 SQLITE_MAGIC: Final = b"SQLite format 3\x00"
+# Exceptions of the standard library for damaged files, including invalid UTF-8 in messages.
 FAULTS: Final = (sqlite3.Error, UnicodeError, ValueError, OverflowError, MemoryError)
-"""Exceptions of the standard library for damaged files, including invalid UTF-8 in messages."""
 
 _WAL_VERSION: Final = 2
 _WAIT_S: Final = 1.0

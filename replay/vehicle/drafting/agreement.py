@@ -26,18 +26,18 @@ STANDING_MPS: Final = 0.05
 TRACK_M: Final = 1.55
 STEERING_RATIO: Final = 15.0
 WHEELBASE_M: Final = 2.7
+# Maximum plausible bias of a car's gyro; ``fit odometry`` removes it.
 GYRO_BIAS_RADPS: Final = 1.0 * DEGREE
-"""Maximum plausible bias of a car's gyro; ``fit odometry`` removes it."""
+# Maximum plausible steering offset on a straight road (crowned road, side wind).
 STEERING_OFF_RAD: Final = 4.0 * DEGREE
-"""Maximum plausible steering offset on a straight road (crowned road, side wind)."""
+# Maximum plausible relative difference between the radii of the left and right wheels.
 TYRES_DIFFER: Final = 0.005
-"""Maximum plausible relative difference between the radii of the left and right wheels."""
+# Minimum turn of a reference, in any window, that determines the sign and scale.
 TURNS: Final = 3.0 * DEGREE
-"""Minimum turn of a reference, in any window, that determines the sign and scale."""
 FOLLOWS: Final = 0.7
 MIN_WINDOWS: Final = 5
+# Number of windows for which a correlation is significant, however little the car turns.
 SURE_WINDOWS: Final = 15
-"""Number of windows for which a correlation is significant, however little the car turns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

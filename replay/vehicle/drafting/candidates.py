@@ -17,21 +17,21 @@ from crosscue.replay.signals.converters import ANGLE_UNITS, SPEED_UNITS
 if TYPE_CHECKING:
     from crosscue.replay.can.layout import CanMessage, CanSignal
 
+# Words in the names of requests, which are not measurements.
 REQUESTS: Final = frozenset(
     {"REQ", "REQUEST", "REQUESTED", "RQ", "RQST", "CMD", "COMMAND", "COMMANDED", "TARGET", "TGT"}
     | {"DES", "DESIRED", "DSRD", "DEMAND", "DMD", "SETPOINT", "SETPT", "SP", "SET", "SOLL"}
     | {"WANTED", "LIMIT", "LIM", "LKA", "LKAS"}
 )
-"""Words in the names of requests, which are not measurements."""
+# Words in the names of signals about other objects or about another signal.
 OTHERS: Final = frozenset({"TRAILER", "TRLR", "OFFSET", "OFFST", "ACCURACY", "LEAD"})
-"""Words in the names of signals about other objects or about another signal."""
+# Words that identify a wheel; the last ones of each wheel are German.
 WHEELS: Final = {
     "front_left": ("FL", "LF", "FRONTLEFT", "LEFTFRONT", "VL"),
     "front_right": ("FR", "RF", "FRONTRIGHT", "RIGHTFRONT", "VR"),
     "rear_left": ("RL", "LR", "REARLEFT", "LEFTREAR", "HL"),
     "rear_right": ("RR", "REARRIGHT", "RIGHTREAR", "HR"),
 }
-"""Words that identify a wheel; the last ones of each wheel are German."""
 OF_WHEELS: Final = ("WHEEL", "WHL", "WH", "RAD", "RADGESCHW")
 OF_SPEED: Final = ("SPEED", "SPD", "VELOCITY", "VEL", "GESCHW", "V")
 OF_YAW: Final = ("YAW", "GIER", "GIERRATE", "YR")

@@ -26,8 +26,8 @@ from .candidates import WHEELS, Candidate, Kind
 from .observed import Bus, Observed
 from .series import Grid, Series
 
+# Typical wheel radius, used to detect motion where the true radius is unknown.
 USUAL_RADIUS_M: Final = 0.32
-"""Typical wheel radius, used to detect motion where the true radius is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -30,12 +30,11 @@ if TYPE_CHECKING:
     from crosscue.replay.can.database import CanDatabase
     from crosscue.replay.can.decode import BusDecoder
 
+# Observed time: five minutes contain some bends and stops, and are read in seconds.
 OBSERVED_NS: Final = 300_000_000_000
-"""Observed time: five minutes contain some bends and stops, and are read in seconds."""
+# Minimum number of its messages, including the status, that identify a Mobileye's bus. Identifiers
+# of other devices may coincide, but not with these lengths and in this number.
 MOBILEYE_MESSAGES: Final = 4
-"""Minimum number of its messages, including the status, that identify a Mobileye's bus.
-
-Identifiers of other devices may coincide, but not with these lengths and in this number."""
 
 
 @dataclass(slots=True, eq=False)

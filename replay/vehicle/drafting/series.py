@@ -18,8 +18,8 @@ Int64s: TypeAlias = NDArray[np.int64]
 
 STEP_S: Final = 0.1
 WINDOW_S: Final = 2.0
+# Maximum gap that is interpolated; GNSS fixes may be one second apart.
 MAX_GAP_S: Final = 1.5
-"""Maximum gap that is interpolated; GNSS fixes may be one second apart."""
 EARTH_RADIUS_M: Final = 6_371_000.0
 
 

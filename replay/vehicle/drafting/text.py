@@ -27,8 +27,8 @@ DEVICES: Final = (
     (Role.GNSS, "gnss"),
     (Role.ODOMETRY, "odometry"),
 )
+# Maximum number of rejected signals that are listed with their reasons.
 LISTED: Final = 6
-"""Maximum number of rejected signals that are listed with their reasons."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

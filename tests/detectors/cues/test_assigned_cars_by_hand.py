@@ -25,8 +25,8 @@ CAMERA = Camera(x_m=1.5, z_m=1.5, focal_px=800.0, center_px=(640.0, 360.0), pitc
 RULES = Cars(kind="tracks", score=0.5, within_m=100.0, max_gap_s=0.5, max_frames=10)
 STILL = Motion(0.0, 0.0, 0.0, 0.1)
 Box = tuple[float, float, float, float]
+# 20 m ahead; its ends are 40 / 800 to the left and 84 / 800 to the right.
 CAR: Box = (600.0, 300.0, 724.0, 362.0)
-"""20 m ahead; its ends are 40 / 800 to the left and 84 / 800 to the right."""
 
 
 def found(*boxes: Box, scores: Sequence[float] | None = None, **changes: Any) -> Detections:

@@ -505,8 +505,8 @@ def test_own_cues_have_their_own_score() -> None:
     assert tally.by_cue["dogs"].threshold == 0.5
 
 
+# 11 cars, of which 2 are not above 0.5.
 CARS = found(*[("car", 0.9)] * 9, ("car", 0.5), ("van", 0.4), ("dog", 0.9))
-"""11 cars, of which 2 are not above 0.5."""
 
 
 def test_pairs_are_skipped_by_the_first_rule_that_fails() -> None:

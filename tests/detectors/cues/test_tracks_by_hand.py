@@ -58,8 +58,8 @@ def car(**changes: Any) -> CarMotion:
     return standing._replace(**changes)
 
 
+# Crosses at 5 m/s: more than 2 m/s and 3 * 0.5 m/s; along 6 = 5 + 2 * 0.5 m/s.
 FAST = {"right_mps": 5.0, "ahead_mps": 6.0}
-"""Crosses at 5 m/s: more than 2 m/s and 3 * 0.5 m/s; along 6 = 5 + 2 * 0.5 m/s."""
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ from crosscue.detectors.networks.model_detector import build
 from support.onnx_models import constant_model
 
 CLASSES = ["person", "car", "stop sign"]
+# Two boxes in pixels of the network's input, for a car and a stop sign.
 BOXES = np.array([[16.0, 40.0, 80.0, 100.0], [100.0, 20.0, 125.0, 90.0]])
-"""Two boxes in pixels of the network's input, for a car and a stop sign."""
 
 
 @pytest.mark.parametrize("is_swapped", [False, True], ids=["boxes first", "scores first"])

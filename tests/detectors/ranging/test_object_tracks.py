@@ -12,8 +12,8 @@ from crosscue.replay.base import Floats
 FOCAL_PX = 1500.0
 CENTER_PX = (960.0, 540.0)
 AHEAD = Motion(1.0, 0.0, 0.0, 0.1)
+# Range at the start, metres to the right and up, height.
 Light = tuple[float, float, float, float]
-"""Range at the start, metres to the right and up, height."""
 NEAR: Light = (57.0, -5.0, 5.0, 1.3)
 FAR: Light = (84.0, 0.0, 5.0, 1.0)
 NEXT_TO_FAR: Light = (84.0, 4.0, 5.0, 1.5)

@@ -13,6 +13,7 @@ from crosscue.eval.drives.many import BatchSettings
 from crosscue.replay.logs.log_part import LogPart
 
 DRIVE: Final = DriveInput("a", ("a.mcap",))
+# Other values of each setting that determines a run.
 OTHER: Final[dict[str, tuple[object, ...]]] = {
     "vehicle": ("other.toml",),
     "detectors": (("signs",), ()),
@@ -22,7 +23,7 @@ OTHER: Final[dict[str, tuple[object, ...]]] = {
     "landmarks": ("marks.db",),
     "part": (LogPart(begin="1"), LogPart(end="1"), LogPart(topics=("/a",))),
 }
-"""Other values of each setting that determines a run."""
+# Settings that do not change a run, and why.
 HOW: Final = {
     "cache": "a cached result is the result",
     "overwrite": "says what may be replaced",
@@ -34,7 +35,6 @@ HOW: Final = {
     "memory_per_drive_gib": "declared to the scheduler",
     "retry_failed": "selects drives",
 }
-"""Settings that do not change a run, and why."""
 
 
 def test_every_setting_is_compared_or_excluded_with_a_reason() -> None:

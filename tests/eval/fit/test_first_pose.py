@@ -169,8 +169,8 @@ def test_truth_without_observable_heading_is_refused(tmp_path: Path) -> None:
         with_start([straight_drive(0.0)], Vehicle(version=1), EVERYTHING, start=str(path))
 
 
+# Scale error of the wheels, five per cent: 12 m over the drive.
 LONG_WHEELS = Vehicle(version=1, odometry=Odometry(wheel_scale=1.05, slip_per_sqrt_m=1.0))
-"""Scale error of the wheels, five per cent: 12 m over the drive."""
 
 
 def test_fused_gnss_positions_bound_the_drift_of_odometry(tmp_path: Path) -> None:

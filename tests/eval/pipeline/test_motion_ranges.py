@@ -21,8 +21,8 @@ AHEAD = FrameEvidence(0, 1.0, 0.0, (), {})
 CAMERA = "[camera]\nfocal_px = 1500.0\nx_m = 1.5\n"
 SETBACK_M = Ranges().light_setback_m
 CURVE = "[ranges.traffic_light]\nparameters = [1800.0]\nresidual_sd_m = 4.0\n"
+# Label, range from the camera at the start, metres to the right, height.
 Thing = tuple[str, float, float, float]
-"""Label, range from the camera at the start, metres to the right, height."""
 NEAR: Thing = ("traffic light", 57.0, -5.0, 1.3)
 FAR: Thing = ("traffic light", 84.0, 2.0, 1.3)
 

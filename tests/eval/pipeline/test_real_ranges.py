@@ -19,8 +19,8 @@ center_px = [970.0, 483.3]
 traffic_light_score = 0.5
 """
 CAMERA_M = 1.8
+# Distance from the first frame's camera to the far kerb and the crosswalk, each within 2.5 m.
 TRUTH_M = {"end": 79.0, "start": 59.0}
-"""Distance from the first frame's camera to the far kerb and the crosswalk, each within 2.5 m."""
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,8 @@ from crosscue.replay.files.log_identity import of_row
 from support.trees import tree
 
 pytestmark = pytest.mark.slow
+# A few seconds of each drive are enough to distinguish runs.
 PART = ("--to", "4", "-q")
-"""A few seconds of each drive are enough to distinguish runs."""
 
 DRIVES: int = 4
 REFUSAL: str = f"format 1, this crosscue reads {FORMAT_VERSION}: replay again"

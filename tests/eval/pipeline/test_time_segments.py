@@ -25,8 +25,8 @@ from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
 
 SECOND = 1_000_000_000
 BEGIN = 1_000 * SECOND
+# Ten wheel rows per second.
 ROW = SECOND // 10
-"""Ten wheel rows per second."""
 
 
 def _drive(seconds: int = 20, rows_a_block: int = 7) -> list[Block]:

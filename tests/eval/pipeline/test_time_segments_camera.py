@@ -18,8 +18,8 @@ from support.trees import tree
 
 LABELLED: Final = ("frames", "detections", "road", "cues", "range", "belief", "pose", "skipped")
 NEVER_S: Final = 1e6
+# Seconds of a gap that is too long to be crossed, above ``time.restart_after_s``.
 RESTART_MS: Final = 5_000
-"""Seconds of a gap that is too long to be crossed, above ``time.restart_after_s``."""
 ONE_ROW_MS: Final = ROW // 1_000_000
 
 

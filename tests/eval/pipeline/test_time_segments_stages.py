@@ -35,8 +35,8 @@ from support.gap_drive import (
 from support.gap_landmarks import STEP_M, PlaceByNumber
 from support.landmark_drive import features_at
 
+# Longer than ``time.restart_after_s``: the pose stays at its last estimate.
 PAUSE: Final = Clock(pause_s=(4.0, 10.0))
-"""Longer than ``time.restart_after_s``: the pose stays at its last estimate."""
 MATCHER: Final = "support.gap_landmarks:matcher"
 
 

@@ -9,8 +9,8 @@ from crosscue.eval.studies.intervals import mean_of, range_at, ratio_of, ratio_o
 from crosscue.replay.columns import Int64s
 
 TIMES = 800
+# Three standard deviations of a coverage of 95 % in ``TIMES`` trials.
 SLACK = 0.023
-"""Three standard deviations of a coverage of 95 % in ``TIMES`` trials."""
 
 
 def sizes(rng: np.random.Generator, clusters: int, *, equal: bool) -> Int64s:

@@ -28,6 +28,7 @@ YAW = CanMessage(
 )
 WHEEL = CanMessage("Wheel", 0x456, True, 4, (CanSignal("speed", 0, 16, scale=0.1, unit="km/h"),))
 
+# One frame with one signal, in the fewest elements that AUTOSAR allows.
 ARXML = """<?xml version="1.0" encoding="UTF-8"?>
 <AUTOSAR xmlns="http://autosar.org/schema/r4.0"
     xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance"
@@ -62,7 +63,6 @@ ARXML = """<?xml version="1.0" encoding="UTF-8"?>
 <SYSTEM-SIGNAL><SHORT-NAME>speed_of_wheel</SHORT-NAME></SYSTEM-SIGNAL>
 </ELEMENTS></AR-PACKAGE></AR-PACKAGES></AUTOSAR>
 """
-"""One frame with one signal, in the fewest elements that AUTOSAR allows."""
 
 
 def write_file(folder: Path, text: str | bytes, name: str = "bus.dbc") -> Path:

@@ -19,8 +19,8 @@ from support.rosbag_files import header_field
 from support.rosbag_files import record as bag_record
 
 BOMB_BYTES = 1 << 30
+# Memory limit of a process that refuses a bomb, including Python and its libraries.
 MAX_MB = 200
-"""Memory limit of a process that refuses a bomb, including Python and its libraries."""
 PIECE = bytes(1 << 20)
 
 

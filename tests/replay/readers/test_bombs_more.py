@@ -25,8 +25,8 @@ from support.rosbag_files import rows_of, write_folder
 from .test_bombs import BOMB_BYTES, MAX_MB, PIECE, zstd_bomb
 
 SIDE_PX = 60_000
+# Memory limit with OpenCV and the table of detectors loaded; the images declare 10 GB.
 MAX_WITH_DETECTOR_MB = 500
-"""Memory limit with OpenCV and the table of detectors loaded; the images declare 10 GB."""
 
 
 def _deflated(size: int) -> bytes:

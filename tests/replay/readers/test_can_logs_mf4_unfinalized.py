@@ -20,8 +20,8 @@ from support.mf4_files import unsorted
 asammdf = pytest.importorskip("asammdf")
 
 Key = tuple[int, int, bool, bool]
+# Seconds, data lengths and payloads by bus, identifier, format of the identifier and direction.
 Frames = dict[Key, list[tuple[float, int, bytes]]]
-"""Seconds, data lengths and payloads by bus, identifier, format of the identifier and direction."""
 
 REAL = [
     (("css_unfinalized", "00000000_00000048_00000001.MF4"), {1: 1_026}),

@@ -16,8 +16,8 @@ from support.mcap_conformance import Conformance, suite
 from support.mcap_files import MAGIC, read_back, record
 
 SUITE_SIZE = 832
+# The only notice about a valid file, and only about one without a summary.
 ALLOWED = "it has no usable summary; topics were found by reading"
-"""The only notice about a valid file, and only about one without a summary."""
 
 
 @pytest.fixture(scope="module")

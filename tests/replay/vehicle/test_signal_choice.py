@@ -21,8 +21,8 @@ SECONDS: Final = 60
 T_NS: Final = np.arange(SECONDS * 20, dtype=np.int64) * 50_000_000
 T_S: Final = T_NS * 1e-9
 SPEED: Final = 12.0 + 4.0 * np.sin(0.1 * T_S)
+# Yaw rate on a winding road, in rad/s.
 YAW_RATE: Final = 0.15 * np.sin(0.3 * T_S) + 0.02
-"""Yaw rate on a winding road, in rad/s."""
 STRAIGHT: Final = np.zeros_like(T_S)
 
 

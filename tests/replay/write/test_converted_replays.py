@@ -14,8 +14,9 @@ from crosscue.replay.vehicle.roles import role_of
 from support.data import shared
 from support.every_format import EVERY_FORMAT
 
+# Formats with their own columns, whose types are chosen by ``convert``.
 TABLES = ("comma2k19", "kitti-raw", "images")
-"""Formats with their own columns, whose types are chosen by ``convert``."""
+# Streams of a comma2k19 segment and their columns.
 COLUMNS = {
     "CAN/wheel_speed": 4,
     "CAN/speed": 1,
@@ -26,7 +27,6 @@ COLUMNS = {
     "IMU/gyro_uncalibrated": 3,
     "IMU/magnetometer": 3,
 }
-"""Streams of a comma2k19 segment and their columns."""
 
 
 def circular_segment(folder: Path) -> Path:

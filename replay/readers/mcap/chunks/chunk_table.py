@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from crosscue.replay.readers.mcap.records import CHUNK_FIXED, PREFIX, BrokenRecordError, ChunkIndex
 
 SMALLEST_CHUNK: Final = PREFIX.size + CHUNK_FIXED
+# Upper bound for file sizes; entries that point beyond it are ignored.
 FARTHEST: Final = 1 << 62
-"""Upper bound for file sizes; entries that point beyond it are ignored."""
 _FIXED: Final = 36
 _PAIR: Final = 10
 _AFTER_MAP: Final = 12

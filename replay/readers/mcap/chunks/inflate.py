@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 Bytes: TypeAlias = NDArray[np.uint8]
 
+# Values of zstandard and lz4 for frames that do not declare their size.
 UNKNOWN_SIZES: Final = (-1, 0)
-"""Values of zstandard and lz4 for frames that do not declare their size."""
 LZ4_STEP: Final = 256 << 10
 
 

@@ -21,17 +21,17 @@ from crosscue.replay.readers.mcap.records import BrokenRecordError
 from crosscue.replay.readers.mcap.segments import Segment
 from crosscue.replay.readers.mcap.walk import Chunk, Item
 
+# Number of threads. One hides most of the work; more would only compete for the interpreter.
 WORKERS: Final = 1
-"""Number of threads. One hides most of the work; more would only compete for the interpreter."""
+# Maximum number of groups of chunks, or other items, that are loaded ahead.
 AHEAD: Final = 2
-"""Maximum number of groups of chunks, or other items, that are loaded ahead."""
+# Maximum total size of the groups that are loaded ahead.
 AHEAD_BYTES: Final = 32 << 20
-"""Maximum total size of the groups that are loaded ahead."""
+# Maximum total size of a group of chunks.
 GROUP_BYTES: Final = 4 << 20
-"""Maximum total size of a group of chunks."""
 GROUP_CHUNKS: Final = 64
+# Compression ratio above which decompression takes longer than the handover to a thread.
 WORTHWHILE: Final = 1.5
-"""Compression ratio above which decompression takes longer than the handover to a thread."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -35,10 +35,10 @@ from crosscue.replay.readers.mcap.records import (
     heads_at,
 )
 
+# Number of gaps between indexed messages above which scanning the complete chunk is as fast.
 MAX_GAPS: Final = 256
-"""Number of gaps between indexed messages above which scanning the complete chunk is as fast."""
+# Maximum number of schemas and channels in a chunk; each has a 16-bit number.
 MAX_DEFINITIONS: Final = 1 << 17
-"""Maximum number of schemas and channels in a chunk; each has a 16-bit number."""
 
 
 @dataclass(frozen=True, slots=True)

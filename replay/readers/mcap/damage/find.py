@@ -30,10 +30,10 @@ from crosscue.replay.readers.mcap.records import (
     read_chunk_head,
 )
 
+# Number of bytes searched first; doubled until something is found.
 FIRST_PIECE: Final = 4 << 10
-"""Number of bytes searched first; doubled until something is found."""
+# Maximum number of candidates decompressed, which keeps a search linear in its bytes.
 TRIES: Final = 16
-"""Maximum number of candidates decompressed, which keeps a search linear in its bytes."""
 
 
 def find_bytes(file: ByteFile, at: int, end: int, wanted: bytes) -> int | None:

@@ -38,10 +38,10 @@ from crosscue.replay.readers.mcap.records import (
     read_chunk_head,
 )
 
+# Number of consecutive plausible records that are accepted wherever they end.
 LINKS: Final = 3
-"""Number of consecutive plausible records that are accepted wherever they end."""
+# Maximum difference of a log time from earlier messages, if no statistics bound it.
 DAY_NS: Final = 86_400 * 10**9
-"""Maximum difference of a log time from earlier messages, if no statistics bound it."""
 LATEST: Final = (1 << 63) - 1
 MAX_UINT64: Final = (1 << 64) - 1
 PIECE_MIN: Final = 4 << 10
