@@ -30,8 +30,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from crosscue.replay.base import Ledger
 from crosscue.replay.decode import Decoder, decoder_for
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 
 FRAME: Final = """std_msgs/Header header

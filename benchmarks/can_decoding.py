@@ -25,10 +25,11 @@ import numpy as np
 from cantools.database.can import Message
 from cantools.database.can.formats import dbc
 
-from crosscue.replay.base import BLOCK_ROWS, Block, CanFrames, Ledger, Table
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
 from crosscue.replay.can.layout import overlaps
+from crosscue.replay.columns import BLOCK_ROWS, Block, CanFrames, Table
+from crosscue.replay.ledger import Ledger
 
 DATA = Path(os.environ.get("CROSSCUE_DATA", Path(__file__).parents[2] / "shared" / "data"))
 SEGMENT = DATA / "comma2k19/Example_1/b0c9d2329ad1606b_2018-08-02--08-34-47/40"

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import can
 
-from crosscue.replay.base import Ledger
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

@@ -26,7 +26,7 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from crosscue.eval.cli import run as crosscue
-from crosscue.replay.base import Ledger
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.write.convert import LogWriter
 

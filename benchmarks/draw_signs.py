@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.signs.templates import FILES_PX, KINDS, Kind, file_name, size_of
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 
 Rgba = NDArray[np.uint8]
 Rgb = tuple[int, int, int]

@@ -25,7 +25,9 @@ from crosscue.detectors.base import Choice, Detections, Found, Frame, View
 from crosscue.eval.pipeline.detect import detect_drive
 from crosscue.eval.pipeline.replay import estimate_run
 from crosscue.eval.runs.folder import create, open_run
-from crosscue.replay.base import EVERYTHING, Block, Images, Ledger, Messages, Topic
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.columns import Block, Images, Messages, Topic
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import parse
 from crosscue.replay.write.convert import LogWriter

@@ -30,7 +30,7 @@ from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.detectors.base import Detections, Found, Frame, View
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import open_run
-from crosscue.replay.base import RunError
+from crosscue.replay.errors import RunError
 
 MIN_S = 0.001
 

@@ -32,7 +32,7 @@ from crosscue.localization.landmarks.features import Features
 from crosscue.localization.landmarks.images import grey_of, read_picture
 from crosscue.localization.landmarks.matcher import OrbMatcher, OrbSettings
 from crosscue.localization.landmarks.update import best_of
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from support.landmark_files import seen_from, some_features, wall
 
 SPACING_M = 10.0

@@ -52,7 +52,8 @@ from crosscue.detectors.networks.mask_rcnn.network import (
     build_network,
     set_limits,
 )
-from crosscue.replay.base import Floats, VehicleError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import VehicleError
 
 LAYOUTS: Final = ("L991", "L992", "L993", "L994", "L995", "L996")
 TIMES_S: Final = (4.0, 7.0)

@@ -24,7 +24,7 @@ from crosscue.detectors.cues.observed import nose_of
 from crosscue.detectors.networks.mask_rcnn.detector import build
 from crosscue.detectors.training.annotations import LabelledPicture, LabelledSet, read_coco
 from crosscue.detectors.training.scores import detections_on
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 CLASSES: Final = ("car", "stop sign", "traffic light")
 SAME_OBJECT: Final = 0.5

@@ -32,8 +32,9 @@ from mcap.writer import CompressionType, Writer
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
-from crosscue.replay.base import DEFAULT_LIMITS, Ledger
 from crosscue.replay.decode import decoder_for
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS
 from crosscue.replay.readers.mcap.bytes import ByteFile
 from crosscue.replay.readers.mcap.channels import TopicBook
 from crosscue.replay.readers.mcap.reader import open_mcap

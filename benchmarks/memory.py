@@ -25,7 +25,8 @@ from mcap.writer import Writer
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from crosscue.replay.base import Block, Images, Ledger, Messages, Topic
+from crosscue.replay.columns import Block, Images, Messages, Topic
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

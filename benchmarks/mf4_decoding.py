@@ -40,8 +40,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 def ours(log: Path, database: Any) -> dict[str, list[Any]]:
     """Return the decoded blocks of each message, by topic."""
-    from crosscue.replay.base import Ledger
     from crosscue.replay.can.decode import BusDecoder, DecodeSettings
+    from crosscue.replay.ledger import Ledger
     from crosscue.replay.logs.opening import open_log
 
     ledger = Ledger(str(log))

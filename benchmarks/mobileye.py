@@ -19,7 +19,8 @@ from cantools.database.can import Message as DbMessage
 from cantools.database.can import Signal
 from cantools.database.conversion import BaseConversion
 
-from crosscue.replay.base import BLOCK_ROWS, Block, CanFrames, Ledger, Table
+from crosscue.replay.columns import BLOCK_ROWS, Block, CanFrames, Table
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import Mounting

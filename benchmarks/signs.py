@@ -31,7 +31,7 @@ from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.signs.detector import POINTS_DRAWN, SignSettings, build, orb_points
 from crosscue.detectors.signs.templates import AMERICAN, Kind, drawings
-from crosscue.replay.base import Bytes, Floats
+from crosscue.replay.columns import Bytes, Floats
 from support.sign_scenes import scene
 
 STRIDE_PX = 16

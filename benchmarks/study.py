@@ -27,7 +27,7 @@ from crosscue.localization.town.drive import (
     drive_traced,
 )
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 SETTINGS = Drive()
 STEPS = 3000

@@ -30,7 +30,7 @@ from crosscue.detectors.ranging.vehicle_range import (
     vehicle_range,
 )
 from crosscue.eval.runs.folder import open_run
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 MIN_SCORE = 0.5
 MIN_IOU = 0.6

@@ -19,24 +19,18 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.base import (
-    EVERYTHING,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    CanFrames,
-    Images,
-    Ledger,
-    Messages,
-    Selection,
-    Table,
-)
+from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.formats import known_formats
 from crosscue.replay.logs.opening import open_log
 
+from .replay.columns import CanFrames, Images, Messages, Table
+from .replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+
 if TYPE_CHECKING:
     from crosscue.detectors.base import Detector, Found, Frame
-    from crosscue.replay.base import Block
     from crosscue.replay.vehicle.vehicle import CueSpec
+
+    from .replay.columns import Block
 
 __all__ = ["check_cue", "check_dataset", "check_detector", "check_reader"]
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 from crosscue.datasets.scenes.drive import SceneFiles, refuse_other_drive, write_scene
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
-from crosscue.replay.base import OutputError, UsageError, write_bytes
+from crosscue.replay.errors import OutputError, UsageError
+from crosscue.replay.files.whole_file import write_bytes
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
 from crosscue.results import Listing, Result

@@ -12,18 +12,13 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    Bytes,
-    Images,
-    Ledger,
-    LogError,
-    LogFormatError,
-    LogTooLargeError,
-    read_at_most,
-)
+from crosscue.replay.columns import Bytes, Images
 from crosscue.replay.decode.coding import MAGIC_BYTES, coding_of
+from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
+from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.image_header import size_in_header
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS
 from crosscue.replay.readers.images.damage import damage_of
 
 from .base import View

@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Bytes, write_bytes
+from crosscue.replay.columns import Bytes
+from crosscue.replay.files.whole_file import write_bytes
 
 from . import rle
 from .base import Detections, Found, RoadMask

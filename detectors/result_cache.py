@@ -19,7 +19,9 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from crosscue.replay.base import OutputError, door, json_tree
+from crosscue.replay.errors import OutputError
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree
 
 from .base import Detections, Found, RoadMask
 from .images import Encoded

@@ -7,7 +7,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Final
 
-from crosscue.replay.base import Block, Bytes, CrosscueError, Images, LogError, UsageError, one_line
+from crosscue.replay.columns import Block, Bytes, Images
+from crosscue.replay.errors import CrosscueError, LogError, UsageError, one_line
 
 from .base import Detections, Detector, Found, Frame, View, fault_of, reportable
 from .images import NOT_DECODED, Encoded, decode, encoded, reduction, size_of

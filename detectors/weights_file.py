@@ -15,7 +15,8 @@ from typing import Final
 
 from torch import Tensor
 
-from crosscue.replay.base import VehicleError, json_tree, one_line
+from crosscue.replay.errors import VehicleError, one_line
+from crosscue.replay.files.tree_text import json_tree
 
 SUM: Final = "crosscue-sha256"
 # SHA-256 of the files that are part of the crosscue package.

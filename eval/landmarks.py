@@ -23,7 +23,9 @@ from crosscue.eval.logs.log import DriveIfGiven, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
 from crosscue.localization.landmarks.images import grey_of, read_picture
-from crosscue.replay.base import EmptyResultError, Floats, UsageError, visible
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import EmptyResultError, UsageError
+from crosscue.replay.safe_text import visible
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result, json_key
 from crosscue.verb import Option

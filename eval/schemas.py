@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
 import crosscue
-from crosscue.replay.base import OutputError, strict_json, write_text
+from crosscue.replay.errors import OutputError
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
 from crosscue.verb import Option
 
 SchemaFile: TypeAlias = Annotated[Path | None, Option(metavar="FILE")]

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.replay.base import Floats, Int64s, UsageError
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import UsageError
 
 from .angles import wrap
 from .ekf import PoseBelief

@@ -15,24 +15,21 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import (
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import (
     DATA,
-    EVERYTHING,
     LENGTH_UNKNOWN,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
     Block,
     CanFrames,
-    Closing,
     Int64s,
-    Ledger,
-    Limits,
-    LogFormatError,
     Rows,
-    Selection,
     Table,
     Topic,
 )
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
 
 from .npy import Column, read_column
 

@@ -11,7 +11,8 @@ from crosscue.datasets.geodesy import ecef_to_enu_matrix, ecef_to_geodetic
 from crosscue.datasets.truth.mounting import mounting_in_car
 from crosscue.datasets.truth.truth import Origin, Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
-from crosscue.replay.base import Floats, LogFormatError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import LogFormatError
 
 from .npy import read_column
 

@@ -29,20 +29,11 @@ from numpy.typing import NDArray
 from crosscue.datasets.geodesy import geodetic_to_enu
 from crosscue.datasets.truth.truth import Origin, Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    EVERYTHING,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Int64s,
-    Ledger,
-    Limits,
-    LogFormatError,
-    Selection,
-    Table,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block, Int64s, Table, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.held_rows import CameraDrive
 from crosscue.replay.readers.images.files import PictureFiles, list_pictures
 from crosscue.replay.readers.time_file import read_time_file

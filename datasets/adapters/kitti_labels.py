@@ -13,8 +13,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.datasets.truth.objects import Objects
-from crosscue.replay.base import MIB, LogFormatError, read_at_most
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.image_header import size_in_header
+from crosscue.replay.limits import MIB
 
 MAX_FILE_BYTES: Final = 64 * MIB
 HEADER_BYTES: Final = 4096

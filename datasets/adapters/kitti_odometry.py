@@ -25,17 +25,10 @@ from scipy.spatial.transform import Rotation
 from crosscue.datasets.truth.mounting import mounting_in_car
 from crosscue.datasets.truth.truth import Mounting, Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    MIB,
-    Floats,
-    Int64s,
-    Limits,
-    LogFormatError,
-    Table,
-    Topic,
-    read_at_most,
-)
+from crosscue.replay.columns import Floats, Int64s, Table, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.limits import DEFAULT_LIMITS, MIB, Limits
 from crosscue.replay.readers.held_rows import CameraDrive, HeldRows, Loss
 from crosscue.replay.readers.images.files import PictureFiles, list_pictures
 from crosscue.replay.readers.time_file import read_time_file

@@ -25,14 +25,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from crosscue.replay.base import (
-    Floats,
-    Int64s,
-    Limits,
-    LogFormatError,
-    Table,
-    Topic,
-)
+from crosscue.replay.columns import Floats, Int64s, Table, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.held_rows import CameraDrive, HeldRows, Loss
 from crosscue.replay.readers.images.files import PictureFiles
 from crosscue.replay.readers.timed_files import TimedFiles

@@ -10,7 +10,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
-from crosscue.replay.base import PIECE_BYTES, LogFormatError, visible
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.bounded import PIECE_BYTES
+from crosscue.replay.safe_text import visible
 
 Row: TypeAlias = Mapping[str, Any]
 

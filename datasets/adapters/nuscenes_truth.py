@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 from crosscue.datasets.truth.objects import Objects
 from crosscue.datasets.truth.truth import Mounting, Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
-from crosscue.replay.base import Floats, LogFormatError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import LogFormatError
 
 from .nuscenes import FRONT, SceneTables, ego_poses, find_scene, matrix_of, numbers, read_tables
 from .nuscenes_tables import Row, RowsOf, checked, whole_table

@@ -23,17 +23,11 @@ from scipy.spatial.transform import Rotation
 from crosscue.datasets.truth.mounting import mounting_in_car
 from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
-from crosscue.replay.base import (
-    MIB,
-    Floats,
-    Int64s,
-    Limits,
-    LogFormatError,
-    Table,
-    Topic,
-    json_tree,
-    read_at_most,
-)
+from crosscue.replay.columns import Floats, Int64s, Table, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.limits import MIB, Limits
 from crosscue.replay.readers.held_rows import CameraDrive, HeldRows
 from crosscue.replay.readers.images.files import PictureFiles, list_pictures
 from crosscue.replay.readers.timed_files import TimedFiles

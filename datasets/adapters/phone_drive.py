@@ -17,20 +17,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from crosscue.replay.base import (
-    EVERYTHING,
-    MIB,
-    Block,
-    Floats,
-    Int64s,
-    Ledger,
-    Limits,
-    LogFormatError,
-    Selection,
-    Table,
-    Topic,
-    read_at_most,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block, Floats, Int64s, Table, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import MIB, Limits
 from crosscue.replay.readers.held_rows import CameraDrive, HeldRows, Loss
 from crosscue.replay.seal.touched import Touched
 

@@ -10,7 +10,8 @@ import numpy as np
 from crosscue.datasets.scenes.export.road_frames import RoadFrames, shrunk
 from crosscue.detectors.base import View
 from crosscue.detectors.images import decode, read_file
-from crosscue.replay.base import Bytes, EmptyResultError, LogError, UsageError
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import EmptyResultError, LogError, UsageError
 
 SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp")
 

@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from crosscue.datasets.truth.annotations import Annotations, Picture, Sizes, Thing, size_of
-from crosscue.replay.base import AnnotationError, json_tree, strict_json, write_text
+from crosscue.replay.errors import AnnotationError
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
 
 FILE = "labels.json"
 

@@ -8,7 +8,9 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from crosscue.datasets.truth.annotations import Annotations, Picture, Thing
-from crosscue.replay.base import AnnotationError, json_tree, strict_json, write_text
+from crosscue.replay.errors import AnnotationError
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
 
 FILE = "tasks.json"
 CONFIG = "interface.xml"

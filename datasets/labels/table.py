@@ -10,7 +10,9 @@ from typing import Final
 from crosscue.datasets.truth.annotations import Annotations, Sizes
 from crosscue.datasets.truth.coco import read_coco, write_coco
 from crosscue.datasets.truth.cvat import read_cvat, write_cvat
-from crosscue.replay.base import AnnotationError, UsageError, json_tree, read_at_most
+from crosscue.replay.errors import AnnotationError, UsageError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import json_tree
 
 from .fiftyone import FILE as FIFTYONE
 from .fiftyone import read_fiftyone, write_fiftyone

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from crosscue.datasets.truth.annotations import Annotations, Picture, Sizes, Thing, size_of
 from crosscue.datasets.truth.box_labels import read_box_labels
-from crosscue.replay.base import strict_json, write_text
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
 
 FILE = "data.yaml"
 LABELS = "labels"

@@ -28,7 +28,9 @@ from numpy.typing import NDArray
 
 from crosscue.datasets.adapters.pandaset import FRONT, Poses, read_poses
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
-from crosscue.replay.base import Floats, json_tree, write_text
+from crosscue.replay.columns import Floats
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.vehicle.vehicle import load
 
 FOLDER: Final = Path(__file__).parent / "pandaset_002"

@@ -21,7 +21,10 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.datasets.adapters.pandaset import FRONT, Poses, read_poses
-from crosscue.replay.base import Floats, LogFormatError, json_tree, strict_json, write_text
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
 
 CATEGORIES: Final = {"car": 1, "truck": 2, "person": 3}
 LABELS: Final = {

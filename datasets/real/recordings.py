@@ -21,13 +21,10 @@ from crosscue.detectors.catalog.card import Hash
 from crosscue.detectors.catalog.fetch import DATA
 from crosscue.detectors.catalog.places import user_cache
 from crosscue.detectors.settings import Settings
-from crosscue.replay.base import (
-    MIB,
-    LogError,
-    VehicleError,
-    toml_tree,
-)
+from crosscue.replay.errors import LogError, VehicleError
 from crosscue.replay.files.transfer import Progress, download, is_there, take
+from crosscue.replay.files.tree_text import toml_tree
+from crosscue.replay.limits import MIB
 from crosscue.replay.vehicle.section import tuples
 from crosscue.replay.vehicle.validation_errors import explain
 

@@ -29,24 +29,14 @@ from crosscue.datasets.simulated.drive import (
 from crosscue.datasets.simulated.sensor_blocks import sensor_blocks
 from crosscue.datasets.truth.truth import Approach, Features, Mounting, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
-from crosscue.replay.base import (
-    Block,
-    ImageCoding,
-    Images,
-    Int64s,
-    Ledger,
-    Messages,
-    Topic,
-    door,
-    json_tree,
-    sha256_of,
-    strict_json,
-    write_bytes,
-    write_text,
-)
+from crosscue.replay.columns import Block, ImageCoding, Images, Int64s, Messages, Topic
 from crosscue.replay.encode.outgoing import standard_type
 from crosscue.replay.encode.template import filled, template_of
+from crosscue.replay.files import door
 from crosscue.replay.files.made_of import SIMULATED, made_of, refuse_another
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import sha256_of, write_bytes, write_text
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 from crosscue.results import Result
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from crosscue.datasets.truth.truth import Mounting, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
-from crosscue.replay.base import Ledger, write_bytes, write_text
+from crosscue.replay.files.whole_file import write_bytes, write_text
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 
 from .drive import (

@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import DATA, Block, CanFrames, Floats, Int64s, Table, Topic
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
+from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table, Topic
 
 from .drive import Sensed, dbc_path
 

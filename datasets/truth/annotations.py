@@ -18,7 +18,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from crosscue.replay.base import AnnotationError, Int64s, SchemaError, UsageError
+from crosscue.replay.columns import Int64s
+from crosscue.replay.errors import AnnotationError, SchemaError, UsageError
 from crosscue.replay.vehicle.cue_table import CUES
 
 from .truth import CueTruth

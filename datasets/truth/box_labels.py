@@ -25,14 +25,10 @@ from typing import Annotated, Final, Literal, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.base import (
-    MIB,
-    AnnotationError,
-    EmptyResultError,
-    UsageError,
-    read_at_most,
-    yaml_tree,
-)
+from crosscue.replay.errors import AnnotationError, EmptyResultError, UsageError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import yaml_tree
+from crosscue.replay.limits import MIB
 from crosscue.verb import Option
 
 from .coco import read_coco

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from crosscue.replay.base import DEFAULT_LIMITS
-from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.logs.opening import open_log
 from crosscue.results import Result, json_key
 

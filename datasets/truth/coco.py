@@ -7,14 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.base import (
-    MIB,
-    AnnotationError,
-    json_tree,
-    read_at_most,
-    strict_json,
-    write_text,
-)
+from crosscue.replay.errors import AnnotationError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.limits import MIB
 
 from .annotations import Annotations, Picture, Thing
 

@@ -17,7 +17,9 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from crosscue.replay.base import MIB, AnnotationError, write_text
+from crosscue.replay.errors import AnnotationError
+from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.limits import MIB
 
 from .annotations import Annotations, Picture, Thing
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.base import strict_json, write_text
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
 
 OBJECTS_FILE: Final = "objects.json"
 

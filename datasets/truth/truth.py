@@ -13,18 +13,12 @@ from typing import Annotated, Any, Final, Literal, Protocol, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from crosscue.replay.base import (
-    MIB,
-    AnnotationError,
-    CrosscueError,
-    EmptyResultError,
-    json_tree,
-    one_line,
-    read_at_most,
-    strict_json,
-    write_text,
-)
+from crosscue.replay.errors import AnnotationError, CrosscueError, EmptyResultError, one_line
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.formats import data_sets
+from crosscue.replay.limits import MIB
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.validation_errors import explain
 

@@ -15,16 +15,10 @@ from typing import Final, TextIO
 
 import numpy as np
 
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    Floats,
-    Int64s,
-    Limits,
-    LogError,
-    LogFormatError,
-    LogTooLargeError,
-    write_text,
-)
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
+from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 _COLUMNS: Final = 8
 _LINE_CHARACTERS: Final = 4096

@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Final, TypeAlias
 from xml.parsers import expat
 
-from crosscue.replay.base import MIB, AnnotationError, read_at_most
+from crosscue.replay.errors import AnnotationError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.limits import MIB
 
 MAX_BYTES: Final = 16 * MIB
 MAX_DEPTH: Final = 16

@@ -28,7 +28,10 @@ from pydantic import Field, ValidationError, model_validator
 from crosscue.detectors.decoders.table import AnyBoxOutput
 from crosscue.detectors.networks.weights import Weights
 from crosscue.detectors.settings import Proportion, Settings
-from crosscue.replay.base import MIB, VehicleError, read_at_most, toml_tree
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import toml_tree
+from crosscue.replay.limits import MIB
 from crosscue.replay.vehicle.section import tuples
 from crosscue.replay.vehicle.validation_errors import explain
 

@@ -27,7 +27,9 @@ from crosscue.detectors.networks.backends import Network, load_network
 from crosscue.detectors.networks.openvino import import_openvino
 from crosscue.detectors.networks.picture_input import prepared
 from crosscue.detectors.networks.weights import Weights
-from crosscue.replay.base import UsageError, one_line, read_at_most, yaml_tree
+from crosscue.replay.errors import UsageError, one_line
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import yaml_tree
 
 from .architectures import WEIGHTS_SUFFIXES
 from .card import MAX_BYTES, Input

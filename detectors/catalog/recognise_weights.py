@@ -13,7 +13,8 @@ from crosscue.detectors.networks.torchvision_weights import (
     read_state_dict,
     shapes_of,
 )
-from crosscue.replay.base import UsageError, read_at_most
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.bounded import read_at_most
 
 from .architectures import ARCHITECTURES, ArchitectureName
 from .card import MAX_BYTES

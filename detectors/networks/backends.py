@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.decoders.base import PICTURE_SIZE_INPUT
-from crosscue.replay.base import VehicleError, installed, one_line
+from crosscue.replay.errors import VehicleError, one_line
+from crosscue.replay.versions import installed
 
 from .free_size import Size, free_size, resized
 from .onnx_input import input_shape

@@ -12,7 +12,8 @@ from crosscue.detectors.base import Detections, Found, Frame, View
 from crosscue.detectors.boxes import best_of
 from crosscue.detectors.catalog.card import ModelCard
 from crosscue.detectors.decoders.base import Array, BoxOutput, Candidates
-from crosscue.replay.base import Bytes, Floats, Int64s, VehicleError
+from crosscue.replay.columns import Bytes, Floats, Int64s
+from crosscue.replay.errors import VehicleError
 
 from .backends import Network
 from .picture_input import Placement, prepared, view_of

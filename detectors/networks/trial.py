@@ -9,7 +9,7 @@ import numpy as np
 from crosscue.detectors.base import Detector
 from crosscue.detectors.decoders.plausible import oddity
 from crosscue.detectors.signs.templates import draw
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 
 from .box_model import BoxModel
 from .picture_input import prepared

@@ -14,7 +14,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import EmptyResultError, Floats, UsageError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.vehicle.vehicle import RangeCurve
 
 Family = Literal["pinhole", "pinhole-offset", "power"]

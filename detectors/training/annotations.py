@@ -19,7 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors import rle
-from crosscue.replay.base import AnnotationError, Int64s, SchemaError, json_tree, read_at_most
+from crosscue.replay.columns import Int64s
+from crosscue.replay.errors import AnnotationError, SchemaError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import json_tree
 
 # Maximum size of an annotation file.
 MAX_BYTES: Final = 2 << 30

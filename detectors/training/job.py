@@ -22,7 +22,10 @@ from crosscue.detectors.networks.mask_rcnn.checkpoint import (
 from crosscue.detectors.networks.mask_rcnn.coco import COCO_NETWORKS
 from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, checkpoint_named
 from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network
-from crosscue.replay.base import OutputError, door, json_tree, strict_json, write_text
+from crosscue.replay.errors import OutputError
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
 
 from .annotations import LabelledSet
 from .loop import Schedule, Training

@@ -20,8 +20,10 @@ from torch import Tensor, nn
 
 from crosscue.detectors.networks.mask_rcnn.network import forward_training, freeze_masks
 from crosscue.detectors.weights_file import serialised
-from crosscue.replay.base import CrosscueError, SchemaError, json_tree, one_line, write_bytes
+from crosscue.replay.errors import CrosscueError, SchemaError, one_line
 from crosscue.replay.files.made_of import NOTHING, refuse_another
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.files.whole_file import write_bytes
 
 from .samples import Sample, Sampler
 

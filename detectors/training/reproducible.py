@@ -17,7 +17,7 @@ from typing import Final
 
 import torch
 
-from crosscue.replay.base import installed
+from crosscue.replay.versions import installed
 
 LIBRARIES: Final = ("torch", "torchvision", "numpy", "opencv-python-headless")
 CUBLAS_VARIABLE: Final = "CUBLAS_WORKSPACE_CONFIG"

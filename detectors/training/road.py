@@ -21,17 +21,13 @@ from torch.nn import functional
 
 from crosscue.detectors.networks.road.network import RoadNetwork, logits_of
 from crosscue.detectors.weights_file import serialised
-from crosscue.replay.base import (
-    MIB,
-    Bytes,
-    SchemaError,
-    UsageError,
-    json_tree,
-    one_line,
-    read_at_most,
-    write_bytes,
-)
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import SchemaError, UsageError, one_line
+from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.made_of import NOTHING, refuse_another
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.files.whole_file import write_bytes
+from crosscue.replay.limits import MIB
 
 STATE_KEY: Final = "crosscue_road_training"
 # Maximum size of a state file; the network and its moments need a few MB.

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.networks.mask_rcnn.network import MEAN, SPREAD, Plan
-from crosscue.replay.base import Bytes, Floats, LogError, SchemaError
+from crosscue.replay.columns import Bytes, Floats
+from crosscue.replay.errors import LogError, SchemaError
 
 from .annotations import Box, Labelled, LabelledPicture, LabelledSet, mask_of
 

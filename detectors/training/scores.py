@@ -12,7 +12,8 @@ import numpy as np
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.boxes import overlaps
 from crosscue.detectors.rle import area_px, encode
-from crosscue.replay.base import Floats, UsageError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import UsageError
 
 from .annotations import LabelledPicture, LabelledSet, mask_of
 from .samples import read_picture

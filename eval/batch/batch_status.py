@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option
 

@@ -26,18 +26,13 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.eval.runs.folder import MANIFEST
-from crosscue.replay.base import (
-    MIB,
-    LogError,
-    UnknownFormatError,
-    UsageError,
-    is_remote,
-    read_at_most,
-)
+from crosscue.replay.errors import LogError, UnknownFormatError, UsageError
+from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.identity import identity_of, identity_of_all
 from crosscue.replay.files.log_identity import SHORT
 from crosscue.replay.formats import format_of, known_formats
-from crosscue.replay.remote.address import LogAddress
+from crosscue.replay.limits import MIB
+from crosscue.replay.remote.address import LogAddress, is_remote
 from crosscue.replay.remote.logs import matches
 
 from .shards import Shard, read_shard

@@ -30,23 +30,15 @@ from crosscue.eval.runs.folder import (
     refuse_files_of_user,
     signature,
 )
-from crosscue.replay.base import (
-    CrosscueError,
-    RunError,
-    UsageError,
-    door,
-    losses_heard,
-    one_line,
-    spelled,
-    strict_json,
-    versions,
-    warn_again,
-    write_text,
-)
-from crosscue.replay.errors import without_secrets
+from crosscue.replay.errors import CrosscueError, RunError, UsageError, one_line, without_secrets
+from crosscue.replay.files import door
 from crosscue.replay.files.identity import identity_of, identity_of_all
 from crosscue.replay.files.log_identity import as_row
+from crosscue.replay.files.tree_text import spelled, strict_json
+from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.losses import losses_heard, warn_again
 from crosscue.replay.progress import Progress, emit
+from crosscue.replay.versions import versions
 
 from .journal import STALE_S, beating, error_of, read_entry, silent_s, write_entry, write_plan
 

@@ -15,7 +15,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.base import door, json_tree, strict_json, write_text
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
 
 JOURNAL: Final = ".drives"
 PLANS: Final = "plans"

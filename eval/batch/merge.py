@@ -16,32 +16,29 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from crosscue.eval.runs.account import summed
 from crosscue.eval.runs.folder import (
     MANIFEST,
-    DriveManifest,
-    EstimateManifest,
-    MergedDrive,
-    MergedLog,
-    MergedManifest,
     RunFolder,
     clear,
     locked,
     open_run,
     staged,
-    summed,
     write_manifest,
+)
+from crosscue.eval.runs.manifest import (
+    DriveManifest,
+    EstimateManifest,
+    MergedDrive,
+    MergedLog,
+    MergedManifest,
 )
 from crosscue.eval.runs.settings_hash import settings_sha256
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tags import read_tags
-from crosscue.replay.base import (
-    RunError,
-    UnreadableRunError,
-    UsageError,
-    door,
-    one_line,
-    spelled,
-)
+from crosscue.replay.errors import RunError, UnreadableRunError, UsageError, one_line
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import spelled
 
 from .status import MERGED, NO_RUN, unfinished
 

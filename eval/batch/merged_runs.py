@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from crosscue.eval.runs.folder import created
-from crosscue.replay.base import RunError
+from crosscue.replay.errors import RunError
 from crosscue.results import Result, json_key
 from crosscue.verb import Option
 

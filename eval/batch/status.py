@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 from crosscue.eval.runs.folder import FAILURE, MANIFEST, is_alive
-from crosscue.replay.base import UnreadableRunError
+from crosscue.replay.errors import UnreadableRunError
 
 from .journal import STALE_S, has_journal, names_in, read_entry, silent_s, started_s
 

@@ -26,14 +26,11 @@ from crosscue.eval.scoring.by_drive import (
     no_longer_scored,
 )
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
-from crosscue.replay.base import (
-    MIB,
-    UnreadableRunError,
-    UsageError,
-    door,
-    json_tree,
-    visible,
-)
+from crosscue.replay.errors import UnreadableRunError, UsageError
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.limits import MIB
+from crosscue.replay.safe_text import visible
 from crosscue.results import HIDDEN, Result
 
 from .paired import FALSE_ALARMS, MIN_DRIVES, PairedMetric, Verdict, compare_drives

@@ -11,38 +11,18 @@ from typing import TYPE_CHECKING, ClassVar, Final, Protocol
 from crosscue.eval.logs.log import DriveGiven, opened, vehicle_of
 from crosscue.eval.pipeline.drive_time import time_segments, whole_timeline
 from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
-from crosscue.eval.runs.folder import (
-    Account,
-    DecodeManifest,
-    RunFolder,
-    account,
-    account_lines,
-    clear,
-    created,
-    details_of,
-    locked,
-    reading_of,
-    staged,
-    write_manifest,
-)
+from crosscue.eval.runs.account import Account, account, account_lines, details_of, reading_of
+from crosscue.eval.runs.folder import RunFolder, clear, created, locked, staged, write_manifest
 from crosscue.eval.runs.logs import log_names
+from crosscue.eval.runs.manifest import DecodeManifest
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tables.skipped import write_skipped
-from crosscue.replay.base import (
-    Block,
-    CanFrames,
-    Images,
-    Ledger,
-    Log,
-    Messages,
-    SchemaError,
-    Selection,
-    Table,
-    Topic,
-    versions,
-)
+from crosscue.replay.base import Log, Selection
+from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.log_summary import rows_declared, rows_read
 from crosscue.replay.logs.topic_part import columns_of
 from crosscue.replay.mobileye.can.admit import all_ids
@@ -53,6 +33,7 @@ from crosscue.replay.progress import Progress, emit
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.versions import versions
 from crosscue.results import HIDDEN, Result, json_key
 
 if TYPE_CHECKING:

@@ -10,13 +10,9 @@ from typing import Final
 
 from crosscue.eval.batch.merge import is_merged
 from crosscue.eval.runs.folder import FAILURE, LOCK, MANIFEST, RunFolder
-from crosscue.replay.base import (
-    RunError,
-    UnreadableRunError,
-    UsageError,
-    is_remote,
-    read_at_most,
-)
+from crosscue.replay.errors import RunError, UnreadableRunError, UsageError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.remote.address import is_remote
 
 from .query.local import LocalRuns, is_cut_short
 

@@ -20,7 +20,7 @@ from crosscue.eval.scoring.change_points import (
     Results,
     change_points,
 )
-from crosscue.replay.base import EmptyResultError
+from crosscue.replay.errors import EmptyResultError
 from crosscue.results import Result
 
 from .paired import pooled

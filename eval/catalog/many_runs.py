@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 from crosscue.eval.scoring.by_drive import DriveMetric, no_longer_scored
-from crosscue.replay.base import RunError, UnreadableRunError, UsageError
+from crosscue.replay.errors import RunError, UnreadableRunError, UsageError
 
 from .compare import Comparison, Tolerance, allowed_by, is_whole_run, open_scored, parts_of
 from .paired import compare_drives

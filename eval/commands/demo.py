@@ -24,7 +24,7 @@ from crosscue.eval.commands.shared.terminal import (
     print_json,
     progress_line,
 )
-from crosscue.replay.base import visible
+from crosscue.replay.safe_text import visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

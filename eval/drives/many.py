@@ -16,10 +16,11 @@ from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.runs.folder import FAILURE, create
 from crosscue.eval.runs.logs import files_named_in
-from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, UsageError, versions
-from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.errors import CrosscueError, UsageError
+from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.logs.log_part import EVERY_PART, LogPart
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
+from crosscue.replay.versions import versions
 from crosscue.results import HIDDEN, Result, plain
 from crosscue.verb import Option, compared, keywords
 

@@ -12,7 +12,7 @@ from crosscue.detectors.result_cache import default_cache
 from crosscue.eval.logs.log import DriveGiven, Log, UnopenedLog, opened, vehicle_of
 from crosscue.eval.pipeline.run import Run, RunGiven, run_given
 from crosscue.eval.runs.folder import RunFolder, copy_files, created
-from crosscue.replay.base import OutputError, UsageError
+from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.vehicle.pose import GnssUse
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.verb import HIDDEN, Option, keywords

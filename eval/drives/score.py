@@ -25,7 +25,8 @@ from crosscue.eval.scoring.runs import (
     scores_of,
     smoothed_ranges,
 )
-from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, UsageError
+from crosscue.replay.errors import CrosscueError, UsageError
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.processes import in_processes
 from crosscue.results import Result
 

@@ -18,7 +18,8 @@ from crosscue.eval.report.summary import (
     reported_line,
     summary,
 )
-from crosscue.eval.runs.folder import account_lines, locked
+from crosscue.eval.runs.account import account_lines
+from crosscue.eval.runs.folder import locked
 from crosscue.eval.scoring.drives import Definition, Scores, ScoreSettings
 from crosscue.eval.scoring.files import FOLDER
 from crosscue.eval.scoring.gates import GateResult, check_gates, load_gates
@@ -33,9 +34,10 @@ from crosscue.eval.studies.attribution import (
     attribution_tree,
 )
 from crosscue.eval.studies.estimated_again import estimate_of
-from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, UsageError, one_line, visible
-from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.errors import CrosscueError, UsageError, one_line
+from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.progress import Progress, emit
+from crosscue.replay.safe_text import visible
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
 

@@ -14,18 +14,12 @@ from crosscue.eval.failures.site import MARKER, RunWork, by_run, entries_of, wri
 from crosscue.eval.pipeline.run import moved_to, open_run
 from crosscue.eval.recording.view import save_recording
 from crosscue.eval.runs import owned
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    CrosscueError,
-    EmptyResultError,
-    OutputError,
-    UsageError,
-    cannot_write,
-    visible,
-)
-from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.errors import CrosscueError, EmptyResultError, OutputError, UsageError
+from crosscue.replay.files.whole_file import cannot_write
+from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
+from crosscue.replay.safe_text import visible
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
 

@@ -13,7 +13,9 @@ from crosscue.detectors.images import Encoded, check, decode
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.runs.stored_images import camera_of, pictures_at
 from crosscue.eval.runs.tables.stored_frames import stored_frames
-from crosscue.replay.base import DEFAULT_LIMITS, Limits, spelled, write_bytes
+from crosscue.replay.files.tree_text import spelled
+from crosscue.replay.files.whole_file import write_bytes
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 # Encodings that every tool reads; others are converted to PNG, which is lossless.
 ENDINGS: Final = {"jpeg": ".jpg", "png": ".png"}

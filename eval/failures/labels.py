@@ -20,22 +20,20 @@ from crosscue.eval.failures.record import Failure, read_failures
 from crosscue.eval.fit.truth_check import FILE, ImportedTruth, import_part
 from crosscue.eval.pipeline.run import moved_to
 from crosscue.eval.runs import owned
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
+from crosscue.replay.errors import (
     AnnotationError,
     CrosscueError,
     EmptyResultError,
     OutputError,
     SchemaError,
     UsageError,
-    cannot_write,
-    door,
-    json_tree,
-    unspelled,
-    visible,
 )
-from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree, unspelled
+from crosscue.replay.files.whole_file import cannot_write
+from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.progress import Progress, emit
+from crosscue.replay.safe_text import visible
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import Result
 from crosscue.verb import Option

@@ -9,16 +9,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from crosscue.replay.base import (
-    AnnotationError,
-    door,
-    json_tree,
-    spelled,
-    strict_json,
-    unspelled,
-    write_table,
-    write_text,
-)
+from crosscue.replay.errors import AnnotationError
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree, spelled, strict_json, unspelled
+from crosscue.replay.files.whole_file import write_table, write_text
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -15,15 +15,10 @@ from crosscue.eval.failures.record import Failure, failure_table, write_failures
 from crosscue.eval.failures.record import read_failures as read_table
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.runs import find_truth, judge_scene
-from crosscue.replay.base import (
-    CrosscueError,
-    EmptyResultError,
-    OutputError,
-    UsageError,
-    visible,
-)
+from crosscue.replay.errors import CrosscueError, EmptyResultError, OutputError, UsageError
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
+from crosscue.replay.safe_text import visible
 from crosscue.results import Result, json_key, listing
 from crosscue.verb import Option, keywords
 

@@ -21,7 +21,8 @@ from urllib.parse import quote
 from crosscue.eval.report.html import page_template, template_text
 from crosscue.eval.runs import owned
 from crosscue.eval.runs.folder import RunFolder, open_run
-from crosscue.replay.base import Limits, write_bytes, write_text
+from crosscue.replay.files.whole_file import write_bytes, write_text
+from crosscue.replay.limits import Limits
 
 from .chart import RunRows, belief_around
 from .pictures import draw_pictures

@@ -28,7 +28,8 @@ from crosscue.fusion.fit.annotated_approach import NOT_EVALUATED, AnnotatedAppro
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive
 from crosscue.fusion.intersection_range import Reference
 from crosscue.fusion.temporal import MeasuredRange, ranges_to_start
-from crosscue.replay.base import Floats, Int64s, OutputError, RunError, UsageError
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import OutputError, RunError, UsageError
 from crosscue.replay.vehicle.vehicle import RangeCurve, Vehicle
 
 if TYPE_CHECKING:

@@ -16,7 +16,9 @@ from crosscue.eval.pipeline.pose import compass_settings
 from crosscue.localization.compass import course_at
 from crosscue.localization.fit.compass import CompassFit
 from crosscue.localization.fit.compass import fit_compass as fit_readings
-from crosscue.replay.base import EmptyResultError, Log, Selection, VehicleError, toml_document
+from crosscue.replay.base import Log, Selection
+from crosscue.replay.errors import EmptyResultError, VehicleError
+from crosscue.replay.files.tree_text import toml_document
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result

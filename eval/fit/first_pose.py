@@ -15,7 +15,8 @@ from crosscue.eval.pipeline.pose import fused_positions, odometry_settings, turn
 from crosscue.localization.fit.known_drive import KnownDrive
 from crosscue.localization.odometry import integrate
 from crosscue.localization.start_pose import START_S, start_pose
-from crosscue.replay.base import Log, MissingTopicError, Selection, UsageError, VehicleError
+from crosscue.replay.base import Log, Selection
+from crosscue.replay.errors import MissingTopicError, UsageError, VehicleError
 from crosscue.replay.logs.log_part import first_ns
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.vehicle.pose import GnssUse, Start

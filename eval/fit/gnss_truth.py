@@ -14,7 +14,9 @@ from crosscue.datasets.truth.truth import Mounting, Origin, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.localization.compass import course_at
-from crosscue.replay.base import EmptyResultError, Floats, Int64s, Log, Selection, name_of
+from crosscue.replay.base import Log, Selection, name_of
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import EmptyResultError
 from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.vehicle.pose import Gnss
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given

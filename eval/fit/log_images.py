@@ -10,17 +10,11 @@ import numpy as np
 
 from crosscue.datasets.truth.annotations import LogPictures
 from crosscue.detectors.images import check, encoded, lose
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    EVERYTHING,
-    EmptyResultError,
-    Int64s,
-    Ledger,
-    Limits,
-    LogError,
-    MissingTopicError,
-    warn_of,
-)
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.columns import Int64s
+from crosscue.replay.errors import EmptyResultError, LogError, MissingTopicError
+from crosscue.replay.ledger import Ledger, warn_of
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.logs.opening import open_log, unless_damaged
 from crosscue.replay.readers.images.folder import picture_names
 from crosscue.replay.signals.extractor import pictures_of

@@ -6,7 +6,8 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from crosscue.replay.base import Ledger, Log, Selection, name_of, warn_of
+from crosscue.replay.base import Log, Selection, name_of
+from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Samples, Signal
 from crosscue.replay.signals.plan import plan

@@ -18,7 +18,8 @@ from crosscue.eval.scoring.intervals import TOO_FEW, Interval, mean_by_cluster, 
 from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.fusion.fit.message_fit import fit_messages as fit_approaches
-from crosscue.replay.base import EmptyResultError, write_text
+from crosscue.replay.errors import EmptyResultError
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.progress import Progress, emit
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option

@@ -20,15 +20,10 @@ from crosscue.localization.fit.known_drive import KnownDrive, whitened
 from crosscue.localization.fit.odometry import FIX_DELAY, OdometryFit
 from crosscue.localization.fit.odometry import fit_odometry as fit_parameters
 from crosscue.localization.odometry import OdometrySettings
-from crosscue.replay.base import (
-    EmptyResultError,
-    Floats,
-    Log,
-    Selection,
-    VehicleError,
-    name_of,
-    toml_document,
-)
+from crosscue.replay.base import Log, Selection, name_of
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import EmptyResultError, VehicleError
+from crosscue.replay.files.tree_text import toml_document
 from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.vehicle.pose import OdometryFitted
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given

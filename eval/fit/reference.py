@@ -12,7 +12,8 @@ from crosscue.datasets.geodesy import geodetic_to_enu
 from crosscue.datasets.truth.tum import heading_rad
 from crosscue.eval.scoring.pose.score import load_truth, mounting_of
 from crosscue.localization.fixes import Fixes
-from crosscue.replay.base import EmptyResultError, Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import EmptyResultError
 from crosscue.replay.signals.kinds import Samples
 from crosscue.replay.vehicle.vehicle import Vehicle
 

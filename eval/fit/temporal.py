@@ -12,7 +12,8 @@ from crosscue.eval.pipeline.run import Run, run_given
 from crosscue.eval.scoring.truth import load
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit
 from crosscue.fusion.fit.temporal_fit import fit_temporal as fit_drives
-from crosscue.replay.base import EmptyResultError, write_text
+from crosscue.replay.errors import EmptyResultError
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.vehicle.temporal import CueChain
 from crosscue.results import HIDDEN, Result

@@ -27,16 +27,10 @@ from crosscue.datasets.truth.objects import OBJECTS_FILE
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import read_tum
 from crosscue.eval.scoring import truth as score_truth
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    Limits,
-    OutputError,
-    SchemaError,
-    sha256_of,
-    strict_json,
-    write_text,
-)
-from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.errors import OutputError, SchemaError
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import sha256_of, write_text
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits, LimitsGiven
 from crosscue.replay.vehicle.vehicle import CUES, Vehicle, vehicle_given
 from crosscue.results import Result
 from crosscue.verb import Option

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import OutputError, UsageError, write_text
+from crosscue.replay.errors import OutputError, UsageError
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 
 # Vehicle file with only default values.

@@ -10,7 +10,9 @@ from crosscue.eval.catalog import compare, many_runs
 from crosscue.eval.catalog.query.catalog import catalog
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.report.junit import cases_text
-from crosscue.replay.base import UsageError, is_remote, write_text
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.remote.address import is_remote
 from crosscue.verb import Option
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 from crosscue.eval.catalog.history import History, MetricHistory, history_of, limits
 from crosscue.eval.catalog.query.catalog import catalog
 from crosscue.eval.report.history_page import Chart, Mark, write_history_page
-from crosscue.replay.base import OutputError
+from crosscue.replay.errors import OutputError
 from crosscue.verb import Option
 
 

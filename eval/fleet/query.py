@@ -15,15 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 from crosscue.eval.catalog.query.catalog import catalog
-from crosscue.replay.base import (
-    CrosscueError,
-    OutputError,
-    UsageError,
-    strict_json,
-    write_bytes,
-    write_table,
-    write_text,
-)
+from crosscue.replay.errors import CrosscueError, OutputError, UsageError
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_bytes, write_table, write_text
 from crosscue.replay.progress import Notice, emit
 from crosscue.replay.safe_text import table, terminal_width
 from crosscue.results import Result

@@ -10,7 +10,7 @@ from typing import Annotated
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.runs import tags as stored
 from crosscue.eval.runs.folder import RunFolder, locked
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 from crosscue.results import Result
 from crosscue.verb import Option
 

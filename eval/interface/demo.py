@@ -12,7 +12,9 @@ from crosscue.eval.drives.replay import replay_drive
 from crosscue.eval.drives.score import ScoredRun, score_run
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.recording.view import save_recording
-from crosscue.replay.base import CrosscueError, UsageError, door, write_text
+from crosscue.replay.errors import CrosscueError, UsageError
+from crosscue.replay.files import door
+from crosscue.replay.files.whole_file import write_text
 
 REAL: Final = "pandaset_002"
 MODEL: Final = "yolox-nano"

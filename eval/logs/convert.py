@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Final
 
 from crosscue.eval.pipeline.empty_result import empty_result
-from crosscue.replay.base import Ledger, LogError, OutputError, Topic, UsageError, visible
-from crosscue.replay.ledger import Detail
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import LogError, OutputError, UsageError
+from crosscue.replay.ledger import Detail, Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.progress import Progress, emit
-from crosscue.replay.safe_text import terminal_width, wrapped
+from crosscue.replay.safe_text import terminal_width, visible, wrapped
 from crosscue.replay.seal.seal import seal_path
 from crosscue.replay.write.convert import LogWriter
 from crosscue.replay.write.mcap import Compression

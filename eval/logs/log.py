@@ -13,33 +13,16 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    EVERYTHING,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    CanFrames,
-    Closing,
-    Images,
-    Ledger,
-    Limits,
-    LossWarning,
-    MissingTopicError,
-    SchemaError,
-    Selection,
-    Table,
-    Topic,
-    TopicAccount,
-    UsageError,
-    name_of,
-    warn_of,
-)
+from crosscue.replay.base import EVERYTHING, Selection, name_of
 from crosscue.replay.base import Log as OneLog
+from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.decode.packets import PacketDecoder, is_stream
-from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.errors import LossWarning, MissingTopicError, SchemaError, UsageError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger, TopicAccount, warn_of
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits, LimitsGiven
 from crosscue.replay.logs.log_part import LogPart, part_of
 from crosscue.replay.logs.opening import open_log as open_one
 from crosscue.replay.logs.opening import unless_damaged
@@ -50,7 +33,7 @@ from crosscue.verb import Option
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from crosscue.replay.base import Bytes
+    from crosscue.replay.columns import Bytes
     from crosscue.replay.vehicle.vehicle import Vehicle
 
 VEHICLE: Final = "vehicle.toml"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Final
 
-from crosscue.replay.base import CrosscueError, LogError, UsageError
+from crosscue.replay.errors import CrosscueError, LogError, UsageError
 from crosscue.replay.formats import format_of
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.seal.seal import (

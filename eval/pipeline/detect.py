@@ -33,45 +33,38 @@ from crosscue.detectors.registry import is_plugin, knows_simulated_only, make
 from crosscue.detectors.result_cache import ResultCache
 from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
 from crosscue.eval.pipeline.outcome import DetectOutcome
+from crosscue.eval.runs.account import Account, account, detecting_of, reading_of
 from crosscue.eval.runs.folder import (
-    Account,
-    DetectCounts,
-    DetectManifest,
-    DetectorRow,
-    DetectTimings,
     RunFolder,
-    Timings,
-    account,
     clear,
-    detecting_of,
     locked,
-    part_of,
-    reading_of,
     staged,
     write_manifest,
     write_timings,
 )
 from crosscue.eval.runs.logs import input_of, is_simulated, log_names, log_rows
+from crosscue.eval.runs.manifest import (
+    DetectCounts,
+    DetectManifest,
+    DetectorRow,
+    DetectTimings,
+    Timings,
+    part_of,
+)
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.skipped import write_skipped
-from crosscue.replay.base import (
-    Block,
-    EmptyResultError,
-    Int64s,
-    Ledger,
-    Log,
-    Selection,
-    Topic,
-    VehicleError,
-    versions_and_commit,
-)
+from crosscue.replay.base import Log, Selection
+from crosscue.replay.columns import Block, Int64s, Topic
+from crosscue.replay.errors import EmptyResultError, VehicleError
 from crosscue.replay.files.made_of import SIMULATED
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.plan import camera_of, pictures_only
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
 from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.versions import versions_and_commit
 
 from .clocks import clock_rows
 from .drive_time import camera_timeline, time_segments

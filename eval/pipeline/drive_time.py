@@ -6,8 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from crosscue.eval.runs.folder import RunFolder, TimeSegments
-from crosscue.replay.base import Log, Selection, Topic, UsageError, VehicleError
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import TimeSegments
+from crosscue.replay.base import Log, Selection
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.signals.extractor import Extractor, probe_clocks, wheels_only
 from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import pictures_only, plan, with_pictures

@@ -8,17 +8,15 @@ from contextlib import contextmanager
 from typing import Final
 
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, clear
-from crosscue.replay.base import (
+from crosscue.replay.base import Log, Selection, name_of
+from crosscue.replay.errors import (
     CrosscueError,
     EmptyResultError,
-    Ledger,
-    Log,
     LogError,
     SchemaError,
-    Selection,
     VehicleError,
-    name_of,
 )
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.signals.kinds import Plan, Signal
 
 TOPICS_SHOWN: Final = 12

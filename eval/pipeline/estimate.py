@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, NamedTuple
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
 from crosscue.eval.pipeline.scene.outcome import SceneOutcome
 from crosscue.eval.pipeline.scene.stage import estimate_scene, features_of, gives_reasons, schemas
-from crosscue.eval.runs.folder import (
-    MANIFEST,
-    UNATTRIBUTED,
-    Account,
+from crosscue.eval.runs.account import UNATTRIBUTED, Account, account, joined_accounts, reading_of
+from crosscue.eval.runs.candidates import candidate_rows
+from crosscue.eval.runs.folder import MANIFEST, RunFolder, write_manifest, write_timings
+from crosscue.eval.runs.logs import log_names, log_rows
+from crosscue.eval.runs.manifest import (
     ApproachRow,
     DetectManifest,
     EstimateCounts,
@@ -26,18 +27,10 @@ from crosscue.eval.runs.folder import (
     LandmarksUsed,
     LogRow,
     PoseSummary,
-    RunFolder,
     SceneSummary,
     Timings,
-    account,
-    candidate_rows,
-    joined_accounts,
     part_of,
-    reading_of,
-    write_manifest,
-    write_timings,
 )
-from crosscue.eval.runs.logs import log_names, log_rows
 from crosscue.eval.runs.tables import measurements
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.mobileye_tables import MobileyeSink, StoredMobileye
@@ -45,7 +38,9 @@ from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tables.pose_tables import PoseTally, pose_rows, pose_schema
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.localization.landmarks.database import LandmarkDatabase
-from crosscue.replay.base import Ledger, Log, Selection, sha256_of, versions_and_commit
+from crosscue.replay.base import Log, Selection
+from crosscue.replay.files.whole_file import sha256_of
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.signals.extractor import Extractor, probe_clocks
 from crosscue.replay.signals.kinds import Plan, Signal
 from crosscue.replay.signals.plan import camera_of, plan, with_pictures
@@ -59,6 +54,7 @@ from crosscue.replay.time.segments import (
 )
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.versions import versions_and_commit
 
 from .clocks import clock_changes, clock_rows
 from .drive_time import drive_timeline, refuse_other_segments, selections_of, time_segments

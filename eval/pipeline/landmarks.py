@@ -16,7 +16,9 @@ from crosscue.localization.landmarks.images import grey_of, picture_of
 from crosscue.localization.landmarks.sighting import Sighting
 from crosscue.localization.landmarks.update import LandmarkSearch, LandmarkSettings
 from crosscue.localization.pose_track import ACCEPTED
-from crosscue.replay.base import Block, Images, Int64s, Ledger, LogError, UsageError
+from crosscue.replay.columns import Block, Images, Int64s
+from crosscue.replay.errors import LogError, UsageError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 

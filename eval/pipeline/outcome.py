@@ -8,17 +8,11 @@ from typing import ClassVar
 
 from crosscue.detectors.runner import Counts
 from crosscue.eval.pipeline.scene.outcome import ApproachSummary, SceneOutcome
-from crosscue.eval.runs.folder import (
-    Account,
-    RunFolder,
-    account_lines,
-    candidate_lines,
-    candidate_rows,
-    details_of,
-    not_looked_lines,
-)
-from crosscue.replay.base import Ledger, visible
-from crosscue.replay.safe_text import terminal_width, wrapped
+from crosscue.eval.runs.account import Account, account_lines, details_of
+from crosscue.eval.runs.candidates import candidate_lines, candidate_rows, not_looked_lines
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.safe_text import terminal_width, visible, wrapped
 from crosscue.replay.time.segments import ONE_SEGMENT, Segment
 from crosscue.results import HIDDEN, Result, json_key
 

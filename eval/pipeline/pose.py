@@ -10,7 +10,8 @@ from typing import Final, Protocol
 import numpy as np
 
 from crosscue.datasets.geodesy import geodetic_to_enu
-from crosscue.eval.runs.folder import OWN_FRAME, Line, line
+from crosscue.eval.runs.account import Line, line
+from crosscue.eval.runs.manifest import OWN_FRAME
 from crosscue.eval.runs.tables.measurements import (
     gap_rows,
     heading_rows,
@@ -36,7 +37,8 @@ from crosscue.localization.pose_track import (
     TrackState,
 )
 from crosscue.localization.position_updates import PositionUpdates
-from crosscue.replay.base import Floats, Int64s, VehicleError
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import VehicleError
 from crosscue.replay.signals.kinds import Plan, Samples, Signal
 from crosscue.replay.signals.windows import Window
 from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Segment, Timeline

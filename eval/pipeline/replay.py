@@ -11,22 +11,20 @@ from typing import Final
 from crosscue.detectors.base import Choice
 from crosscue.detectors.registry import make
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
-from crosscue.eval.runs.folder import (
-    MANIFEST,
+from crosscue.eval.runs.folder import MANIFEST, RunFolder, clear, locked, staged, write_input
+from crosscue.eval.runs.logs import input_of, log_rows, refuse_another, reopened, settings_changed
+from crosscue.eval.runs.manifest import (
     DetectManifest,
     DriveManifest,
     EstimateManifest,
     LogRow,
-    RunFolder,
-    clear,
-    locked,
     part_of,
-    staged,
-    write_input,
 )
-from crosscue.eval.runs.logs import input_of, log_rows, refuse_another, reopened, settings_changed
 from crosscue.localization.landmarks.database import LandmarkDatabase
-from crosscue.replay.base import Log, RunError, Selection, Topic, UsageError, sha256_of
+from crosscue.replay.base import Log, Selection
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import RunError, UsageError
+from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
-from crosscue.eval.runs.folder import Manifest, RunFolder, json_schema
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.folder import open_run as open_folder
-from crosscue.replay.base import DEFAULT_LIMITS, LogError, RunError, UsageError, visible
-from crosscue.replay.limits import LimitsGiven
+from crosscue.eval.runs.manifest import Manifest, json_schema
+from crosscue.replay.errors import LogError, RunError, UsageError
+from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
+from crosscue.replay.safe_text import visible
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 from crosscue.results import Result, listing
 from crosscue.verb import Option

@@ -16,12 +16,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crosscue.detectors.images import Encoded
-from crosscue.eval.runs.folder import DriveManifest, RunFolder
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import DriveManifest
 from crosscue.eval.runs.moments import part_of
 from crosscue.eval.runs.stored_images import StoredCamera, camera_of, read_pictures
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges
-from crosscue.replay.base import Floats, door, spelled, write_whole
+from crosscue.replay.columns import Floats
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import spelled
+from crosscue.replay.files.whole_file import write_whole
 
 from .part import WHOLE, Part
 

@@ -19,7 +19,8 @@ from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.cues.tracked.judge import along, crossing, is_past, parked
 from crosscue.detectors.cues.tracked.motion import CarMotion
 from crosscue.eval.pipeline.scene.stage import EgoMotion, Restarts, place_of
-from crosscue.eval.runs.folder import DriveManifest, RunFolder
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import DriveManifest
 from crosscue.eval.runs.tables.stored_frames import StoredFrame
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.fusion.approaches import RangeRow

@@ -9,7 +9,7 @@ from typing import Final
 import rerun as rr
 
 from crosscue.detectors.images import Encoded, check, decode
-from crosscue.replay.base import LogFormatError
+from crosscue.replay.errors import LogFormatError
 
 from .columns import DriveTime
 

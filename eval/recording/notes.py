@@ -9,7 +9,7 @@ from typing import Final
 import rerun as rr
 
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.replay.base import visible
+from crosscue.replay.safe_text import visible
 
 COLOURS: Final = (
     "- camera: cars blue, stop signs red, traffic lights yellow, sign windows magenta, what is "

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from crosscue.eval.pipeline.run import PicturedRun, Run, run_given
 from crosscue.eval.runs.moments import TableFolder, approach_spans, moment_ns
-from crosscue.replay.base import CrosscueError, OutputError, UsageError
+from crosscue.replay.errors import CrosscueError, OutputError, UsageError
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option
 

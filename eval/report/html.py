@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from importlib.resources import files
 from pathlib import Path
 
-from crosscue.replay.base import write_text
+from crosscue.replay.files.whole_file import write_text
 
 
 def write_page(

@@ -7,7 +7,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from crosscue.eval.scoring.gates import GateResult
-from crosscue.replay.base import write_text
+from crosscue.replay.files.whole_file import write_text
 
 
 def write_junit(path: Path, results: Sequence[GateResult], suite: str) -> None:

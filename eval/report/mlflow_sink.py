@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.base import OutputError, UsageError, one_line, valid_text
+from crosscue.replay.errors import OutputError, UsageError, one_line
+from crosscue.replay.files.tree_text import valid_text
 
 # Max number of metrics in one request.
 MAX_METRICS: Final = 1000

@@ -13,22 +13,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.eval.runs.folder import (
-    CandidateRow,
-    DriveManifest,
-    EstimateManifest,
-    candidate_lines,
-    not_looked_lines,
-)
+from crosscue.eval.runs.candidates import CandidateRow, candidate_lines, not_looked_lines
+from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest
 from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.drives import Scores
 from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.runs import RunScored
-from crosscue.replay.base import (
-    door,
-    spelled,
-    strict_json,
-)
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import spelled, strict_json
 from crosscue.replay.vehicle.cue_table import CUES
 
 from .html import write_page

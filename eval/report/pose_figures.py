@@ -12,7 +12,8 @@ import numpy as np
 from crosscue.eval.runs.tables.log_time import broken_at
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.scoring.pose.score import ScoredPoses
-from crosscue.replay.base import Floats, write_whole
+from crosscue.replay.columns import Floats
+from crosscue.replay.files.whole_file import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

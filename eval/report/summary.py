@@ -18,7 +18,7 @@ from crosscue.eval.scoring.scene.approaches import ApproachScore
 from crosscue.eval.scoring.scene.belief import BeliefScore
 from crosscue.eval.scoring.scene.cues import CueScore
 from crosscue.eval.scoring.scene.ranges import RangeScore
-from crosscue.replay.base import visible
+from crosscue.replay.safe_text import visible
 
 WIDTH: Final = 80
 LABEL: Final = 11

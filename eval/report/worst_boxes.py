@@ -15,7 +15,8 @@ from crosscue.detectors.overlay import GREEN, write_label
 from crosscue.eval.runs.stored_images import StoredCamera, camera_of, picture_at
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun
 from crosscue.eval.scoring.boxes.matching import match
-from crosscue.replay.base import Bytes, CrosscueError, Floats
+from crosscue.replay.columns import Bytes, Floats
+from crosscue.replay.errors import CrosscueError
 
 # Pictures closer in time than this show the same mistakes, so only the worst is shown.
 APART_NS: Final = 1_000_000_000

@@ -18,15 +18,9 @@ from typing import Final, Protocol
 
 from pydantic import Field
 
-from crosscue.replay.base import (
-    CHANGED,
-    DIFFERS,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    AccountError,
-    Ledger,
-)
-from crosscue.replay.base import TopicAccount as Counted
+from crosscue.replay.errors import AccountError
+from crosscue.replay.ledger import CHANGED, DIFFERS, NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.ledger import TopicAccount as Counted
 
 from .record import Record
 

@@ -17,32 +17,23 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.detectors.base import Choice
-from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, LogRow, RunFolder, part_of
-from crosscue.replay.base import (
-    CrosscueError,
-    Log,
-    Selection,
-    UnreadableRunError,
-    UsageError,
-    door,
-    file_sha256,
-    is_remote,
-    json_tree,
-    origin,
-    sha256_of,
-    spelled,
-    strict_json,
-    unspelled,
-    versions,
-)
+from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, RunFolder
+from crosscue.replay.base import Log, Selection, origin
+from crosscue.replay.errors import CrosscueError, UnreadableRunError, UsageError
+from crosscue.replay.files import door
 from crosscue.replay.files.identity import identity_of, identity_of_all, identity_of_log
 from crosscue.replay.files.log_identity import as_row, of_row
 from crosscue.replay.files.made_of import SIMULATED, difference
+from crosscue.replay.files.tree_text import json_tree, spelled, strict_json, unspelled
+from crosscue.replay.files.whole_file import file_sha256, sha256_of
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.remote.address import LogAddress
+from crosscue.replay.remote.address import LogAddress, is_remote
 from crosscue.replay.remote.logs import RangedLog
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.versions import versions
+
+from .manifest import LogRow, part_of
 
 # Max depth of folders searched for logs that have moved.
 DEPTH: Final = 8

@@ -15,9 +15,10 @@ from typing import Annotated, Any, Final, Literal, Self, TypeAlias
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError
 
-from crosscue.replay.base import Selection, json_tree
+from crosscue.replay.base import Selection
 from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.files.log_identity import Identity
+from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.time.segments import LogClock, Segment, Timeline
 from crosscue.replay.vehicle.section import tuples
 from crosscue.replay.vehicle.vehicle import Vehicle

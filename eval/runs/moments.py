@@ -8,9 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from crosscue.replay.base import UnreadableRunError, UsageError
+from crosscue.replay.errors import UnreadableRunError, UsageError
 
-from .folder import RunFolder, TableFolder
+from .folder import RunFolder
+from .tables.parquet import TableFolder
 
 if TYPE_CHECKING:
     import pyarrow as pa

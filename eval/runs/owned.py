@@ -11,14 +11,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final, TypeAlias
 
-from crosscue.replay.base import (
-    UsageError,
-    door,
-    json_tree,
-    strict_json,
-    visible,
-    write_text,
-)
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.safe_text import visible
 
 MAX_LIST_BYTES: Final = 256 << 20
 # Max number of files named in an error.

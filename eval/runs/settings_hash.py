@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from functools import lru_cache
 
-from crosscue.replay.base import json_tree
+from crosscue.replay.files.tree_text import json_tree
 
 
 def settings_sha256(settings: object, detectors: object, selection: object) -> str:

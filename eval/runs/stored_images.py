@@ -10,21 +10,13 @@ from typing import Final
 import numpy as np
 
 from crosscue.detectors.images import Encoded, encoded, lose
-from crosscue.eval.runs.folder import DetectManifest, RunFolder
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    Block,
-    Images,
-    Ledger,
-    Limits,
-    LogError,
-    RunError,
-    Selection,
-    Topic,
-    UnreadableRunError,
-    warn_of,
-)
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.replay.base import Selection
 from crosscue.replay.clocks.clock import Clock
+from crosscue.replay.columns import Block, Images, Topic
+from crosscue.replay.errors import LogError, RunError, UnreadableRunError
+from crosscue.replay.ledger import Ledger, warn_of
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Source
@@ -32,6 +24,7 @@ from crosscue.replay.time.segments import UNSHIFTED, LogClock, TimedLog
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .logs import place_of
+from .manifest import DetectManifest
 
 # Max difference between a picture's own clock and the log's.
 AROUND_NS: Final = 2_000_000_000

@@ -13,7 +13,10 @@ from typing import Annotated, Final, Literal
 
 from pydantic import StringConstraints, ValidationError
 
-from crosscue.replay.base import UnreadableRunError, UsageError, door, strict_json, write_text
+from crosscue.replay.errors import UnreadableRunError, UsageError
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
 
 from .folder import TAGS
 from .record import Record

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crosscue.replay.base import strict_json, write_table, write_text
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_table, write_text
 
 from .by_drive import BY_DRIVE, DriveMetric, parts_of, table_of
 from .by_drive import FOLDER as FOLDER

@@ -22,7 +22,10 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from crosscue.replay.base import MIB, UsageError, read_at_most, toml_tree
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import toml_tree
+from crosscue.replay.limits import MIB
 from crosscue.replay.vehicle.validation_errors import explain
 
 from .metric_values import MetricValue

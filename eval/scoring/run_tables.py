@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import LABELS, table_in_log_time
-from crosscue.replay.base import Floats, Int64s, UnreadableRunError
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import UnreadableRunError
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.fusion import NOT_FEATURES
 

@@ -11,19 +11,14 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from crosscue.datasets.truth.truth import FILE, Truth
-from crosscue.eval.runs.folder import (
-    Line,
-    LogRow,
-    RunFolder,
-    ScoredAccount,
-    SummedAccount,
-    check,
-    line,
-    summed,
-)
+from crosscue.eval.runs.account import Line, ScoredAccount, SummedAccount, check, line, summed
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.logs import place_of
+from crosscue.eval.runs.manifest import LogRow
 from crosscue.eval.runs.tables.travelled import odometer_of
-from crosscue.replay.base import RunError, SchemaError, UsageError, is_remote, spelled
+from crosscue.replay.errors import RunError, SchemaError, UsageError
+from crosscue.replay.files.tree_text import spelled
+from crosscue.replay.remote.address import is_remote
 
 from . import intervals
 from . import truth as score_truth

@@ -13,7 +13,9 @@ import numpy as np
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.truth import Approach, CueTruth, Truth
 from crosscue.datasets.truth.tum import read_tum
-from crosscue.replay.base import MIB, AnnotationError, Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import AnnotationError
+from crosscue.replay.limits import MIB
 
 from .columns import NONE
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import door, write_text
+from crosscue.replay.files import door
+from crosscue.replay.files.whole_file import write_text
 
 HEAD: Final = """\
 <meta charset="utf-8">

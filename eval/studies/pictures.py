@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.replay.base import write_whole
+from crosscue.replay.files.whole_file import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

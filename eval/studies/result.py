@@ -6,7 +6,8 @@ from abc import abstractmethod
 from pathlib import Path
 from typing import Any
 
-from crosscue.replay.base import door, json_tree
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree
 from crosscue.results import Result
 
 

@@ -28,9 +28,12 @@ from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import create
-from crosscue.replay.base import EVERYTHING, door, versions, write_text
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.files import door
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
+from crosscue.replay.versions import versions
 
 LOG: Final = "drive.mcap"
 VEHICLE: Final = "vehicle.toml"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from crosscue.detectors.training.job import read_curve
-from crosscue.replay.base import write_whole
+from crosscue.replay.files.whole_file import write_whole
 
 
 def draw_curve(curve: Path, picture: Path) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 from crosscue.datasets.scenes.layout import SCORED
-from crosscue.replay.base import UsageError, write_text
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.whole_file import write_text
 
 Device: TypeAlias = Literal["auto", "cpu", "cuda", "mps"]
 # Max number of layouts of a command, far more than can be rendered in practice.

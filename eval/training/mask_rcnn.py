@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, over
 
 from crosscue.detectors.training.summary import measured_text, measured_tree
 from crosscue.eval.training.inputs import Device, check_place
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 from crosscue.replay.files.made_of import made_of
 from crosscue.replay.progress import Progress, emit
 from crosscue.results import HIDDEN, Result

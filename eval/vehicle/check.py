@@ -10,18 +10,10 @@ from typing import Final
 import numpy as np
 
 from crosscue.detectors.images import decode, encoded, lose
-from crosscue.replay.base import (
-    Bytes,
-    Floats,
-    Int64s,
-    Ledger,
-    Log,
-    LogError,
-    Selection,
-    Topic,
-    name_of,
-    warn_of,
-)
+from crosscue.replay.base import Log, Selection, name_of
+from crosscue.replay.columns import Bytes, Floats, Int64s, Topic
+from crosscue.replay.errors import LogError
+from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.signals.extractor import Extractor, pictures_of
 from crosscue.replay.signals.kinds import Plan, Samples, Signal
 from crosscue.replay.signals.plan import camera_of, plan

@@ -12,7 +12,9 @@ import cv2
 import numpy as np
 
 from crosscue.eval.report.html import write_page
-from crosscue.replay.base import Bytes, OutputError, UsageError, write_bytes
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import OutputError, UsageError
+from crosscue.replay.files.whole_file import write_bytes
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .check import Checked

@@ -10,8 +10,9 @@ from typing import Annotated
 
 from crosscue.eval.logs.log import WholeDriveGiven, opened
 from crosscue.eval.vehicle.mounting import estimate_mounting
-from crosscue.replay.base import OutputError, UsageError, write_text
 from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.errors import OutputError, UsageError
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.vehicle.drafting.camera import Measured, Mounting, camera_of
 from crosscue.replay.vehicle.drafting.text import Examined, draft, examine
 from crosscue.replay.vehicle.vehicle import Vehicle, parse

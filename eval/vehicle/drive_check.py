@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from crosscue.eval.logs.log import WholeDriveGiven, opened
-from crosscue.replay.base import EmptyResultError, UsageError, name_of
+from crosscue.replay.base import name_of
+from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result, json_key, listing
 from crosscue.verb import Option

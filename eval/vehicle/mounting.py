@@ -11,17 +11,10 @@ import numpy as np
 from crosscue.detectors.base import View
 from crosscue.detectors.images import decode, encoded, lose
 from crosscue.detectors.ranging.travel_direction import Travel, travel_between
-from crosscue.replay.base import (
-    EVERYTHING,
-    Bytes,
-    Floats,
-    Images,
-    Ledger,
-    Log,
-    LogError,
-    name_of,
-    warn_of,
-)
+from crosscue.replay.base import EVERYTHING, Log, name_of
+from crosscue.replay.columns import Bytes, Floats, Images
+from crosscue.replay.errors import LogError
+from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.vehicle.drafting.camera import Intrinsics, Measured
 from crosscue.replay.vehicle.drafting.series import Series

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from crosscue.localization.angles import circular_mean, wrap_all
 from crosscue.localization.compass import IDENTITY, CompassSettings, Vector, heading, level_field
-from crosscue.replay.base import Floats, Int64s, VehicleError
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import VehicleError
 
 Complexes: TypeAlias = NDArray[np.complex128]
 

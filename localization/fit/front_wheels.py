@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.localization.odometry import Increments, OdometrySettings, WheelSpeeds
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 PIECES: Final = 10
 MIN_ROWS: Final = 10 * PIECES

@@ -29,7 +29,8 @@ from crosscue.localization.fit.front_wheels import front_wheels
 from crosscue.localization.fit.known_drive import GATE_NIS, KnownDrive, Steps, whitened
 from crosscue.localization.odometry import OdometrySettings
 from crosscue.localization.pose_filter import State
-from crosscue.replay.base import Floats, VehicleError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import VehicleError
 
 if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult

@@ -24,7 +24,8 @@ from typing import Final, NamedTuple, Self, cast
 
 import numpy as np
 
-from crosscue.replay.base import Floats, LogError, OutputError, UsageError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import LogError, OutputError, UsageError
 
 from .features import Features
 from .file import (

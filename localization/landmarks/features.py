@@ -15,7 +15,8 @@ from typing import Final, NamedTuple, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Bytes, UsageError
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import UsageError
 
 MATCHERS: Final[Mapping[str, str]] = {
     "orb": "crosscue.localization.landmarks.matcher:orb",

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
-from crosscue.replay.base import LogError, LogFormatError, OutputError, cannot_write
+from crosscue.replay.errors import LogError, LogFormatError, OutputError
+from crosscue.replay.files.whole_file import cannot_write
 
 # ``CCLM`` in the file's header.
 APPLICATION_ID: Final = 0x43434C4D

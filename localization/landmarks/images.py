@@ -8,7 +8,9 @@ from typing import Final
 
 from crosscue.detectors.base import View
 from crosscue.detectors.images import Encoded, decode, encoded, read_file
-from crosscue.replay.base import DEFAULT_LIMITS, Bytes, Images, Limits, LogError
+from crosscue.replay.columns import Bytes, Images
+from crosscue.replay.errors import LogError
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 GREY: Final = View(is_grey=True)
 

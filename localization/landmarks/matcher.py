@@ -16,7 +16,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Bytes, UsageError
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import UsageError
 
 from .features import CameraGeometry, Features, Match
 

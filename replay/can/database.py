@@ -14,14 +14,8 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    CanDatabaseError,
-    Limits,
-    LogTooLargeError,
-    SchemaError,
-    one_line,
-)
+from crosscue.replay.errors import CanDatabaseError, LogTooLargeError, SchemaError, one_line
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 from .dbc_text import read_dbc
 from .extract import Extractor

@@ -15,18 +15,17 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import (
+from crosscue.replay.columns import (
     DATA,
     ERROR,
     LENGTH_UNKNOWN,
-    NOT_ASKED_TOPIC,
     REMOTE,
     Block,
     CanFrames,
     Int64s,
-    Ledger,
     Table,
 )
+from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
 
 from .database import CanDatabase, spell_id
 from .extract import PRESENT_SUFFIX, Extractor

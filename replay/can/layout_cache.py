@@ -22,7 +22,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, overload
 
-from crosscue.replay.base import MIB, door, json_tree
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.limits import MIB
 
 from .layout import CanMessage, CanSignal
 from .sources import DatabaseText

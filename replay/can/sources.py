@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import MIB, CanDatabaseError, Limits, LogTooLargeError, read_at_most
+from crosscue.replay.errors import CanDatabaseError, LogTooLargeError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.limits import MIB, Limits
 
 # Upper bound on the bits of a message; the longest multi-packet message has 1785 bytes.
 _MAX_BITS: Final = 8 * 2048

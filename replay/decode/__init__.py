@@ -11,7 +11,8 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Final, Protocol, cast
 
-from crosscue.replay.base import Block, Ledger, Topic
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.ledger import Ledger
 
 from .interfaces import is_feedback, is_service_event
 

@@ -13,17 +13,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    Block,
-    Ledger,
-    Messages,
-    SchemaError,
-    Table,
-    Topic,
-    json_tree,
-    one_line,
-)
+from crosscue.replay.columns import Block, Messages, Table, Topic
+from crosscue.replay.errors import SchemaError, one_line
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS
 
 from .coding import MAGIC_BYTES
 from .foxglove import PICTURES, TABLES, Picture, Source

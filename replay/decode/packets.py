@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, Images, Ledger, Messages, one_line
+from crosscue.replay.columns import Block, Images, Messages
+from crosscue.replay.errors import one_line
+from crosscue.replay.ledger import Ledger
 
 if TYPE_CHECKING:
     from av import VideoFrame

@@ -7,8 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, Bytes, ImageCoding, Images, Ledger, Messages
+from crosscue.replay.columns import Block, Bytes, ImageCoding, Images, Messages
 from crosscue.replay.decode.ros.standard import MAX_SIDE_PX
+from crosscue.replay.ledger import Ledger
 
 from .coding import STREAMS, coding_of
 from .foxglove import Picture

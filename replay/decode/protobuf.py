@@ -23,16 +23,10 @@ from google.protobuf.descriptor import (  # type: ignore[import-untyped]
 from google.protobuf.message import DecodeError, Message  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    Block,
-    Ledger,
-    Messages,
-    SchemaError,
-    Table,
-    Topic,
-    one_line,
-)
+from crosscue.replay.columns import Block, Messages, Table, Topic
+from crosscue.replay.errors import SchemaError, one_line
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS
 
 from .coding import MAGIC_BYTES
 from .foxglove import PICTURES, TABLES, Picture, Source

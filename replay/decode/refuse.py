@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from crosscue.replay.base import Block, Ledger
+from crosscue.replay.columns import Block
+from crosscue.replay.ledger import Ledger
 
 MISFIT: Final = "does not fit its schema"
 WRONG_CODING: Final = "CDR representation not supported"

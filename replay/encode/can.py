@@ -12,8 +12,9 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Ledger
+from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames
 from crosscue.replay.decode.ros.plan import Plan
+from crosscue.replay.ledger import Ledger
 
 from .outgoing import Outgoing, Ros2Type, own_type, stamps, standard_type, with_rows
 from .template import filled, template_of

@@ -7,7 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, Images, Int64s, Ledger, Messages
+from crosscue.replay.columns import Block, Images, Int64s, Messages
+from crosscue.replay.ledger import Ledger
 
 from .outgoing import Outgoing, stamps, standard_type
 from .template import ENCAPSULATION

@@ -8,9 +8,11 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from crosscue.replay.base import Block, Bytes, Int64s, Ledger, Messages, SchemaError
+from crosscue.replay.columns import Block, Bytes, Int64s, Messages
 from crosscue.replay.decode.ros.definition import Definitions, definitions_of, well_known
 from crosscue.replay.decode.ros.plan import Plan, plan_of
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
 
 from .definitions import standard_text, text_of
 

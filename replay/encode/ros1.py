@@ -12,12 +12,14 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Block, Bytes, Int64s, Ledger, Messages, SchemaError, Topic
+from crosscue.replay.columns import Block, Bytes, Int64s, Messages, Topic
 from crosscue.replay.decode.refuse import MISFIT, refuse
 from crosscue.replay.decode.ros.definition import definitions_of
 from crosscue.replay.decode.ros.plan import Items, Plan, Run, Text, jumped, plan_of
 from crosscue.replay.decode.ros.type_names import ros2_spelling
 from crosscue.replay.decode.ros.walk import Bools, Cursor, Found, Rows, Walker
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
 
 from .copy_ranges import copy_ranges
 from .definitions import as_ros2, differs_in_ros2, text_of

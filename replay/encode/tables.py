@@ -14,9 +14,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Block, Ledger, Table
+from crosscue.replay.columns import Block, Table
 from crosscue.replay.decode.ros.paths import quat, xyz
 from crosscue.replay.decode.ros.plan import Plan
+from crosscue.replay.ledger import Ledger
 
 from .outgoing import Outgoing, Ros2Type, own_type, stamps, standard_type, with_rows
 from .template import filled, template_of

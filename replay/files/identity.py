@@ -26,11 +26,15 @@ from contextlib import closing, suppress
 from pathlib import Path, PurePosixPath
 from typing import Final, Protocol
 
-from crosscue.replay.base import MIB, Log, LogError, is_remote, spelled
+from crosscue.replay.base import Log
+from crosscue.replay.errors import LogError
 from crosscue.replay.files.log_identity import Identity
-from crosscue.replay.remote.address import LogAddress
+from crosscue.replay.limits import MIB
+from crosscue.replay.remote.address import LogAddress, is_remote
 from crosscue.replay.remote.logs import RangedLog, RemoteFiles, by_ranges, fetch
 from crosscue.replay.remote.ranges import RangedFile
+
+from .tree_text import spelled
 
 SHARE_BYTES: Final = 4 * MIB
 MIN_BYTES: Final = 64 << 10

@@ -11,10 +11,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.base import UsageError, json_tree, strict_json
+from crosscue.replay.errors import UsageError
 from crosscue.replay.files.log_identity import as_row, of_row
 
 from .identity import identity_of, identity_of_all
+from .tree_text import json_tree, strict_json
 
 # File that `simulate` writes next to a log: it marks the log as simulated, with its settings.
 SIMULATED: Final = "simulated.json"

@@ -15,16 +15,11 @@ from typing import Any, Final, Protocol
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
-from crosscue.replay.base import (
-    MIB,
-    CrosscueError,
-    UsageError,
-    cannot_write,
-    door,
-    file_sha256,
-    one_line,
-    write_whole,
-)
+from crosscue.replay.errors import CrosscueError, UsageError, one_line
+from crosscue.replay.limits import MIB
+
+from . import door
+from .whole_file import cannot_write, file_sha256, write_whole
 
 TIMEOUT_S: Final = 30.0
 _PARTIAL: Final = 206

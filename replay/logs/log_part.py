@@ -8,7 +8,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
-from crosscue.replay.base import Ledger, Log, MissingTopicError, Selection, UsageError, name_of
+from crosscue.replay.base import Log, Selection, name_of
+from crosscue.replay.errors import MissingTopicError, UsageError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.remote.logs import RangedLog
 from crosscue.verb import Option
 

@@ -12,21 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.replay.base import (
-    EVERYTHING,
-    Block,
-    CanFrames,
-    Detail,
-    Ledger,
-    Log,
-    Messages,
-    SchemaError,
-    Selection,
-    Topic,
-    TopicAccount,
-    name_of,
-    report_missing,
-)
+from crosscue.replay.base import EVERYTHING, Log, Selection, name_of, report_missing
 from crosscue.replay.clocks.findings import (
     ROWS_FOR_OFFSET,
     apart,
@@ -35,6 +21,9 @@ from crosscue.replay.clocks.findings import (
     instant_text,
 )
 from crosscue.replay.clocks.reports import ClockReport, ClockWatch
+from crosscue.replay.columns import Block, CanFrames, Messages, Topic
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Detail, Ledger, TopicAccount
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.seal.log import sealed_sentence
 from crosscue.replay.vehicle.roles import Role, role_of

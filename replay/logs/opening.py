@@ -8,18 +8,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import cast
 
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    CrosscueError,
-    Ledger,
-    Limits,
-    Log,
-    LogError,
-    MissingTopicError,
-    name_of,
-)
+from crosscue.replay.base import Log, name_of
+from crosscue.replay.errors import CrosscueError, LogError, MissingTopicError
 from crosscue.replay.files.identity import link_of_log
 from crosscue.replay.formats import FORMATS, format_of, known_formats
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 
 def open_log(path: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:

@@ -11,18 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import (
-    Block,
-    CanFrames,
-    Ledger,
-    Log,
-    Selection,
-    Table,
-    Topic,
-    UsageError,
-    name_of,
-)
+from crosscue.replay.base import Log, Selection, name_of
+from crosscue.replay.columns import Block, CanFrames, Table, Topic
 from crosscue.replay.decode import decoder_for
+from crosscue.replay.errors import UsageError
+from crosscue.replay.ledger import Ledger
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,8 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import SchemaError, toml_tree
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.files.tree_text import toml_tree
 
 Column: TypeAlias = NDArray[np.generic]
 # Columns of a message's fields, or of a table, by name.

@@ -7,7 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, CanFrames, Floats, Ledger, Table
+from crosscue.replay.columns import Block, CanFrames, Floats, Table
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.ros.reader import RosMobileye

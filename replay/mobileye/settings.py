@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias
 
-from crosscue.replay.base import Ledger
+from crosscue.replay.ledger import Ledger
 
 from .geometry import AT_REAR_AXLE, Mounting
 

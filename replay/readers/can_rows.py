@@ -9,17 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import (
-    BLOCK_ROWS,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    CanFrames,
-    Int64s,
-    Ledger,
-    Selection,
-    Topic,
-)
+from crosscue.replay.base import Selection
+from crosscue.replay.columns import BLOCK_ROWS, Block, CanFrames, Int64s, Topic
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 
 # Maximum number of buses of a log; more names are a sign of damage.
 BUSES_MAX: Final = 256

@@ -8,19 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple, Protocol
 
-from crosscue.replay.base import (
-    EVERYTHING,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Closing,
-    Int64s,
-    Ledger,
-    Limits,
-    Selection,
-    Table,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block, Int64s, Table, Topic
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.images.files import PictureFiles
 from crosscue.replay.seal.touched import Touched
 

@@ -9,18 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import (
-    BLOCK_ROWS,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Bytes,
-    Int64s,
-    Ledger,
-    Limits,
-    Messages,
-    Selection,
-)
+from crosscue.replay.base import Selection
+from crosscue.replay.columns import BLOCK_ROWS, Block, Bytes, Int64s, Messages
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
 
 TOO_LARGE: Final = "message over the size limit"
 

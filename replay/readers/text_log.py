@@ -10,18 +10,10 @@ from typing import Final, TextIO, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.base import (
-    BLOCK_ROWS,
-    EVERYTHING,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Closing,
-    Ledger,
-    Selection,
-    Table,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import BLOCK_ROWS, Block, Table, Topic
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 
 # Maximum length of a line, which bounds memory; a longer line is not a row of numbers.
 MAX_LINE: Final = 4096

@@ -32,7 +32,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from crosscue.replay.base import Int64s, Limits, LogFormatError, LogTooLargeError, read_at_most
+from crosscue.replay.columns import Int64s
+from crosscue.replay.errors import LogFormatError, LogTooLargeError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.limits import Limits
 
 SECOND_NS: Final = 1_000_000_000
 _LATEST_NS: Final = 1 << 62

@@ -21,7 +21,8 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Int64s, LogFormatError
+from crosscue.replay.columns import Int64s
+from crosscue.replay.errors import LogFormatError
 
 from .time_file import TimeFile
 

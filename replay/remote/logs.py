@@ -22,28 +22,23 @@ from importlib import import_module
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, Final, Protocol, TypeVar, cast
 
-from crosscue.replay.base import (
-    EVERYTHING,
-    Block,
-    Closing,
+from crosscue.replay.base import EVERYTHING, KnowsItsEnd, Log, Selection, WrappedLog
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.errors import (
     CrosscueError,
-    KnowsItsEnd,
-    Ledger,
-    Limits,
-    Log,
     LogError,
     LogTooLargeError,
     OutputError,
-    Selection,
-    Topic,
     UsageError,
-    WrappedLog,
-    cannot_write,
-    door,
     one_line,
 )
+from crosscue.replay.files import door
+from crosscue.replay.files.closing import Closing
 from crosscue.replay.files.partial_file import is_still
+from crosscue.replay.files.whole_file import cannot_write
 from crosscue.replay.formats import has_known_suffix, unknown_format
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
 
 from .address import LogAddress
 from .ranges import RangedFile, Spool

@@ -12,17 +12,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, Protocol, runtime_checkable
 
-from crosscue.replay.base import (
-    CHANGED,
-    DIFFERS,
-    EVERYTHING,
-    Block,
-    Ledger,
-    Log,
-    LogError,
-    Selection,
-    WrappedLog,
-)
+from crosscue.replay.base import EVERYTHING, Log, Selection, WrappedLog
+from crosscue.replay.columns import Block
+from crosscue.replay.errors import LogError
+from crosscue.replay.ledger import CHANGED, DIFFERS, Ledger
 
 from .seal import HASH, Check, Seal, seal_over, seal_path
 from .touched import Blocks, Touched

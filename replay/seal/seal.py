@@ -20,15 +20,10 @@ from typing import Any, Final
 
 import xxhash
 
-from crosscue.replay.base import (
-    MIB,
-    LogError,
-    OutputError,
-    door,
-    json_tree,
-    one_line,
-    spelled,
-)
+from crosscue.replay.errors import LogError, OutputError, one_line
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree, spelled
+from crosscue.replay.limits import MIB
 
 SUFFIX: Final = ".seal"
 KIND: Final = "crosscue seal"
@@ -241,14 +236,14 @@ def write_seal(log: Path, seal: Seal, *, overwrite: bool) -> bool:
             f"{path}: the log differs from its seal of {kept.sealed_at}; see "
             f"'crosscue seal --check {log}', and use --overwrite only if the log is correct"
         )
-    from crosscue.replay.base import write_text
+    from crosscue.replay.files.whole_file import write_text
 
     write_text(path, _as_text(seal))
     return True
 
 
 def _as_text(seal: Seal) -> str:
-    from crosscue.replay.base import strict_json
+    from crosscue.replay.files.tree_text import strict_json
 
     tree = {
         "kind": KIND,

@@ -8,9 +8,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import Block, Ledger, VehicleError
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder
+from crosscue.replay.columns import Block
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.admit import all_ids
 from crosscue.replay.mobileye.samples import settings_of
 from crosscue.replay.vehicle.vehicle import Vehicle

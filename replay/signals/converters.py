@@ -8,7 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, Floats, Int64s, Ledger, Table, VehicleError
+from crosscue.replay.columns import Block, Floats, Int64s, Table
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.vehicle import AngleSignal
 
 from .kinds import Samples, Signal

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, cast
 
 import numpy as np
 
-from crosscue.replay.base import Block, Images, Int64s, Ledger, Log, Selection, Topic
+from crosscue.replay.base import Log, Selection
 from crosscue.replay.clocks.clock import Clock, times_of
 from crosscue.replay.clocks.reports import MAX_OFFSET_NS, ClockWatch
+from crosscue.replay.columns import Block, Images, Int64s, Topic
 from crosscue.replay.decode import Decoder, decoder_for
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 

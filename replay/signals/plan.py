@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from crosscue.replay.base import MissingTopicError, Topic, VehicleError
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import MissingTopicError, VehicleError
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 

@@ -13,7 +13,9 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from crosscue.replay.base import Block, Ledger, Readable, Selection
+from crosscue.replay.base import Readable, Selection
+from crosscue.replay.columns import Block
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.signals.kinds import Plan, Samples, Signal
 
 WIDTH_NS: Final = 1_000_000_000

@@ -15,7 +15,9 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.base import Block, Ledger, Log, Selection
+from crosscue.replay.base import Log, Selection
+from crosscue.replay.columns import Block
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.signals.kinds import Plan, Samples, Signal, Source
 from crosscue.replay.vehicle.vehicle import Vehicle
 

@@ -21,8 +21,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import EVERYTHING, Block, Int64s, Ledger, Log, Selection
-from crosscue.replay.ledger import ReversedTimes
+from crosscue.replay.base import EVERYTHING, Log, Selection
+from crosscue.replay.columns import Block, Int64s
+from crosscue.replay.ledger import Ledger, ReversedTimes
 
 STRAY_STAMP: Final = "stray time stamp"
 BEGINNING: Final = int(np.iinfo(np.int64).min)

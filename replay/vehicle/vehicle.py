@@ -17,7 +17,10 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from crosscue.replay.base import MIB, VehicleError, read_at_most, toml_tree, unspelled
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import toml_tree, unspelled
+from crosscue.replay.limits import MIB
 
 from .camera import Camera as Camera
 from .cue_spec import CueSpec as CueSpec

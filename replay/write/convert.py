@@ -12,16 +12,7 @@ from typing import Final, Protocol, Self, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import (
-    Block,
-    CanFrames,
-    Images,
-    Ledger,
-    Messages,
-    SchemaError,
-    Table,
-    Topic,
-)
+from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.decode.ros.definition import definitions_of
@@ -32,6 +23,8 @@ from crosscue.replay.encode.images import image_messages
 from crosscue.replay.encode.outgoing import Encoder, Outgoing, Ros2Type, without_odd_times
 from crosscue.replay.encode.ros1 import ros1_to_cdr
 from crosscue.replay.encode.tables import OwnTypes, table_messages
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.roles import OF_TABLES
 
 from .mcap import Compression, McapWriter, Stretch

@@ -18,8 +18,10 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Int64s, Messages, OutputError, cannot_write
+from crosscue.replay.columns import Int64s, Messages
+from crosscue.replay.errors import OutputError
 from crosscue.replay.files.partial_file import PartialFile
+from crosscue.replay.files.whole_file import cannot_write
 from crosscue.replay.readers.mcap.records import CONVERTED_FROM
 
 LIBRARY: Final = "crosscue"

@@ -18,7 +18,8 @@ from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.detectors.images import MAX_PIXELS
 from crosscue.eval import cli
 from crosscue.localization.landmarks.database import LandmarkWriter
-from crosscue.replay.base import MIB, Floats
+from crosscue.replay.columns import Floats
+from crosscue.replay.limits import MIB
 from support.every_format import EVERY_FORMAT
 from support.failures import table_of_failures
 from support.gap_drive import BEGIN, SIZE, Clock, replayed, write_drive

@@ -12,7 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from crosscue.eval import cli
-from crosscue.eval.runs.folder import DetectorRow, EstimateManifest, open_run
+from crosscue.eval.runs.folder import open_run
+from crosscue.eval.runs.manifest import DetectorRow, EstimateManifest
 from support.onnx_models import constant_model
 from support.pictures import picture_folder
 

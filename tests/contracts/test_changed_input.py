@@ -12,8 +12,9 @@ from crosscue.datasets.scenes.drive import MADE_OF
 from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval import cli
-from crosscue.replay.base import OutputError, strict_json
+from crosscue.replay.errors import OutputError
 from crosscue.replay.files.made_of import made_of
+from crosscue.replay.files.tree_text import strict_json
 from support.pictures import picture
 from support.scenes import shorten
 from support.trees import tree

@@ -12,7 +12,7 @@ from typing import Final
 import pytest
 
 from crosscue.eval import cli
-from crosscue.replay.base import one_line
+from crosscue.replay.errors import one_line
 
 # Exit status for an unreadable recording, run, database, picture or annotation file.
 INPUT: Final = 4

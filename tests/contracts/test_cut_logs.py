@@ -7,8 +7,10 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval import cli
-from crosscue.replay.base import Ledger, LogError, report_missing
+from crosscue.replay.base import report_missing
+from crosscue.replay.errors import LogError
 from crosscue.replay.formats import FORMATS
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from support.accounted import read
 from support.every_format import EVERY_FORMAT

@@ -23,7 +23,7 @@ import crosscue
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.runs.logs import place_of
-from crosscue.replay.base import spelled, unspelled
+from crosscue.replay.files.tree_text import spelled, unspelled
 from support.gap_drive import VEHICLE, Clock, write_drive
 
 HOSTILE: Final[dict[str, bytes]] = {

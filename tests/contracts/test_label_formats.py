@@ -10,7 +10,7 @@ import pytest
 
 from crosscue.datasets.labels.table import LABEL_FORMATS, read_labels
 from crosscue.datasets.truth.annotations import Annotations, Picture, Thing, time_in_name
-from crosscue.replay.base import CrosscueError, UsageError
+from crosscue.replay.errors import CrosscueError, UsageError
 
 T_NS: Final = 1_700_000_000_123_456_789
 SIZE: Final = (1280, 719)

@@ -9,8 +9,9 @@ from typing import Final
 import pytest
 
 from crosscue.eval import cli
-from crosscue.replay.base import Limits, LogError
+from crosscue.replay.errors import LogError
 from crosscue.replay.formats import FORMATS
+from crosscue.replay.limits import Limits
 from crosscue.replay.logs.opening import open_log
 from support.every_format import EVERY_FORMAT
 from support.pictures import picture_folder

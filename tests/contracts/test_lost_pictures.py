@@ -19,7 +19,7 @@ import pytest
 from crosscue.eval import cli
 from crosscue.eval.vehicle.mounting import estimate_mounting
 from crosscue.localization.landmarks.database import LandmarkWriter
-from crosscue.replay.base import Images, Int64s
+from crosscue.replay.columns import Images, Int64s
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.losses import losses_heard
 from crosscue.replay.vehicle.drafting.camera import Intrinsics

@@ -7,8 +7,8 @@ from typing import Final
 
 import pytest
 
-from crosscue.replay.base import Ledger
 from crosscue.replay.formats import FORMATS
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.testing import check_reader
 from support.every_format import EVERY_FORMAT

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from crosscue.datasets.truth.box_labels import BoxLabels, read_box_labels
-from crosscue.replay.base import AnnotationError, CrosscueError, EmptyResultError, UsageError
+from crosscue.replay.errors import AnnotationError, CrosscueError, EmptyResultError, UsageError
 
 BOX = (10.0, 20.0, 50.0, 60.0)
 SIZE = (100, 80)

@@ -11,14 +11,10 @@ from crosscue.datasets.adapters.comma2k19 import STREAMS
 from crosscue.datasets.adapters.comma2k19_truth import write
 from crosscue.datasets.adapters.npy import read_column
 from crosscue.eval import cli
-from crosscue.replay.base import (
-    CanFrames,
-    Ledger,
-    LogFormatError,
-    Selection,
-    Table,
-    UnknownFormatError,
-)
+from crosscue.replay.base import Selection
+from crosscue.replay.columns import CanFrames, Table
+from crosscue.replay.errors import LogFormatError, UnknownFormatError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.signals.plan import plan

@@ -17,18 +17,11 @@ from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.truth import load as load_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.eval.cli import run
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    EVERYTHING,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Images,
-    Ledger,
-    LogFormatError,
-    Selection,
-    Table,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block, Images, Table
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.drafting.camera import KnowsItsCameras
 from crosscue.replay.vehicle.roles import Role, role_of

@@ -11,7 +11,8 @@ import crosscue
 from crosscue.datasets.adapters.kitti_odometry import read_poses, write_truth
 from crosscue.datasets.truth.truth import load
 from crosscue.datasets.truth.tum import heading_rad, read_tum
-from crosscue.replay.base import Ledger, LogFormatError
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from support.kitti_odometry_drive import (
     FOCAL_PX,

@@ -13,7 +13,9 @@ from crosscue.datasets.adapters.nuscenes_truth import write
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.truth import load
 from crosscue.datasets.truth.tum import heading_rad, read_tum
-from crosscue.replay.base import Floats, Ledger, LogFormatError, Table
+from crosscue.replay.columns import Floats, Table
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from support.nuscenes_drive import (
     FIRST_US,

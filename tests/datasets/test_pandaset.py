@@ -12,7 +12,9 @@ from crosscue.datasets.adapters.pandaset import read_poses
 from crosscue.datasets.real.label_pandaset import write_labels
 from crosscue.datasets.truth.truth import load, write_carried
 from crosscue.datasets.truth.tum import heading_rad, read_tum
-from crosscue.replay.base import Ledger, LogFormatError, Selection
+from crosscue.replay.base import Selection
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from support.data import shared
 from support.pandaset_drive import COUNT, SPEED_MPS, START_S, YAW_RATE_RADPS, pandaset_drive

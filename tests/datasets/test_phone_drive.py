@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.replay.base import Ledger, LogFormatError, Table
+from crosscue.replay.columns import Table
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from support.phone_drive import LATE_S, START_S, YAW_RATE_RADPS, phone_drive
 

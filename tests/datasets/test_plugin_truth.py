@@ -8,7 +8,7 @@ from types import ModuleType
 import pytest
 
 from crosscue.datasets.truth import truth as truth_file
-from crosscue.replay.base import AnnotationError, CrosscueError
+from crosscue.replay.errors import AnnotationError, CrosscueError
 from crosscue.replay.formats import DataSet, Format
 
 NAME = "line-drive"

@@ -13,7 +13,7 @@ from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.cvat import read_cvat
 from crosscue.datasets.truth.truth import Truth, load, truth_schema
 from crosscue.eval import cli
-from crosscue.replay.base import SchemaError
+from crosscue.replay.errors import SchemaError
 from crosscue.replay.vehicle.cue_table import CUES
 
 WIDE, HIGH = 64, 36

@@ -18,7 +18,8 @@ from crosscue.datasets.truth.tum import (
     seconds_text,
     write_tum,
 )
-from crosscue.replay.base import Limits, LogError, LogFormatError, LogTooLargeError
+from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
+from crosscue.replay.limits import Limits
 
 POSE = "1.5 1 2 3 0 0 0 1"
 

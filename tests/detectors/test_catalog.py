@@ -16,7 +16,7 @@ from crosscue.detectors.catalog.card import ModelCard, WeightFile
 from crosscue.detectors.catalog.class_names import COCO_80, COCO_90, meaning_of
 from crosscue.detectors.registry import make
 from crosscue.eval.cli import run
-from crosscue.replay.base import CrosscueError, UsageError, VehicleError
+from crosscue.replay.errors import CrosscueError, UsageError, VehicleError
 from support.data import shared
 from support.range_server import Served, serving
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import crosscue
 from crosscue.detectors.catalog.recognise import guesses, read_interface
-from crosscue.replay.base import VehicleError
+from crosscue.replay.errors import VehicleError
 from support.onnx_models import constant_model
 
 # Cells of strides 8, 16 and 32 at 256 x 128.

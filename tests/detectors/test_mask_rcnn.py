@@ -50,7 +50,8 @@ from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network, s
 from crosscue.detectors.networks.mask_rcnn.parts import Body, Parts, as_input
 from crosscue.detectors.registry import make
 from crosscue.detectors.weights_file import SUM
-from crosscue.replay.base import Bytes, CrosscueError, VehicleError
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import CrosscueError, VehicleError
 from support.mask_rcnn import CLASSES, CPU, noise_frame, plan_of, random_checkpoint
 from support.scenes import picture_at, world
 

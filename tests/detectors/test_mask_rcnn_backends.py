@@ -36,7 +36,7 @@ from crosscue.detectors.networks.mask_rcnn.detector import (
 from crosscue.detectors.networks.mask_rcnn.network import build_network
 from crosscue.detectors.networks.mask_rcnn.parts import TorchParts, as_input
 from crosscue.detectors.networks.mask_rcnn.screening import ScreenedParts
-from crosscue.replay.base import VehicleError
+from crosscue.replay.errors import VehicleError
 from support.mask_rcnn import CPU, noise_frame, plan_of, random_checkpoint
 from support.scenes import picture_at, world
 

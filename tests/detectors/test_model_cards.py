@@ -14,7 +14,7 @@ from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.catalog.card import Input
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.networks.picture_input import prepared
-from crosscue.replay.base import VehicleError
+from crosscue.replay.errors import VehicleError
 from crosscue.testing import check_detector
 from support.data import shared
 from support.detecting import yolox_card

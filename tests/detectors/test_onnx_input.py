@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.networks.onnx_input import input_shape
-from crosscue.replay.base import VehicleError
+from crosscue.replay.errors import VehicleError
 from support.data import shared
 from support.detecting import yolox_card
 

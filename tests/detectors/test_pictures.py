@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from crosscue.detectors.base import View
 from crosscue.detectors.images import MAX_PIXELS, Encoded, decode, reduction, size_of
-from crosscue.replay.base import Bytes, LogError, LogFormatError, LogTooLargeError
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
 
 COLOUR, GREY = View(), View(is_grey=True)
 

@@ -19,7 +19,8 @@ from crosscue.detectors.networks.road.detector import build
 from crosscue.detectors.networks.road.network import RoadNetwork, embedded_path
 from crosscue.detectors.training.road import RoadSchedule, RoadTraining, road_score
 from crosscue.eval.cli import run
-from crosscue.replay.base import Bytes, SchemaError, UsageError, VehicleError
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import SchemaError, UsageError, VehicleError
 from crosscue.replay.vehicle.vehicle import Regions
 
 CPU = torch.device("cpu")

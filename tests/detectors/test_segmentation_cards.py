@@ -15,7 +15,7 @@ from crosscue.detectors.base import Frame
 from crosscue.detectors.catalog.card import SegmentationOutput, read_card
 from crosscue.detectors.networks.model_detector import RoadModel, build
 from crosscue.eval import cli
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 from support.data import shared
 from support.onnx_models import constant_model
 

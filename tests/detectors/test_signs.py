@@ -16,7 +16,9 @@ from crosscue.detectors.signs.matching import nearest, window_counts
 from crosscue.detectors.signs.templates import AMERICAN, Kind, draw
 from crosscue.detectors.training.operating_point import Judged, judge, rates_at, threshold_for
 from crosscue.eval.cli import run
-from crosscue.replay.base import Block, Bytes, Images, Ledger, Messages, Topic, VehicleError
+from crosscue.replay.columns import Block, Bytes, Images, Messages, Topic
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 from support.data import shared
 from support.sign_scenes import clutter, scene

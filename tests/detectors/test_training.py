@@ -24,7 +24,7 @@ from crosscue.detectors.training.operating_point import Judged
 from crosscue.detectors.training.samples import Sampler, Window, read_picture
 from crosscue.detectors.training.scores import average_precisions
 from crosscue.eval.cli import run
-from crosscue.replay.base import CrosscueError, LogError, SchemaError
+from crosscue.replay.errors import CrosscueError, LogError, SchemaError
 from support.mask_rcnn import CPU, plan_of, write_bars
 
 WINDOW = Window(96, 64)

@@ -15,7 +15,7 @@ from crosscue.fusion.calibrated import CalibratedMessageModel, cue_messages_of
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.fit.message_fit import fit_messages, log_odds_of
 from crosscue.fusion.situation import Situation
-from crosscue.replay.base import VehicleError
+from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Fusion, RangeFilter, Rates
 from crosscue.replay.vehicle.vehicle import parse
 from support.fusion import FADE_M, RATES, annotated, drive, situation

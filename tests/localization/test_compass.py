@@ -21,7 +21,8 @@ from crosscue.localization.fit.compass import (
     fit_compass,
     persistence,
 )
-from crosscue.replay.base import Floats, Int64s, VehicleError
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import VehicleError
 
 DOWN_T = 42e-6
 LEVEL_T = 23e-6

@@ -28,7 +28,7 @@ from crosscue.localization.ekf import (
     update_speed,
 )
 from crosscue.localization.pose_filter import arc
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 NOISE = MotionNoise(
     wheelbase_m=2.7, accel_mps2=0.3, steering_rad=0.02, yaw_rate_radps=0.01, slip_per_sqrt_m=0.05

@@ -22,7 +22,7 @@ from crosscue.localization.odometry import (
     WheelSpeeds,
     integrate,
 )
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 from support.simulated_drive import BASE_M, TRACK_M, drive, gyro, wheels
 
 CAR = OdometrySettings(track_width_m=TRACK_M, wheelbase_m=BASE_M)

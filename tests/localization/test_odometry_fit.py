@@ -13,7 +13,8 @@ from crosscue.localization.fit.odometry import OdometryFit, fit_odometry
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import OdometrySettings, TurnSignal, integrate
 from crosscue.localization.start_pose import start_pose
-from crosscue.replay.base import Floats, VehicleError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import VehicleError
 from support.simulated_drive import BASE_M, TRACK_M, Truth, drive, gyro, wheels
 
 CAR = OdometrySettings(

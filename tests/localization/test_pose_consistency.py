@@ -40,7 +40,7 @@ from crosscue.localization.pose_track import (
     advance,
     start_belief,
 )
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
 
 ODOMETRY = OdometrySettings(

@@ -23,7 +23,8 @@ from crosscue.localization.pose_track import (
     start_belief,
 )
 from crosscue.localization.smoother import smooth
-from crosscue.replay.base import Floats, Int64s, UsageError
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import UsageError
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
 
 pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")

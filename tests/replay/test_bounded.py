@@ -12,7 +12,8 @@ from crosscue.datasets.truth import truth
 from crosscue.detectors.catalog.card import read_card
 from crosscue.eval.fit.ranges.pairs import pairs_of_table
 from crosscue.eval.scoring.gates import load_gates
-from crosscue.replay.base import CrosscueError, read_at_most
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.vehicle import vehicle
 
 ENDLESS = Path("/dev/zero")

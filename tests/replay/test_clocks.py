@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import Int64s
 from crosscue.replay.clocks.clock import Clock, times_of
 from crosscue.replay.clocks.order import forward_max, forward_min
 from crosscue.replay.clocks.periods import PeriodSketch
 from crosscue.replay.clocks.reports import ClockWatch, StampReport
+from crosscue.replay.columns import Int64s
 from support.clock_streams import SECOND_NS, START_NS, Stream, table_of, watch, watch_stream
 
 MS = 1_000_000

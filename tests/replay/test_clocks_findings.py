@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import Block, Int64s
 from crosscue.replay.clocks.findings import apart, duration_text, findings, instant_text
 from crosscue.replay.clocks.reports import ClockWatch
+from crosscue.replay.columns import Block, Int64s
 from support.clock_streams import SECOND_NS, START_NS, Stream, table_of
 
 MS = 1_000_000

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crosscue.replay.base import LogError, one_line
+from crosscue.replay.errors import LogError, one_line
 
 
 def test_line_ends_and_indents_collapse_to_one_space() -> None:

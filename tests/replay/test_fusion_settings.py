@@ -7,7 +7,7 @@ import pytest
 from crosscue.fusion.approaches import Approaches
 from crosscue.fusion.evidence import FrameEvidence
 from crosscue.fusion.factor_graph import graph_of
-from crosscue.replay.base import VehicleError
+from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.fusion import Fusion, usual_cues
 from crosscue.replay.vehicle.vehicle import parse
 

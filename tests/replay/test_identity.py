@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.replay.base import LogError
+from crosscue.replay.errors import LogError
 from crosscue.replay.files.identity import SHARE_BYTES, identity_of, identity_of_all
 
 LARGE: int = 3 * SHARE_BYTES

@@ -12,17 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from crosscue.replay.base import (
+from crosscue.replay.errors import AccountError, LossWarning
+from crosscue.replay.ledger import (
     DETAILS_KEPT,
     NOT_ASKED_TIME,
     NOT_ASKED_TOPIC,
-    AccountError,
+    Detail,
     Ledger,
-    LossWarning,
     TopicAccount,
     warn_of,
 )
-from crosscue.replay.ledger import Detail
 
 _COUNTS = st.integers(0, 1000)
 NOT_FOUND = "declared by the format, not in its bytes"

@@ -13,11 +13,10 @@ import pytest
 
 import crosscue
 from crosscue.eval.logs.log import UnopenedLog
-from crosscue.replay.base import LogError, UsageError, is_remote, one_line
-from crosscue.replay.errors import without_secrets
+from crosscue.replay.errors import LogError, UsageError, one_line, without_secrets
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
-from crosscue.replay.remote.address import LogAddress
+from crosscue.replay.remote.address import LogAddress, is_remote
 from support.range_server import serving
 
 PUBLIC = {

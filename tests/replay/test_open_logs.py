@@ -8,7 +8,9 @@ import pytest
 
 import crosscue
 from crosscue.eval.logs import log as interface
-from crosscue.replay.base import DEFAULT_LIMITS, Limits, Log, LogError
+from crosscue.replay.base import Log
+from crosscue.replay.errors import LogError
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from support.memory_log import MemoryLog
 
 

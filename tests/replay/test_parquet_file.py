@@ -11,9 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.replay.base import (
-    door,
-)
+from crosscue.replay.files import door
 
 READS = """
 import sys

@@ -17,9 +17,9 @@ import pytest
 
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import create, locked
-from crosscue.replay.base import write_text
 from crosscue.replay.files import partial_file
 from crosscue.replay.files.partial_file import PARTIAL, PartialFile, Scratch, is_partial, sweep
+from crosscue.replay.files.whole_file import write_text
 from support import faults, scenes
 
 

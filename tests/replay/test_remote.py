@@ -8,17 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.replay.base import (
-    Ledger,
-    LogError,
-    LogTooLargeError,
-    OutputError,
-    UsageError,
-    is_remote,
-)
+from crosscue.replay.errors import LogError, LogTooLargeError, OutputError, UsageError
 from crosscue.replay.files.identity import SHARE_BYTES, identity_of
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
+from crosscue.replay.remote.address import is_remote
 from crosscue.replay.remote.logs import Store, fetch, matches
 from support.can_files import candump, random_frames
 from support.can_files import read_back as read_file

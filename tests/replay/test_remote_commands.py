@@ -14,8 +14,10 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from crosscue.eval.cli import run as crosscue
-from crosscue.replay.base import Block, Images, Ledger, Messages, Selection, Topic
+from crosscue.replay.base import Selection
+from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.files.identity import SHARE_BYTES, identity_of
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.write.convert import LogWriter

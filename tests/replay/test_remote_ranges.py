@@ -11,7 +11,10 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from crosscue.eval.cli import run as crosscue
-from crosscue.replay.base import EVERYTHING, Block, Ledger, LogError, Selection
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block
+from crosscue.replay.errors import LogError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.logs.topic_part import read_topic
 from crosscue.replay.remote import logs as remote

@@ -15,9 +15,12 @@ import pytest
 from crosscue.eval.cli import run
 from crosscue.eval.fit.log_images import log_span
 from crosscue.eval.runs.stored_images import StoredCamera, read_pictures
-from crosscue.replay.base import CHANGED, DIFFERS, MIB, Ledger, LogError, Selection
+from crosscue.replay.base import Selection
 from crosscue.replay.clocks.clock import Clock
+from crosscue.replay.errors import LogError
 from crosscue.replay.formats import FORMATS
+from crosscue.replay.ledger import CHANGED, DIFFERS, Ledger
+from crosscue.replay.limits import MIB
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.losses import losses_heard
 from crosscue.replay.seal import seal as sealing

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from crosscue.eval.cli import run as crosscue
-from crosscue.replay.base import LogError, UnknownFormatError
+from crosscue.replay.errors import LogError, UnknownFormatError
 from crosscue.replay.files.identity import identity_of
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from crosscue.replay.base import Messages, Table, UsageError
+from crosscue.replay.columns import Messages, Table
+from crosscue.replay.errors import UsageError
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.logs.topic_part import read_topic
 

@@ -14,7 +14,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
-from crosscue.replay.base import MAX_DEPTH, json_tree, toml_document, toml_tree, yaml_tree
+from crosscue.replay.files.tree_text import (
+    MAX_DEPTH,
+    json_tree,
+    toml_document,
+    toml_tree,
+    yaml_tree,
+)
 from support.every_format import EVERY_FORMAT
 from support.measured import measured
 from support.pictures import picture_folder

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.replay.base import VehicleError
+from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
 
 

@@ -7,7 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import EVERYTHING, Block, Ledger, Topic, VehicleError
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.signals.plan import plan

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
-from crosscue.replay.base import DEFAULT_LIMITS, EVERYTHING, Block, Ledger, Limits, Selection
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.logs.opening import open_log
 
 

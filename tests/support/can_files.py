@@ -11,7 +11,9 @@ from pathlib import Path
 
 import can
 
-from crosscue.replay.base import DATA, ERROR, EVERYTHING, REMOTE, CanFrames, Ledger, Selection
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import DATA, ERROR, REMOTE, CanFrames
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 
 # Noon of 10 July 2015, which the day count of TRC files represents exactly.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from crosscue.replay.base import CrosscueError
+from crosscue.replay.errors import CrosscueError
 from crosscue.replay.logs.opening import open_log
 from support.can_files import (
     START_NS,

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Block, CanFrames
 from crosscue.replay.can.layout import CanMessage, CanSignal
+from crosscue.replay.columns import Block, CanFrames
 
 from .data import shared
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from crosscue.replay.base import Block, Int64s, Table
 from crosscue.replay.clocks.reports import ClockReport, ClockWatch
+from crosscue.replay.columns import Block, Int64s, Table
 
 SECOND_NS = 1_000_000_000
 START_NS = 1_763_000_000 * SECOND_NS

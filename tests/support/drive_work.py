@@ -16,8 +16,7 @@ from crosscue.eval.batch.jobs import Job
 from crosscue.eval.runs.account import LogAccount, account
 from crosscue.eval.runs.folder import clear, create, locked, write_manifest
 from crosscue.eval.runs.tables.parquet import TableSink
-from crosscue.replay.base import LogFormatError
-from crosscue.replay.errors import LossWarning
+from crosscue.replay.errors import LogFormatError, LossWarning
 
 from .manifests import estimated, log_account
 

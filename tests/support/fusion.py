@@ -14,7 +14,7 @@ from crosscue.fusion.factor_graph import CueNode, Edge, FactorGraph, Feature
 from crosscue.fusion.fit.annotated_approach import AnnotatedApproach
 from crosscue.fusion.intersection_range import Reference
 from crosscue.fusion.situation import Situation
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.cue_table import CUES
 
 SECOND_NS = 1_000_000_000

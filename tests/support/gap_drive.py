@@ -23,21 +23,11 @@ from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
-from crosscue.replay.base import (
-    DATA,
-    EVERYTHING,
-    Block,
-    CanFrames,
-    Floats,
-    Images,
-    Int64s,
-    Ledger,
-    Messages,
-    Selection,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
+from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Images, Int64s, Messages, Topic
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 from crosscue.replay.write.convert import LogWriter

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.localization.landmarks.features import CameraGeometry, Features
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 
 from .gap_drive import ROW, SECOND, SPEED_MPS
 from .landmark_drive import NearnessMatcher, features_at

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from crosscue.datasets.geodesy import ecef_to_enu_matrix, ecef_to_geodetic, geodetic_to_ecef
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from support.pictures import picture
 
 ORIGIN = (49.0, 8.4, 110.0)

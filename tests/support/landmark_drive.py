@@ -12,7 +12,7 @@ from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
 from crosscue.localization.landmarks.features import Features, Match
 from crosscue.localization.landmarks.update import LandmarkSearch, LandmarkSettings
-from crosscue.replay.base import Bytes, Floats
+from crosscue.replay.columns import Bytes, Floats
 from support.simulated_drive import Truth
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from crosscue.localization.landmarks.database import LandmarkWriter, Place
 from crosscue.localization.landmarks.features import CameraGeometry, Features, Match
-from crosscue.replay.base import Bytes, Floats
+from crosscue.replay.columns import Bytes, Floats
 
 
 def some_features(seed: int, count: int = 20) -> Features:

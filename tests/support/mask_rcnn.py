@@ -14,7 +14,7 @@ import torch
 from crosscue.detectors.base import Frame
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Checkpoint, Facts
 from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 
 CLASSES: Final = ("car", "stop sign", "traffic light")
 CPU: Final = torch.device("cpu")

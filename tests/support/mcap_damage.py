@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crosscue.replay.base import CrosscueError
+from crosscue.replay.errors import CrosscueError
 from support.mcap_files import (
     ChunkOf,
     McapFile,

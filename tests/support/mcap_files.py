@@ -12,7 +12,10 @@ from typing import TypeAlias
 import lz4.frame
 import zstandard
 
-from crosscue.replay.base import DEFAULT_LIMITS, EVERYTHING, Ledger, Limits, Messages, Selection
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Messages
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.mcap.reader import open_mcap
 
 MAGIC = b"\x89MCAP0\r\n"

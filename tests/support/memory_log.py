@@ -10,16 +10,9 @@ from typing import Self
 
 import numpy as np
 
-from crosscue.replay.base import (
-    EVERYTHING,
-    NOT_ASKED_TOPIC,
-    Block,
-    Floats,
-    Ledger,
-    Selection,
-    Table,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block, Floats, Table, Topic
+from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
 
 WHEELS = Topic("wheels", "crosscue/WheelSpeeds", "columns")
 GYRO = Topic("gyro", "sensor_msgs/msg/Imu", "columns")

@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from crosscue.replay.base import DATA, ERROR, REMOTE
+from crosscue.replay.columns import DATA, ERROR, REMOTE
 
 from .can_files import FD_LENGTHS, START_NS, Sent
 

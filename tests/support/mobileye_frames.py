@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from crosscue.replay.base import DATA, Block, CanFrames, Floats, Int64s, Table
+from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table
 from crosscue.replay.mobileye.bits import Words, payloads_of, place
 from crosscue.replay.mobileye.layout import Field, Message, layout
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from crosscue.replay.base import Block, CanFrames, Floats, Int64s, Table, Topic
+from crosscue.replay.columns import Block, CanFrames, Floats, Int64s, Table, Topic
 from crosscue.replay.mobileye.bits import extract, words_of
 from crosscue.replay.mobileye.layout import Field, Message, layout
 from crosscue.replay.mobileye.wire import from_raw

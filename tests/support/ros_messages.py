@@ -12,7 +12,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from crosscue.replay.base import Block, Messages, Topic
+from crosscue.replay.columns import Block, Messages, Topic
 from crosscue.replay.decode import Decoder, decoder_for
 
 PRIMITIVES = (

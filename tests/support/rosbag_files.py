@@ -18,7 +18,9 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from crosscue.replay.base import EVERYTHING, CrosscueError, Ledger, Log, Selection
+from crosscue.replay.base import EVERYTHING, Log, Selection
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 
 START_NS: Final = 1_700_000_000_000_000_000

@@ -16,8 +16,9 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import ClockRow
 from crosscue.eval.runs.tables.labelled import with_labels
 from crosscue.eval.runs.tables.pose_tables import pose_schema
-from crosscue.replay.base import Block, Images, Ledger, Messages, Topic
 from crosscue.replay.clocks.clock import Clock
+from crosscue.replay.columns import Block, Images, Messages, Topic
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.time.segments import ONE_SEGMENT, UNSHIFTED
 from crosscue.replay.write.convert import LogWriter
 

@@ -16,9 +16,9 @@ from crosscue.eval.runs.manifest import LogRow
 from crosscue.eval.scoring.columns import RunTables
 from crosscue.eval.scoring.run_tables import run_tables
 from crosscue.eval.scoring.truth import DriveTruth, TrueRanges
-from crosscue.replay.base import write_text
 from crosscue.replay.files.identity import identity_of
 from crosscue.replay.files.log_identity import Identity
+from crosscue.replay.files.whole_file import write_text
 
 from .manifests import estimated
 

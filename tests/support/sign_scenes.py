@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from crosscue.detectors.signs.templates import MARGIN_PX, Kind, draw
-from crosscue.replay.base import Bytes, Floats
+from crosscue.replay.columns import Bytes, Floats
 
 
 class Scene(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.odometry import OdometrySettings, TurnSignal, WheelSpeeds
 from crosscue.localization.pose_track import Headings
-from crosscue.replay.base import Floats, Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 TRACK_M = 1.6
 BASE_M = 2.7

@@ -9,7 +9,7 @@ from typing import cast
 import av
 import numpy as np
 
-from crosscue.replay.base import Block, Images
+from crosscue.replay.columns import Block, Images
 
 # Grey levels between consecutive pictures; encoding errors are less than half of it.
 STEP = 9

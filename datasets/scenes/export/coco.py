@@ -10,7 +10,8 @@ from crosscue.datasets.scenes.cues import MIN_PIXELS
 from crosscue.datasets.scenes.rendering.render import Picture
 from crosscue.datasets.scenes.world import CATEGORIES
 from crosscue.detectors.rle import encode
-from crosscue.replay.base import strict_json, write_text
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
 
 # Category numbers and names, which are those of COCO if COCO has the class.
 COCO_IDS: Final = {

@@ -18,7 +18,8 @@ from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.datasets.scenes.world import World
 from crosscue.datasets.simulated.drive import START_NS
-from crosscue.replay.base import Floats, write_bytes
+from crosscue.replay.columns import Floats
+from crosscue.replay.files.whole_file import write_bytes
 from crosscue.replay.processes import in_processes
 
 from .coco import Objects

@@ -18,7 +18,9 @@ from torch import Tensor
 
 from crosscue.detectors.settings import Settings
 from crosscue.detectors.weights_file import embedded, packed, unpacked
-from crosscue.replay.base import VehicleError, read_at_most, write_bytes
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.whole_file import write_bytes
 
 from .network import Plan, build_network
 

@@ -28,7 +28,8 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Detector, Found, Frame, View
 from crosscue.detectors.networks.devices import chosen_device, threads_of
 from crosscue.detectors.settings import Proportion, Settings, identity_of, settings_of
-from crosscue.replay.base import Bytes, CrosscueError, Floats, VehicleError
+from crosscue.replay.columns import Bytes, Floats
+from crosscue.replay.errors import CrosscueError, VehicleError
 
 from .checkpoint import Calibration, Checkpoint, embedded_path, load_checkpoint
 from .coco import COCO_NETWORKS, load_coco

@@ -17,7 +17,8 @@ from torch import Tensor, nn
 
 from crosscue.detectors.networks.backends import Array
 from crosscue.detectors.networks.openvino import import_openvino
-from crosscue.replay.base import Bytes, VehicleError, one_line
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import VehicleError, one_line
 
 from .network import MEAN, SPREAD, STRIDE
 from .parts import Body

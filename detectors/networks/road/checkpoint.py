@@ -13,7 +13,9 @@ from pydantic import Field, ValidationError
 
 from crosscue.detectors.settings import Settings
 from crosscue.detectors.weights_file import packed, unpacked
-from crosscue.replay.base import VehicleError, one_line, read_at_most, write_bytes
+from crosscue.replay.errors import VehicleError, one_line
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.whole_file import write_bytes
 
 from .network import RoadNetwork
 

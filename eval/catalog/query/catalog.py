@@ -8,7 +8,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.replay.base import UnreadableRunError, UsageError, is_remote
+from crosscue.replay.errors import UnreadableRunError, UsageError
+from crosscue.replay.remote.address import is_remote
 
 from . import database, parts
 from .columns import INDEXED, OWN, VIEWS

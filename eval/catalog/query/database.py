@@ -13,7 +13,8 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.replay.base import UsageError, json_tree, one_line
+from crosscue.replay.errors import UsageError, one_line
+from crosscue.replay.files.tree_text import json_tree
 
 if TYPE_CHECKING:
     import duckdb

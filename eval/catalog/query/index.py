@@ -14,13 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
-from crosscue.replay.base import (
-    OutputError,
-    UnreadableRunError,
-    door,
-    is_remote,
-    spelled,
-)
+from crosscue.replay.errors import OutputError, UnreadableRunError
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import spelled
+from crosscue.replay.remote.address import is_remote
 
 from .columns import INDEXED, arrow_schema
 from .local import CUT_SHORT, Found

@@ -8,12 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from crosscue.eval.runs.folder import FAILURE, INPUT, MANIFEST, MAX_MANIFEST_BYTES, TAGS, TIMINGS
-from crosscue.replay.base import (
-    UnreadableRunError,
-    door,
-    spelled,
-    unspelled,
-)
+from crosscue.replay.errors import UnreadableRunError
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import spelled, unspelled
 
 if TYPE_CHECKING:
     import pyarrow.fs

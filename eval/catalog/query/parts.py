@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.replay.base import door
+from crosscue.replay.files import door
 
 from .columns import FILES, OWN, arrow_schema
 

@@ -11,13 +11,10 @@ from typing import Any, Final, Literal, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from crosscue.eval.runs.folder import (
-    FAILURE,
+from crosscue.eval.runs.account import Account
+from crosscue.eval.runs.folder import FAILURE, MANIFEST, TAGS, TIMINGS
+from crosscue.eval.runs.manifest import (
     FORMAT_VERSION,
-    MANIFEST,
-    TAGS,
-    TIMINGS,
-    Account,
     LogRow,
     PoseSummary,
     SceneSummary,
@@ -26,7 +23,7 @@ from crosscue.eval.runs.folder import (
 )
 from crosscue.eval.runs.settings_hash import settings_sha256
 from crosscue.eval.runs.tags import parse_tags
-from crosscue.replay.base import one_line
+from crosscue.replay.errors import one_line
 from crosscue.replay.files.identity import identity_of_all
 
 from .local import BESIDE, Found

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from crosscue.eval.runs.folder import FAILURE, MANIFEST
-from crosscue.replay.base import LogError, UnreadableRunError, UsageError
+from crosscue.replay.errors import LogError, UnreadableRunError, UsageError
 from crosscue.replay.remote.logs import guarded, opened_store
 
 from .local import BESIDE, CUT_SHORT, DEPTH, SCORE, Found, Stamp, is_cut_short

@@ -12,7 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.replay.base import one_line, write_bytes
+from crosscue.replay.errors import one_line
+from crosscue.replay.files.whole_file import write_bytes
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -13,9 +13,7 @@ from crosscue.eval.terminal import is_shown
 from crosscue.eval.terminal import print_json as print_json
 from crosscue.eval.terminal import warn as warn
 from crosscue.replay import limits
-from crosscue.replay.base import (
-    Limits,
-)
+from crosscue.replay.limits import Limits
 
 if TYPE_CHECKING:
     pass

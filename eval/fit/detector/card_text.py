@@ -12,7 +12,8 @@ from pydantic import ValidationError
 from crosscue.detectors.catalog.card import ModelCard
 from crosscue.detectors.catalog.class_names import CUE_LABELS
 from crosscue.detectors.catalog.class_scores import ClassScores
-from crosscue.replay.base import UsageError, VehicleError, one_line, toml_document
+from crosscue.replay.errors import UsageError, VehicleError, one_line
+from crosscue.replay.files.tree_text import toml_document
 from crosscue.replay.vehicle.section import tuples
 
 from .class_fit import ClassFit

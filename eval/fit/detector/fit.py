@@ -33,8 +33,10 @@ from crosscue.eval.pipeline.run import Run, open_run
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
-from crosscue.replay.base import DEFAULT_LIMITS, UsageError, visible, write_text
-from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
+from crosscue.replay.safe_text import visible
 from crosscue.results import HIDDEN, Result, json_key
 from crosscue.verb import Option, keywords
 

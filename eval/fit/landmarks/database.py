@@ -22,19 +22,11 @@ from crosscue.localization.angles import interpolate_angle
 from crosscue.localization.landmarks.database import LandmarkWriter, Place
 from crosscue.localization.landmarks.features import Matcher
 from crosscue.localization.landmarks.images import grey_of, picture_of, read_picture
-from crosscue.replay.base import (
-    AnnotationError,
-    Floats,
-    Int64s,
-    Ledger,
-    Log,
-    LogError,
-    MissingTopicError,
-    Selection,
-    UsageError,
-    read_at_most,
-    warn_of,
-)
+from crosscue.replay.base import Log, Selection
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import AnnotationError, LogError, MissingTopicError, UsageError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import camera_of
 from crosscue.replay.vehicle.vehicle import Vehicle

@@ -15,7 +15,7 @@ from crosscue.eval.logs.log import DriveIfGiven, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.fit import LandmarkFit, Rate
 from crosscue.localization.landmarks.fit import fit_landmarks as fit_threshold
-from crosscue.replay.base import SchemaError, UsageError
+from crosscue.replay.errors import SchemaError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords

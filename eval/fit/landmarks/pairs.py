@@ -19,7 +19,11 @@ from crosscue.localization.landmarks.database import LandmarkDatabase, Nearby
 from crosscue.localization.landmarks.features import Features, Matcher
 from crosscue.localization.landmarks.fit import ScoredPairs
 from crosscue.localization.landmarks.images import grey_of, read_picture
-from crosscue.replay.base import MIB, AnnotationError, Ledger, LogError, read_at_most, toml_document
+from crosscue.replay.errors import AnnotationError, LogError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import toml_document
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import MIB
 
 MAX_PAIRS: Final = 1_000_000
 MAX_PAIR_BYTES: Final = 256 * MIB

@@ -8,7 +8,7 @@ import numpy as np
 
 from crosscue.detectors.ranging.height_to_range import RangeFit, range_of
 from crosscue.eval.fit.ranges.pairs import RangePairs
-from crosscue.replay.base import write_whole
+from crosscue.replay.files.whole_file import write_whole
 
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c")
 

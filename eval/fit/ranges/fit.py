@@ -22,7 +22,7 @@ from crosscue.eval.fit.ranges.pairs import (
     pairs_of_truth,
     together,
 )
-from crosscue.replay.base import EmptyResultError, OutputError, UsageError
+from crosscue.replay.errors import EmptyResultError, OutputError, UsageError
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
 

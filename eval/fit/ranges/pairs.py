@@ -11,16 +11,12 @@ import numpy as np
 
 from crosscue.datasets.truth.truth import FILE, load
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.replay.base import (
-    MIB,
-    AnnotationError,
-    Floats,
-    Int64s,
-    SchemaError,
-    door,
-    json_tree,
-    read_at_most,
-)
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import AnnotationError, SchemaError
+from crosscue.replay.files import door
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.limits import MIB
 
 MAX_BYTES: Final = 256 * MIB
 LABELS: Final[Mapping[str, str]] = {"stop_sign": "stop sign", "traffic_light": "traffic light"}

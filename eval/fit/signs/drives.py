@@ -11,16 +11,10 @@ from crosscue.datasets.truth.objects import OBJECTS_FILE
 from crosscue.detectors.images import encoded, lose
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
 from crosscue.eval.fit.signs.labels import Boxes, Labelled, coco_boxes, read_text
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    EVERYTHING,
-    MIB,
-    AnnotationError,
-    Ledger,
-    Limits,
-    MissingTopicError,
-    warn_of,
-)
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.errors import AnnotationError, MissingTopicError
+from crosscue.replay.ledger import Ledger, warn_of
+from crosscue.replay.limits import DEFAULT_LIMITS, MIB, Limits
 from crosscue.replay.logs.opening import open_log, unless_damaged
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import camera_of

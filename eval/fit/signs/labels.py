@@ -10,14 +10,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.detectors.images import Encoded
-from crosscue.replay.base import (
-    MIB,
-    AnnotationError,
-    EmptyResultError,
-    LogError,
-    json_tree,
-    read_at_most,
-)
+from crosscue.replay.errors import AnnotationError, EmptyResultError, LogError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.limits import MIB
 
 COLUMNS: Final = ("picture", "label", "x0", "y0", "x1", "y1")
 MAX_BYTES: Final = 64 * MIB

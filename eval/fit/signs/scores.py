@@ -14,7 +14,9 @@ from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.training.operating_point import Judged, judge, together
 from crosscue.eval.fit.signs.drives import drive_pictures
 from crosscue.eval.fit.signs.labels import Labelled, read_labels
-from crosscue.replay.base import DEFAULT_LIMITS, Floats, Limits, LogError, UsageError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import LogError, UsageError
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ from crosscue.detectors.signs.templates import AMERICAN, KINDS, Kind
 from crosscue.detectors.training.operating_point import Judged, rates_at, threshold_for, together
 from crosscue.eval.fit.signs.scores import Rules, judged_pictures
 from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, fraction
-from crosscue.replay.base import DEFAULT_LIMITS, EmptyResultError, UsageError
-from crosscue.replay.limits import LimitsGiven
+from crosscue.replay.errors import EmptyResultError, UsageError
+from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.progress import Progress, emit
 from crosscue.results import HIDDEN, Result, json_key
 from crosscue.verb import Option, keywords

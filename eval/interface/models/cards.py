@@ -20,14 +20,9 @@ from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.networks.trial import fault_seen
 from crosscue.detectors.overlay import picture_of
-from crosscue.replay.base import (
-    Bytes,
-    LogError,
-    UsageError,
-    VehicleError,
-    write_bytes,
-    write_text,
-)
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import LogError, UsageError, VehicleError
+from crosscue.replay.files.whole_file import write_bytes, write_text
 
 # Supported tasks in the metadata of Ultralytics' exports.
 _TASKS: Final = ("detect", "segment")

@@ -19,14 +19,11 @@ from crosscue.eval.scoring.boxes.matching import match
 from crosscue.eval.scoring.boxes.reliability import Reliability, reliability
 from crosscue.eval.scoring.boxes.scores import SEED, Measured, PartScore, score_parts
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    Limits,
-    UsageError,
-    strict_json,
-    visible,
-    write_text,
-)
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
+from crosscue.replay.safe_text import visible
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -22,7 +22,8 @@ from crosscue.eval.pipeline.progress import report_time
 from crosscue.eval.pipeline.scene.looked_for import needing_masks, not_looked_for
 from crosscue.eval.pipeline.scene.motion_ranges import MotionRanges, RangedObject
 from crosscue.eval.pipeline.scene.sign_ranges import SignRanges
-from crosscue.eval.runs.folder import DetectManifest, RunFolder
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
 from crosscue.eval.runs.tables.travelled import Odometer, odometer_of
 from crosscue.fusion.approaches import Approaches, RangeRow, Step

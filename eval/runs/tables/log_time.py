@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Int64s
+from crosscue.replay.columns import Int64s
 from crosscue.replay.time.segments import Cause, Timeline
 
 if TYPE_CHECKING:

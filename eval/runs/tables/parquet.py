@@ -9,12 +9,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
-from crosscue.replay.base import (
-    UnreadableRunError,
-    cannot_write,
-    door,
-)
+from crosscue.replay.errors import UnreadableRunError
+from crosscue.replay.files import door
 from crosscue.replay.files.partial_file import PartialFile
+from crosscue.replay.files.whole_file import cannot_write
 
 if TYPE_CHECKING:
     import pyarrow as pa

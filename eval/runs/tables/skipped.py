@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from crosscue.eval.runs.account import UNATTRIBUTED, LogAccount, TopicLine
-from crosscue.replay.base import Ledger
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 
 from .labelled import labelled

@@ -26,7 +26,8 @@ from crosscue.detectors.decoders.base import DEFAULT_OVERLAP
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.logs import reopened
 from crosscue.eval.runs.manifest import DetectManifest, DetectorRow
-from crosscue.replay.base import EmptyResultError, Int64s, SchemaError, UsageError
+from crosscue.replay.columns import Int64s
+from crosscue.replay.errors import EmptyResultError, SchemaError, UsageError
 from crosscue.replay.readers.images.folder import picture_names
 
 from .matching import NOBODY, Boxes

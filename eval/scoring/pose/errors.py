@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from crosscue.datasets.truth.tum import Trajectory, heading_rad
 from crosscue.eval.scoring.consistency import mean_band, quantile
 from crosscue.localization.angles import wrap_all
-from crosscue.replay.base import Floats, UsageError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import UsageError
 
 from .quaternions import about_z, angle_rad, between, inverse, product, rotate
 

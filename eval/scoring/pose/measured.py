@@ -14,7 +14,8 @@ from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
 from crosscue.localization.pose_track import Headings
-from crosscue.replay.base import Floats, RunError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import RunError
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,10 +19,13 @@ from crosscue.datasets.geodesy import geodetic_to_enu
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
-from crosscue.eval.runs.folder import OWN_FRAME, RunFolder
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import OWN_FRAME
 from crosscue.eval.runs.tables.log_time import Gap, comes_twice, gaps_of, table_in_log_time
 from crosscue.localization.angles import wrap_all
-from crosscue.replay.base import Floats, Int64s, SchemaError, spelled
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.files.tree_text import spelled
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .errors import (

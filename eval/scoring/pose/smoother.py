@@ -14,7 +14,10 @@ from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.smoother import smooth
-from crosscue.replay.base import Floats, Int64s, SchemaError, strict_json, write_text
+from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
 
 from .errors import FilterAndSmoother, NeesSummary, nees, pair, summarise_nees
 from .measured import read_measured

@@ -15,7 +15,8 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.stored_images import StoredCamera, camera_of, picture_at
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
 from crosscue.eval.scoring.runs import RunScored
-from crosscue.replay.base import Bytes, Int64s, write_bytes
+from crosscue.replay.columns import Bytes, Int64s
+from crosscue.replay.files.whole_file import write_bytes
 
 # True distance to the intersection of the frame.
 AWAY_M: Final = 18.0

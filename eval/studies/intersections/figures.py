@@ -11,7 +11,7 @@ import numpy as np
 from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
 from crosscue.eval.scoring.scene.approaches import ApproachResult, Curve
 from crosscue.eval.scoring.scene.belief import BeliefScore
-from crosscue.replay.base import write_whole
+from crosscue.replay.files.whole_file import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

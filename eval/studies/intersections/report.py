@@ -18,7 +18,10 @@ from crosscue.eval.scoring.files import write_scores
 from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.runs import RunScored, metrics_of
 from crosscue.eval.scoring.scene.approaches import ApproachScore
-from crosscue.replay.base import door, strict_json, versions, write_text
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.versions import versions
 
 from .conditions import condition_costs
 from .contact_sheet import write_sheet

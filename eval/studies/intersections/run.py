@@ -14,7 +14,7 @@ from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.studies.result import StoredResult
 from crosscue.eval.studies.simulated_drives import run_drives
-from crosscue.replay.base import RunError
+from crosscue.replay.errors import RunError
 from crosscue.replay.vehicle.vehicle import vehicle_given
 from crosscue.verb import Option
 

@@ -16,7 +16,7 @@ from crosscue.eval.scoring.scene.belief import compare_belief
 from crosscue.eval.studies.attribution import Drive, attribute
 from crosscue.eval.studies.estimated_again import estimate_of
 from crosscue.fusion.fit.message_fit import fit_messages
-from crosscue.replay.base import RunError
+from crosscue.replay.errors import RunError
 from crosscue.replay.vehicle.fusion import Calibrated
 from crosscue.replay.vehicle.vehicle import Vehicle
 

@@ -10,7 +10,9 @@ from typing import Any, Final
 
 from crosscue.eval.scoring.intervals import TOO_FEW, Mean
 from crosscue.eval.studies.page import Table, write_page
-from crosscue.replay.base import strict_json, versions, write_text
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.versions import versions
 
 from .score import LayoutDifference, LayoutScore
 from .score import LayoutScores as LayoutScores

@@ -13,7 +13,7 @@ from crosscue.eval.batch.jobs import Done, exit_status_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.studies.result import StoredResult
 from crosscue.eval.studies.simulated_drives import SPARSE_AND_EMBEDDED, run_drives
-from crosscue.replay.base import RunError
+from crosscue.replay.errors import RunError
 from crosscue.verb import Option
 
 from .drives import open_drive

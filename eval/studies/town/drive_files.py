@@ -28,7 +28,9 @@ from crosscue.localization.town.drive import (
 )
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.base import (
+from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.can.encode import encode
+from crosscue.replay.columns import (
     DATA,
     Block,
     Bytes,
@@ -36,14 +38,12 @@ from crosscue.replay.base import (
     Floats,
     Images,
     Int64s,
-    Ledger,
     Messages,
     Table,
     Topic,
-    write_text,
 )
-from crosscue.replay.can.database import CanDatabase
-from crosscue.replay.can.encode import encode
+from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 
 BUS: Final = Topic("/can", "crosscue/CanFrames", "columns")

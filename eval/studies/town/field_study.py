@@ -25,7 +25,10 @@ from crosscue.eval.studies.words import percent
 from crosscue.localization.town.drive import Traced
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.base import RunError, UsageError, door, json_tree, strict_json, write_text
+from crosscue.replay.errors import RunError, UsageError
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
 from crosscue.results import Result

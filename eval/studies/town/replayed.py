@@ -20,7 +20,10 @@ from crosscue.eval.scoring.files import FOLDER, METRICS
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, measure, truth_track
 from crosscue.localization.town.drive import Traced, drive_traced
 from crosscue.localization.town.settings import Drive, Navigation, Sensors
-from crosscue.replay.base import EVERYTHING, UsageError, strict_json, write_text
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 from crosscue.results import HIDDEN, Result

@@ -14,7 +14,10 @@ from crosscue.eval.studies.result import StoredResult
 from crosscue.eval.studies.words import km, percent
 from crosscue.localization.town.drive import Result as DriveResult
 from crosscue.localization.town.drive import drive_traced
-from crosscue.replay.base import RunError, door, json_tree, strict_json, write_text
+from crosscue.replay.errors import RunError
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.progress import Progress, emit
 from crosscue.results import Result
 from crosscue.verb import Option

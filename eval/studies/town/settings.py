@@ -20,7 +20,9 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from crosscue.localization.town.settings import City, Drive, Proportion
-from crosscue.replay.base import StudyFileError, UsageError, read_at_most, toml_tree
+from crosscue.replay.errors import StudyFileError, UsageError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import toml_tree
 from crosscue.replay.vehicle.section import Section, tuples
 from crosscue.replay.vehicle.validation_errors import explain
 

@@ -28,14 +28,9 @@ from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import Keys, Result, drive_many, drive_one
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import Drive
-from crosscue.replay.base import (
-    Floats,
-    RunError,
-    UnreadableRunError,
-    UsageError,
-    WorkerError,
-)
+from crosscue.replay.columns import Floats
 from crosscue.replay.compiled import fingerprint
+from crosscue.replay.errors import RunError, UnreadableRunError, UsageError, WorkerError
 
 from .settings import Case
 

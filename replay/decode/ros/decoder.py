@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, Ledger, Messages, SchemaError, Topic
+from crosscue.replay.columns import Block, Messages, Topic
 from crosscue.replay.decode.refuse import MISFIT, WRONG_CODING, refuse
 from crosscue.replay.decode.ros.definition import Definitions, definitions_of, well_known
 from crosscue.replay.decode.ros.fields import Fields, Part, WalkedFields
@@ -26,6 +26,8 @@ from crosscue.replay.decode.ros.repeated import (
 from crosscue.replay.decode.ros.standard import Doubt, Kind, header_ns, kind_of
 from crosscue.replay.decode.ros.type_names import ros2_spelling
 from crosscue.replay.decode.ros.walk import CDR_PADDING, Bools, Rows, gather, walk
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
 
 CDR_BE: Final = 0x0000
 CDR_LE: Final = 0x0001

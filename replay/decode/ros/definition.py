@@ -13,8 +13,9 @@ from enum import Enum
 from functools import cache
 from typing import Final
 
-from crosscue.replay.base import DEFAULT_LIMITS, Limits, SchemaError
 from crosscue.replay.decode.ros.type_names import ros2_spelling
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 # NumPy codes of primitive types; ``byte`` is signed and ``char`` is not, in ROS 1 and ROS 2.
 PRIMITIVES: Final[Mapping[str, str]] = {

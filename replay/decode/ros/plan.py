@@ -14,7 +14,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.base import DEFAULT_LIMITS, Int64s, Limits, SchemaError
+from crosscue.replay.columns import Int64s
 from crosscue.replay.decode.ros.definition import (
     DURATION,
     PRIMITIVES,
@@ -24,6 +24,8 @@ from crosscue.replay.decode.ros.definition import (
     Shape,
     well_known,
 )
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 MAX_DEPTH: Final = 32
 MAX_STEPS: Final = 20_000

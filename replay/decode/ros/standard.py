@@ -13,7 +13,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import (
+from crosscue.replay.columns import (
     DATA,
     ERROR,
     REMOTE,
@@ -22,7 +22,6 @@ from crosscue.replay.base import (
     Images,
     Int64s,
     Messages,
-    SchemaError,
     Table,
 )
 from crosscue.replay.decode.coding import JPEG, MAGIC_BYTES, STREAMS, coding_of
@@ -37,6 +36,7 @@ from crosscue.replay.decode.ros.fields import Fields
 from crosscue.replay.decode.ros.paths import quat, xyz
 from crosscue.replay.decode.ros.plan import Plan
 from crosscue.replay.decode.ros.walk import Bools, gather
+from crosscue.replay.errors import SchemaError
 
 Decoded: TypeAlias = CanFrames | Table | Images
 # Messages that fit their definition but cannot be used, and the reason for the ledger.

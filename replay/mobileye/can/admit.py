@@ -7,7 +7,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import DATA, ERROR, LENGTH_UNKNOWN, REMOTE, CanFrames, Int64s, Ledger
+from crosscue.replay.columns import DATA, ERROR, LENGTH_UNKNOWN, REMOTE, CanFrames, Int64s
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.bits import Words, words_of
 from crosscue.replay.mobileye.layout import Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings

@@ -12,7 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Block, CanFrames, Int64s, Ledger
+from crosscue.replay.columns import Block, CanFrames, Int64s
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.bits import Words, extract
 from crosscue.replay.mobileye.bursts import (
     CUT,

@@ -8,7 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Int64s, Ledger
+from crosscue.replay.columns import Int64s
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.bursts import NO_BURST
 from crosscue.replay.mobileye.layout import Columns
 from crosscue.replay.mobileye.settings import MobileyeSettings

@@ -27,7 +27,8 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Block, Floats, Int64s, Ledger, Table
+from crosscue.replay.columns import Block, Floats, Int64s, Table
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.bursts import NO_BURST
 from crosscue.replay.mobileye.clock import CounterClock
 from crosscue.replay.mobileye.layout import Columns, Message, layout, variant_number

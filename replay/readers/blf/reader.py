@@ -18,18 +18,12 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import (
-    EVERYTHING,
-    NOT_ASKED_TIME,
-    Block,
-    Closing,
-    Ledger,
-    Limits,
-    Log,
-    LogFormatError,
-    Selection,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Log, Selection
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import NOT_ASKED_TIME, Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import (
     FrameRows,
     blocks_by_bus,

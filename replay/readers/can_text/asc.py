@@ -24,7 +24,10 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import DATA, ERROR, REMOTE, Int64s, Ledger, Limits, Log
+from crosscue.replay.base import Log
+from crosscue.replay.columns import DATA, ERROR, REMOTE, Int64s
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import FD_LENGTHS
 
 from .dialect import (

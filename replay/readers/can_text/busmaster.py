@@ -13,7 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import DATA, REMOTE, Int64s, Ledger
+from crosscue.replay.columns import DATA, REMOTE, Int64s
+from crosscue.replay.ledger import Ledger
 
 from .dialect import Damage, Dialect, Fast, Frame, Mark, Other, Outcome
 from .digits import NANOS, TIME_MAX_NS, Bools, decimal, within_range

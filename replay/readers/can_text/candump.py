@@ -18,7 +18,10 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import DATA, ERROR, REMOTE, CanFrames, Int64s, Limits, Log, LogFormatError
+from crosscue.replay.base import Log
+from crosscue.replay.columns import DATA, ERROR, REMOTE, CanFrames, Int64s
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import IS_FD_LENGTH
 
 from .busmaster import BUSMASTER_HEAD, Busmaster

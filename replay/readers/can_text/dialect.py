@@ -17,19 +17,12 @@ from typing import ClassVar, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.base import (
-    EVERYTHING,
-    Block,
-    Bytes,
-    CanFrames,
-    Closing,
-    Int64s,
-    Ledger,
-    Limits,
-    LogFormatError,
-    Selection,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block, Bytes, CanFrames, Int64s, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import (
     FrameRows,
     blocks_by_bus,

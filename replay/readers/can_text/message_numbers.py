@@ -12,7 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Int64s, Ledger
+from crosscue.replay.columns import Int64s
+from crosscue.replay.ledger import Ledger
 
 from .digits import Bools
 

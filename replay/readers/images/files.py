@@ -10,20 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import (
-    BLOCK_BYTES,
-    EVERYTHING,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Images,
-    Ledger,
-    Limits,
-    Messages,
-    Selection,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import BLOCK_BYTES, Block, Images, Messages, Topic
 from crosscue.replay.decode.coding import IMAGE_SUFFIXES, MAGIC_BYTES, coding_of
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.timed_files import TimedFiles, list_files
 from crosscue.replay.seal.touched import Touched, open_noted
 

@@ -10,19 +10,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    EVERYTHING,
-    Block,
-    Closing,
-    Ledger,
-    Limits,
-    Log,
-    LogFormatError,
-    Selection,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Log, Selection
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.closing import Closing
 from crosscue.replay.files.time_file_names import find_time_file
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import pair
 from crosscue.replay.seal.touched import Touched

@@ -21,23 +21,13 @@ from typing import TYPE_CHECKING, BinaryIO, Final, cast
 
 import numpy as np
 
-from crosscue.replay.base import (
-    BLOCK_BYTES,
-    EVERYTHING,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Closing,
-    Images,
-    Int64s,
-    Ledger,
-    Limits,
-    LogFormatError,
-    Messages,
-    Selection,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import BLOCK_BYTES, Block, Images, Int64s, Messages, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.closing import Closing
 from crosscue.replay.files.time_file_names import time_file_of_video
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.time_file import SECOND_NS, TimeFile, read_time_file
 
 from .files import image_block

@@ -12,7 +12,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Final
 
-from crosscue.replay.base import Limits, Topic
+from crosscue.replay.columns import Topic
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.chunks.rows import Definition
 
 from .records import CHANNEL, Channel, Schema, read_channel, read_schema

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from crosscue.replay.base import Ledger
+from crosscue.replay.ledger import Ledger
 
 
 @dataclass(slots=True)

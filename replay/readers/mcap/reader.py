@@ -21,7 +21,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import EVERYTHING, Block, Closing, Ledger, Limits, Selection, Topic
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.remote.ranges import RangedFile
 from crosscue.replay.seal.touched import Touched
 

@@ -11,7 +11,10 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import EVERYTHING, Block, Bytes, Ledger, Limits, Selection
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block, Bytes
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.chunks.blocks import BlockBuilder
 from crosscue.replay.readers.mcap.chunks.load import Load, Loader, Stretch
 from crosscue.replay.readers.mcap.chunks.rows import (

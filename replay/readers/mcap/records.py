@@ -15,7 +15,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Bytes, LogFormatError
+from crosscue.replay.columns import Bytes
+from crosscue.replay.errors import LogFormatError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 

@@ -13,8 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Limits, LogFormatError
+from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.checksum import crc32
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.chunks.chunk_table import ChunkTable, run_of, table_of
 from crosscue.replay.readers.mcap.chunks.inflate import inflate, inflate_prefix
 from crosscue.replay.readers.mcap.chunks.rows import NEVER_IN_A_CHUNK, Definition, rows_by_scan

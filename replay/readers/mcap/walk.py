@@ -16,7 +16,8 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.base import Bytes, Limits
+from crosscue.replay.columns import Bytes
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.chunks.rows import Rows, opcodes, rows_by_scan
 from crosscue.replay.readers.mcap.damage.find import (
     REPAIRED,

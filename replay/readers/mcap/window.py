@@ -19,7 +19,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Limits, Selection
+from crosscue.replay.base import Selection
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.chunks.chunk_table import ChunkTable
 
 from .bytes import ByteFile

@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, Final
 
-from crosscue.replay.base import Limits, LogFormatError
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.limits import Limits
 
 _HEAD: Final = struct.Struct("<4s4xQQ")
 HEAD_BYTES: Final = 24

@@ -16,22 +16,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import (
-    BLOCK_ROWS,
-    EVERYTHING,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Closing,
-    Int64s,
-    Ledger,
-    Limits,
-    Log,
-    LogFormatError,
-    Selection,
-    Table,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Log, Selection
+from crosscue.replay.columns import BLOCK_ROWS, Block, Int64s, Table, Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import (
     BUSES_MAX,
     NO_ROWS,

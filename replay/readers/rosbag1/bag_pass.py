@@ -9,20 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import (
-    BLOCK_BYTES,
-    BLOCK_ROWS,
-    EVERYTHING,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Bytes,
-    Int64s,
-    Ledger,
-    Limits,
-    Selection,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Block, Bytes, Int64s, Topic
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mixed import MixedRows, blocks_of
 
 from .chunk import CUT, TOO_LARGE, ChunkRows, Inflated, inflate, read_chunk

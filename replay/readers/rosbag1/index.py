@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
-from crosscue.replay.base import Limits
+from crosscue.replay.limits import Limits
 
 from .chunk import inflate, read_chunk
 from .records import (

@@ -11,18 +11,12 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    EVERYTHING,
-    Block,
-    Closing,
-    Ledger,
-    Limits,
-    LogError,
-    LogFormatError,
-    Selection,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block, Topic
+from crosscue.replay.errors import LogError, LogFormatError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.remote.ranges import RangedFile
 from crosscue.replay.seal.touched import Touched
 

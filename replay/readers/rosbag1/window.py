@@ -12,7 +12,8 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
-from crosscue.replay.base import Limits, Selection
+from crosscue.replay.base import Selection
+from crosscue.replay.limits import Limits
 
 from .index import ChunkUnit, Contents, Gap, units
 from .records import BagFile, ChunkInfo, Record

@@ -14,20 +14,11 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    EVERYTHING,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Closing,
-    Int64s,
-    Ledger,
-    Limits,
-    Messages,
-    Selection,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block, Int64s, Messages, Topic
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.can_rows import keep_memory
 from crosscue.replay.readers.mixed import MixedRows, blocks_of
 

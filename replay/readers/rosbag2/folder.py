@@ -15,19 +15,12 @@ from typing import Final, cast
 
 import numpy as np
 
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    DETAILS_KEPT,
-    EVERYTHING,
-    Block,
-    Closing,
-    Ledger,
-    Limits,
-    LogError,
-    Messages,
-    Selection,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Block, Messages, Topic
+from crosscue.replay.errors import LogError
+from crosscue.replay.files.closing import Closing
+from crosscue.replay.ledger import DETAILS_KEPT, Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 from .inflate import DAMAGED, inflated
 from .merge import Stream, merged

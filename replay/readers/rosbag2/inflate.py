@@ -8,7 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import BLOCK_BYTES, Bytes, Int64s, Limits, Messages
+from crosscue.replay.columns import BLOCK_BYTES, Bytes, Int64s, Messages
+from crosscue.replay.limits import Limits
 
 # First bytes of a zstd frame as a little-endian number; no CDR message starts with them.
 ZSTD_MAGIC: Final = 0xFD2FB528

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from crosscue.replay.base import read_at_most, yaml_tree
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import yaml_tree
 
 METADATA_BYTES: Final = 1 << 20
 

@@ -19,7 +19,8 @@ from typing import BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import BLOCK_BYTES, MIB, Bytes, Int64s, Limits, Messages
+from crosscue.replay.columns import BLOCK_BYTES, Bytes, Int64s, Messages
+from crosscue.replay.limits import MIB, Limits
 
 from .sqlite import FAULTS, Database
 from .tables import fetched

@@ -9,18 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import (
-    MIB,
-    CrosscueError,
-    Detail,
-    Ledger,
-    Limits,
-    Log,
-    LogError,
-    Topic,
-    report_missing,
-)
+from crosscue.replay.base import Log, report_missing
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import CrosscueError, LogError
 from crosscue.replay.files.partial_file import Scratch
+from crosscue.replay.ledger import Detail, Ledger
+from crosscue.replay.limits import MIB, Limits
 from crosscue.replay.logs.opening import open_log, open_unsealed
 from crosscue.replay.seal.log import with_seal
 

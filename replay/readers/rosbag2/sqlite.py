@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
-from crosscue.replay.base import MIB, Limits, LogError, LogFormatError
+from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.files.partial_file import Scratch
+from crosscue.replay.limits import MIB, Limits
 
 from .wal import check_wal
 

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.replay.base import Limits, LogFormatError, Topic
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.limits import Limits
 
 from .definitions import known_definition
 from .sqlite import FAULTS, Database, explained

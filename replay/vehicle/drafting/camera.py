@@ -6,8 +6,10 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
 
-from crosscue.replay.base import Ledger, Log, Selection, Table, name_of, warn_of
+from crosscue.replay.base import Log, Selection, name_of
+from crosscue.replay.columns import Table
 from crosscue.replay.decode import decoder_for
+from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.vehicle.roles import Role, role_of
 
 

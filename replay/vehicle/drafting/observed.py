@@ -8,19 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.replay.base import (
-    Block,
-    CanFrames,
-    Floats,
-    Int64s,
-    Ledger,
-    Log,
-    Selection,
-    Table,
-    name_of,
-    warn_of,
-)
+from crosscue.replay.base import Log, Selection, name_of
+from crosscue.replay.columns import Block, CanFrames, Floats, Int64s, Table
 from crosscue.replay.decode import decoder_for
+from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.vehicle.roles import Role, is_table, role_of
 
 from .candidates import Candidate, Kind, candidates
@@ -58,7 +49,7 @@ class Bus:
     @property
     def mobileye(self) -> tuple[str, ...]:
         """Names of a Mobileye's messages on the bus; empty if it is not a Mobileye's bus."""
-        from crosscue.replay.base import LENGTH_UNKNOWN
+        from crosscue.replay.columns import LENGTH_UNKNOWN
         from crosscue.replay.mobileye.layout import layout
 
         found = []

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.replay.base import EmptyResultError, Log, SchemaError, name_of, spelled
+from crosscue.replay.base import Log, name_of
+from crosscue.replay.errors import EmptyResultError, SchemaError
+from crosscue.replay.files.tree_text import spelled
 from crosscue.replay.vehicle.roles import Role, role_of
 
 from .agreement import Verdict

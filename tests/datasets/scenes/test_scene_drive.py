@@ -26,10 +26,12 @@ from crosscue.datasets.truth.truth import load
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.detectors import rle
 from crosscue.eval.cli import run
-from crosscue.replay.base import Block, CanFrames, Images, Ledger, OutputError, SchemaError, Table
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder
+from crosscue.replay.columns import Block, CanFrames, Images, Table
 from crosscue.replay.decode import decoder_for
+from crosscue.replay.errors import OutputError, SchemaError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.vehicle.vehicle import load as load_vehicle

@@ -22,7 +22,10 @@ from crosscue.detectors.cues.far_side import (
     state_at,
     vehicles_past,
 )
-from crosscue.replay.base import Block, Floats, Ledger, Selection, Topic, VehicleError
+from crosscue.replay.base import Selection
+from crosscue.replay.columns import Block, Floats, Topic
+from crosscue.replay.errors import VehicleError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import MOBILEYE_SIGNALS, Samples, Signal

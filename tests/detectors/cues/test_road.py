@@ -10,7 +10,7 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.observed import RoadFractions
 from crosscue.detectors.cues.road import region_mask, road_fractions
-from crosscue.replay.base import VehicleError
+from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.vehicle import Regions, parse
 
 

@@ -5,7 +5,8 @@ import pytest
 from scipy.optimize import curve_fit
 
 from crosscue.detectors.ranging.height_to_range import FAMILIES, Family, fit_range, range_of
-from crosscue.replay.base import Floats, UsageError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import UsageError
 from crosscue.replay.vehicle.vehicle import RangeCurve
 
 TRUE: dict[Family, tuple[float, ...]] = {

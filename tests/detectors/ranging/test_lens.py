@@ -11,7 +11,7 @@ import pytest
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.ranging.lens import Lens, lens_of, with_lenses
 from crosscue.detectors.result_cache import ResultCache
-from crosscue.replay.base import Bytes
+from crosscue.replay.columns import Bytes
 from support.data import shared
 
 BGR = {"red": (40, 30, 230), "yellow": (20, 180, 240), "green": (200, 230, 60)}

@@ -7,7 +7,7 @@ import pytest
 
 from crosscue.detectors.ranging.object_tracks import Facing, Motion, ObjectTracks, Track
 from crosscue.detectors.ranging.standard_sizes import light_size
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 FOCAL_PX = 1500.0
 CENTER_PX = (960.0, 540.0)

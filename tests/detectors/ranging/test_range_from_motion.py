@@ -12,7 +12,7 @@ from crosscue.detectors.ranging.range_from_motion import (
     range_from_motion,
 )
 from crosscue.detectors.ranging.standard_sizes import SizePrior
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 FOCAL_PX = 1500.0
 LIGHT = SizePrior(1.2, 0.25)

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from crosscue.detectors.ranging.travel_direction import travel_between
-from crosscue.replay.base import Bytes, Floats
+from crosscue.replay.columns import Bytes, Floats
 
 FOCAL_PX, SIZE_PX = 600.0, (640, 400)
 CENTER_PX = (320.0, 200.0)

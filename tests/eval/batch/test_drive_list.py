@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
-from crosscue.replay.base import CrosscueError, LogError, UsageError
+from crosscue.replay.errors import CrosscueError, LogError, UsageError
 
 
 def _touch(folder: Path, *names: str) -> Path:

@@ -24,7 +24,7 @@ from crosscue.eval.batch.jobs import (
     state_of,
 )
 from crosscue.eval.batch.processes import Processes
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 from crosscue.replay.losses import losses_heard
 from crosscue.replay.progress import Progress, watching
 from support.drive_work import Letters, letters, write_jobs

@@ -10,7 +10,7 @@ from crosscue.eval.batch.merge import is_merged, merge_runs
 from crosscue.eval.runs.folder import RunFolder, create, open_run, write_manifest
 from crosscue.eval.runs.manifest import MergedManifest
 from crosscue.eval.runs.tables.parquet import TableSink
-from crosscue.replay.base import RunError
+from crosscue.replay.errors import RunError
 from support.drive_work import letters, write_jobs
 from support.manifests import estimated
 from support.trees import tree

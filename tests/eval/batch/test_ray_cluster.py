@@ -21,7 +21,7 @@ from crosscue.eval.studies.town import work
 from crosscue.eval.studies.town.settings import LandmarkStudy
 from crosscue.eval.studies.town.work import assemble, chunks_of, run
 from crosscue.localization.town.settings import City, Drive
-from crosscue.replay.base import CrosscueError, UsageError, WorkerError
+from crosscue.replay.errors import CrosscueError, UsageError, WorkerError
 from support.drive_work import letters, write_jobs
 from support.trees import tree
 

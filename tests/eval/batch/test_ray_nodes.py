@@ -14,7 +14,7 @@ import pytest
 
 from crosscue.eval.batch.jobs import Done, in_turn, run_many
 from crosscue.eval.batch.ray_jobs import OnRay
-from crosscue.replay.base import CrosscueError
+from crosscue.replay.errors import CrosscueError
 from support.drive_work import Letters, letters, write_jobs
 from support.trees import tree
 

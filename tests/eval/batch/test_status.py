@@ -18,7 +18,7 @@ from crosscue.eval.batch.merge import gathered
 from crosscue.eval.batch.status import DriveState, drives_of_folder, pace_of
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import FAILURE, LOCK, signature
-from crosscue.replay.base import UnreadableRunError
+from crosscue.replay.errors import UnreadableRunError
 from support.drive_work import letters, write_jobs
 
 WORDS = ("plain", "damaged", "bug", "loss")

@@ -8,15 +8,9 @@ import pytest
 import crosscue
 from crosscue.eval.batch.merge import gathered, merge_runs
 from crosscue.eval.runs.account import Account, Line
-from crosscue.eval.runs.folder import (
-    MANIFEST,
-    TIMINGS,
-    RunFolder,
-    Timings,
-    create,
-    write_timings,
-)
-from crosscue.replay.base import UnreadableRunError, UsageError
+from crosscue.eval.runs.folder import MANIFEST, TIMINGS, RunFolder, create, write_timings
+from crosscue.eval.runs.manifest import Timings
+from crosscue.replay.errors import UnreadableRunError, UsageError
 from support.catalog_runs import add_run, approach_row, runs_below, scene
 
 

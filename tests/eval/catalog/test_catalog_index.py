@@ -14,7 +14,7 @@ from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.catalog.query import index, records
 from crosscue.eval.catalog.query.index import NAME
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.replay.base import UnreadableRunError
+from crosscue.replay.errors import UnreadableRunError
 from crosscue.replay.files.partial_file import PartialFile
 from support.catalog_runs import add_run, approach_row, change, runs_below, scene
 

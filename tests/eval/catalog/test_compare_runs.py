@@ -13,7 +13,7 @@ from crosscue.eval.catalog.compare import compare_runs, open_scored, read_tolera
 from crosscue.eval.runs.account import Account, line
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.by_drive import table_of
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.scoring import (

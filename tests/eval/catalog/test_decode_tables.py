@@ -11,7 +11,8 @@ import pytest
 from crosscue.eval import cli
 from crosscue.eval.catalog.decoded_logs import decode_tables, file_name
 from crosscue.eval.runs.folder import RunFolder, create
-from crosscue.replay.base import EVERYTHING, Block, Messages, Table, Topic
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.columns import Block, Messages, Table, Topic
 from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.settings import MobileyeSettings

@@ -15,7 +15,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 import crosscue
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.replay.base import UnreadableRunError, UsageError
+from crosscue.replay.errors import UnreadableRunError, UsageError
 from support.catalog_runs import add_run, runs_below
 
 ROWS = 200_000

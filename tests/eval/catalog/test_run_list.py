@@ -7,7 +7,7 @@ import pytest
 from crosscue.eval.batch.merge import merge_runs
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.runs.folder import create, write_manifest
-from crosscue.replay.base import CrosscueError
+from crosscue.replay.errors import CrosscueError
 from support.manifests import estimated
 
 

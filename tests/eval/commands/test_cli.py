@@ -8,7 +8,7 @@ from types import ModuleType
 import pytest
 
 from crosscue.eval import cli
-from crosscue.replay.base import CrosscueError, LogError, UsageError
+from crosscue.replay.errors import CrosscueError, LogError, UsageError
 
 
 def _register_command(monkeypatch: pytest.MonkeyPatch, error: BaseException | None) -> None:

@@ -17,17 +17,10 @@ from hypothesis import strategies as st
 
 from crosscue.eval.cli import run
 from crosscue.eval.logs.summary import lines_of
-from crosscue.replay.base import (
-    DATA,
-    EVERYTHING,
-    Block,
-    CanFrames,
-    Ledger,
-    Messages,
-    Selection,
-    Topic,
-    strict_json,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import DATA, Block, CanFrames, Messages, Topic
+from crosscue.replay.files.tree_text import strict_json
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.log_summary import quick_summary, summarise, together
 from crosscue.replay.safe_text import cells, table, visible, wrapped
 from crosscue.results import plain

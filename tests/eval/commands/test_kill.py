@@ -21,7 +21,7 @@ from crosscue.datasets.scenes.rendering.camera import Camera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import RunFolder, create, locked, open_run
-from crosscue.replay.base import RunError
+from crosscue.replay.errors import RunError
 from support import faults, scenes
 from support.trees import tree
 

@@ -12,7 +12,7 @@ import pytest
 
 import crosscue
 from crosscue.eval import cli
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 from support.catalog_runs import add_run, runs_below
 from support.trees import tree
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from crosscue.eval import cli
-from crosscue.replay.base import MIB
+from crosscue.replay.limits import MIB
 from support import scene_run as pictured
 from support.scoring import approach, good_truth, span, truth, truth_folder
 

@@ -19,7 +19,7 @@ from crosscue.eval.failures.order import cause_groups, diverse, ranked
 from crosscue.eval.failures.record import Failure, distance_bin, read_failures, write_failures
 from crosscue.eval.scoring.columns import BeliefRows
 from crosscue.eval.scoring.scene.ranges import RangeJudged
-from crosscue.replay.base import AnnotationError, UnreadableRunError, UsageError
+from crosscue.replay.errors import AnnotationError, UnreadableRunError, UsageError
 from support.scene_run import scene_run
 from support.scoring import at, truth_folder
 

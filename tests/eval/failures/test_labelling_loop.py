@@ -14,8 +14,9 @@ import crosscue
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.detectors.training.annotations import read_coco as read_to_train
 from crosscue.eval.failures.record import Failure
-from crosscue.eval.runs.folder import EstimateManifest, write_manifest
-from crosscue.replay.base import AnnotationError, OutputError, SchemaError, UsageError
+from crosscue.eval.runs.folder import write_manifest
+from crosscue.eval.runs.manifest import EstimateManifest
+from crosscue.replay.errors import AnnotationError, OutputError, SchemaError, UsageError
 from crosscue.replay.progress import watching
 from support.scene_run import SIZE, scene_run
 from support.scoring import at, truth_folder

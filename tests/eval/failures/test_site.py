@@ -12,7 +12,7 @@ import pytest
 import crosscue
 from crosscue.eval.failures.record import Failure, read_failures, write_failures
 from crosscue.eval.failures.site import FACETS, PER_PAGE, entries_of, write_lists
-from crosscue.replay.base import EmptyResultError, OutputError, UsageError
+from crosscue.replay.errors import EmptyResultError, OutputError, UsageError
 from support.scene_run import scene_run
 from support.scoring import truth_folder
 

@@ -22,7 +22,7 @@ from crosscue.eval.fit.detector.threshold import (
     threshold_for,
 )
 from crosscue.eval.scoring.boxes.reliability import reliability
-from crosscue.replay.base import SchemaError, UsageError
+from crosscue.replay.errors import SchemaError, UsageError
 from support.onnx_models import bright_box_model, constant_model
 
 

@@ -22,7 +22,9 @@ from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.smoother import score_smoother
 from crosscue.eval.studies.town.replayed import score_pose
-from crosscue.replay.base import EVERYTHING, Block, Floats, Table, Topic, UsageError, VehicleError
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.columns import Block, Floats, Table, Topic
+from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.vehicle.pose import Gnss, GnssUse, Odometry, Start
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block

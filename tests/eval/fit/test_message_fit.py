@@ -13,7 +13,7 @@ from crosscue.datasets.truth.truth import load
 from crosscue.eval.cli import run as crosscue
 from crosscue.eval.fit.annotated_runs import AnnotatedRuns, annotate, graph_of_runs
 from crosscue.eval.runs.folder import RunFolder, open_run
-from crosscue.replay.base import RunError, UsageError
+from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from support.fusion_runs import (
     made_up_drive,

@@ -11,7 +11,7 @@ from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval.fit.odometry import FittedOdometry
 from crosscue.eval.fit.vehicle_output import check_output, write_fit
-from crosscue.replay.base import EmptyResultError, UsageError
+from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 BIAS = 0.002

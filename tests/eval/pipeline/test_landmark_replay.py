@@ -26,7 +26,8 @@ from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.localization.landmarks.images import grey_of
 from crosscue.localization.landmarks.update import best_of
-from crosscue.replay.base import Block, Bytes, Floats, Images, Ledger, Messages
+from crosscue.replay.columns import Block, Bytes, Floats, Images, Messages
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 from support.data import shared
 from support.landmark_files import database_of, encoded, seen_from, wall

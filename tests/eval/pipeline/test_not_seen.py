@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from crosscue.eval.runs.folder import EstimateManifest, RunFolder, SceneSummary
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import EstimateManifest, SceneSummary
 from support.gap_drive import Clock, GreyNumber, replayed, write_drive
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import RunFolder, open_run
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from support.data import shared
 
 CAR = """

@@ -11,7 +11,9 @@ from crosscue.eval import cli
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import create
-from crosscue.replay.base import EVERYTHING, Block, EmptyResultError, RunError, VehicleError
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.columns import Block
+from crosscue.replay.errors import EmptyResultError, RunError, VehicleError
 from crosscue.replay.vehicle.pose import Start
 from crosscue.replay.vehicle.time import Time
 from crosscue.replay.vehicle.vehicle import Vehicle, parse

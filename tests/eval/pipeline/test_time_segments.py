@@ -16,7 +16,8 @@ from crosscue.eval.runs.folder import create
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.pose_track import start_belief
-from crosscue.replay.base import EVERYTHING, Block, Int64s
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.columns import Block, Int64s
 from crosscue.replay.time.stamp_watch import StampWatch
 from crosscue.replay.vehicle.pose import Start
 from crosscue.replay.vehicle.time import Time

@@ -17,7 +17,8 @@ from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.smoother import score_smoother
 from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
-from crosscue.replay.base import EVERYTHING, Floats
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.columns import Floats
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 from support.gap_drive import (

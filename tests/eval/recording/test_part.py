@@ -13,7 +13,7 @@ import crosscue
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.moments import part_of
-from crosscue.replay.base import UsageError
+from crosscue.replay.errors import UsageError
 from support.scene_run import scene_run
 from support.scoring import at
 

@@ -24,7 +24,7 @@ from crosscue.eval.recording.marks import road_lines
 from crosscue.eval.recording.notes import inert
 from crosscue.eval.recording.plan import log_landmarks
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
-from crosscue.replay.base import LogError
+from crosscue.replay.errors import LogError
 from support.scene_run import FRAMES, LABEL, TOPIC, scene_run, write_pictures
 from support.scoring import at, good_truth, truth_folder
 

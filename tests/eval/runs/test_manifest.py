@@ -20,7 +20,9 @@ from crosscue.eval.runs.manifest import (
     Manifest,
     TimeSegments,
 )
-from crosscue.replay.base import EVERYTHING, RunError, Topic
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.columns import Topic
+from crosscue.replay.errors import RunError
 from crosscue.replay.time.segments import Cause, Epoch, LogClock, Marks, Segment
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.manifests import detected, estimated, log_account

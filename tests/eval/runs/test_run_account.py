@@ -30,13 +30,13 @@ from crosscue.eval.runs.account import (
 )
 from crosscue.eval.runs.folder import create, open_run
 from crosscue.eval.runs.tables.skipped import write_skipped
-from crosscue.replay.base import (
+from crosscue.replay.errors import AccountError
+from crosscue.replay.ledger import (
     CHANGED,
     DETAILS_KEPT,
     DIFFERS,
     NOT_ASKED_TIME,
     NOT_ASKED_TOPIC,
-    AccountError,
     Ledger,
 )
 from support.manifests import log_account

@@ -13,7 +13,8 @@ import pytest
 from crosscue.eval.runs import folder
 from crosscue.eval.runs.folder import create, locked, open_run
 from crosscue.eval.runs.tables.parquet import TableSink
-from crosscue.replay.base import OutputError, RunError, UsageError, write_text, write_whole
+from crosscue.replay.errors import OutputError, RunError, UsageError
+from crosscue.replay.files.whole_file import write_text, write_whole
 
 SCHEMA = pa.schema([("t_ns", pa.int64())])
 

@@ -10,7 +10,7 @@ from crosscue.eval import cli
 from crosscue.eval.batch.merge import gathered, merge_runs
 from crosscue.eval.runs.folder import MANIFEST, clear, create, locked, open_run, staged
 from crosscue.eval.runs.manifest import MergedManifest
-from crosscue.replay.base import RunError, UnreadableRunError, UsageError
+from crosscue.replay.errors import RunError, UnreadableRunError, UsageError
 from support.catalog_runs import add_run, runs_below
 from support.manifests import estimated
 from support.trees import tree

@@ -30,7 +30,8 @@ from crosscue.eval.scoring.pose.errors import (
     summarise_nees,
 )
 from crosscue.eval.scoring.pose.quaternions import angle_rad, between, inverse, product, rotate
-from crosscue.replay.base import Floats, UsageError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import UsageError
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

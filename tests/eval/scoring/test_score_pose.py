@@ -23,16 +23,10 @@ from crosscue.eval.scoring.files import FOLDER
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
 from crosscue.eval.scoring.runs import judge_run, metrics_of, scores_of
 from crosscue.eval.studies.town.replayed import score_pose
-from crosscue.replay.base import (
-    EVERYTHING,
-    Block,
-    Images,
-    Ledger,
-    Messages,
-    RunError,
-    SchemaError,
-    Topic,
-)
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.columns import Block, Images, Messages, Topic
+from crosscue.replay.errors import RunError, SchemaError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.pose import Start
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle

@@ -22,7 +22,7 @@ from crosscue.eval.runs.manifest import FORMAT_VERSION, LogRow, Part
 from crosscue.eval.scoring.gates import Gate, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.eval.scoring.runs import judge_run
-from crosscue.replay.base import RunError, UsageError
+from crosscue.replay.errors import RunError, UsageError
 from support.manifests import WHOLE_LOG
 from support.scoring import (
     BELIEF,

@@ -8,7 +8,7 @@ from crosscue.eval.runs.tables.travelled import Odometer
 from crosscue.eval.scoring.columns import RangeRows
 from crosscue.eval.scoring.scene.ranges import smoothed_rows
 from crosscue.fusion.intersection_range import RangeBelief, initialise, predict, update
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 SENSOR_M2, WAY_M2, STEP_M, STEP_NS = 4.0, 0.01, 1.0, 100_000_000
 

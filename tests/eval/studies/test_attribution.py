@@ -8,7 +8,7 @@ import pytest
 from crosscue.eval.scoring.columns import RunTables
 from crosscue.eval.scoring.drives import as_metrics, judge, score
 from crosscue.eval.studies.attribution import Drive, attribute, attribution_lines, attribution_tree
-from crosscue.replay.base import strict_json
+from crosscue.replay.files.tree_text import strict_json
 from support.scoring import BELIEF, CUES, belief_table, good_truth, range_table, tables
 
 Beliefs = Mapping[str, Mapping[int, float]]

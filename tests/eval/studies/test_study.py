@@ -46,7 +46,8 @@ from crosscue.eval.studies.town.settings import (
 from crosscue.eval.studies.town.work import assemble, chunks_of, run
 from crosscue.localization.town.drive import Keys, Result, drive_many
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
-from crosscue.replay.base import Floats, RunError, StudyFileError, UsageError, WorkerError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import RunError, StudyFileError, UsageError, WorkerError
 
 TOWN = Drive(city=City(largest_km2=2.0))
 SMALL = LandmarkStudy(

@@ -14,7 +14,8 @@ from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.eval.cli import run
 from crosscue.eval.vehicle.check import Checked, _normalized, check
 from crosscue.eval.vehicle.ground_picture import draw_ground
-from crosscue.replay.base import EVERYTHING, Block, Table, Topic
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.columns import Block, Table, Topic
 from crosscue.replay.vehicle.drafting.series import Series
 from crosscue.replay.vehicle.pose import Odometry
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle

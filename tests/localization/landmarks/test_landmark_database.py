@@ -22,7 +22,8 @@ from crosscue.localization.landmarks.database import (
     is_positive,
 )
 from crosscue.localization.landmarks.features import Features
-from crosscue.replay.base import Floats, LogError, LogFormatError, OutputError, UsageError
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import LogError, LogFormatError, OutputError, UsageError
 from support.landmark_files import database_of, place_at, some_features
 
 GRID = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0)), axis=-1).reshape(-1, 2) * 50.0

@@ -12,16 +12,9 @@ from hypothesis import strategies as st
 from crosscue.localization.landmarks.features import CameraGeometry, Features, make_matcher
 from crosscue.localization.landmarks.images import grey_of, picture_of, read_picture
 from crosscue.localization.landmarks.matcher import OrbMatcher, OrbSettings
-from crosscue.replay.base import (
-    Bytes,
-    Images,
-    Limits,
-    LogError,
-    LogFormatError,
-    LogTooLargeError,
-    Messages,
-    UsageError,
-)
+from crosscue.replay.columns import Bytes, Images, Messages
+from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError, UsageError
+from crosscue.replay.limits import Limits
 from support.data import shared
 from support.landmark_files import encoded, seen_from, some_features, wall
 

@@ -27,7 +27,7 @@ from crosscue.localization.pose_track import (
     advance,
     start_belief,
 )
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from support.landmark_drive import PlaceMeasurements, features_at, landmarks_along, search_in
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
 

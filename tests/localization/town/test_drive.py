@@ -29,7 +29,7 @@ from crosscue.localization.town.drive import (
     drive_traced,
 )
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 from crosscue.replay.compiled import fingerprint
 
 FIELD = {name: i for i, name in enumerate(Result._fields)}

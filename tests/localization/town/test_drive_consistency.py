@@ -21,7 +21,7 @@ from crosscue.localization.town.drive import (
     drive_traced,
 )
 from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
-from crosscue.replay.base import Floats
+from crosscue.replay.columns import Floats
 
 NEES = Result._fields.index("nees")
 FINE_M = 1e-4

@@ -9,9 +9,10 @@ from pathlib import Path
 import cantools
 import pytest
 
-from crosscue.replay.base import CrosscueError, Limits, LogTooLargeError, SchemaError
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.layout import CanMessage, CanSignal
+from crosscue.replay.errors import CrosscueError, LogTooLargeError, SchemaError
+from crosscue.replay.limits import Limits
 from support.can_layouts import dbc_text
 from support.data import shared
 

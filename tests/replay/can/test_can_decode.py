@@ -17,12 +17,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Block, Ledger, Table
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
 from crosscue.replay.can.encode import encode
 from crosscue.replay.can.extract import PRESENT_SUFFIX
 from crosscue.replay.can.layout import Arithmetic, CanMessage, CanSignal, is_whole
+from crosscue.replay.columns import Block, Table
+from crosscue.replay.ledger import Ledger
 from support.can_layouts import block_of, dbc_text, frames_of, messages
 
 ENGINES: tuple[EngineName, ...] = ("numpy", "numba")

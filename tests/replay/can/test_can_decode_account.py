@@ -10,21 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import (
-    ERROR,
-    LENGTH_UNKNOWN,
-    NOT_ASKED_TOPIC,
-    REMOTE,
-    Block,
-    CanFrames,
-    Ledger,
-    Table,
-)
 from crosscue.replay.can import decode as decoding
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
 from crosscue.replay.can.grouping import Engine, Rules
 from crosscue.replay.can.layout import CanMessage, CanSignal
+from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Table
+from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
 from support.can_layouts import block_of, frames_of
 
 SPEED = CanMessage("Speed", 0x100, False, 2, (CanSignal("kph", 0, 16, scale=0.01, unit="km/h"),))

@@ -9,10 +9,11 @@ import pytest
 from cantools.database.can import Message
 from cantools.database.can.formats import dbc
 
-from crosscue.replay.base import Block, CanFrames, Ledger, Table
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import TOO_SHORT, UNKNOWN_ID, BusDecoder, DecodeSettings, EngineName
 from crosscue.replay.can.layout import overlaps
+from crosscue.replay.columns import Block, CanFrames, Table
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from support.can_layouts import comma2k19_frames, ford_frames
 from support.data import shared

@@ -8,10 +8,11 @@ from typing import Final
 import numpy as np
 import pytest
 
-from crosscue.replay.base import Block, CanFrames, Ledger, Table
 from crosscue.replay.can import numpy_engine
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings
+from crosscue.replay.columns import Block, CanFrames, Table
+from crosscue.replay.ledger import Ledger
 
 IDS: Final = (256, 257, 258)
 

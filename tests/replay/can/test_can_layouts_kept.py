@@ -14,15 +14,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    Block,
-    CanFrames,
-    Ledger,
-    SchemaError,
-    Table,
-    json_tree,
-)
 from crosscue.replay.can import database
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.dbc_text import read_dbc
@@ -30,6 +21,11 @@ from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.can.layout import CanMessage
 from crosscue.replay.can.layout_cache import VARIABLE, cache_folder
 from crosscue.replay.can.sources import DatabaseText, read_text
+from crosscue.replay.columns import Block, CanFrames, Table
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS
 from support.can_layouts import dbc_text, messages
 from support.data import shared
 

@@ -6,10 +6,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import DATA, ERROR, REMOTE, Block, CanFrames, Ledger
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
 from crosscue.replay.can.layout import CanMessage, CanSignal
+from crosscue.replay.columns import DATA, ERROR, REMOTE, Block, CanFrames
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.admit import Admission, all_ids
 from crosscue.replay.mobileye.settings import MobileyeSettings
 

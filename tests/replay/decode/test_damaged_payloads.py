@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from crosscue.eval import cli
-from crosscue.replay.base import Ledger, Topic
+from crosscue.replay.columns import Topic
+from crosscue.replay.ledger import Ledger
 from support.ros_messages import (
     block_of,
     decoder_of,

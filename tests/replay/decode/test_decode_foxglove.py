@@ -18,9 +18,11 @@ from google.protobuf import (  # type: ignore[import-untyped]
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import Block, Images, Ledger, SchemaError, Table, Topic
+from crosscue.replay.columns import Block, Images, Table, Topic
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.refuse import MISFIT
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
 from support.ros_messages import block_of, decoder_of
 
 F = descriptor_pb2.FieldDescriptorProto

@@ -13,12 +13,14 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from crosscue.replay.base import Block, CanFrames, Images, Ledger, SchemaError, Table, Topic
+from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.refuse import MISFIT, WRONG_CODING
 from crosscue.replay.decode.ros.decoder import RosDecoder
 from crosscue.replay.decode.ros.fields import WalkedFields
 from crosscue.replay.decode.ros.standard import Kind, generic
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.ledger import Ledger
 from support.ros_messages import (
     block_of,
     decoder_of,

@@ -11,8 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from crosscue.eval.cli import run
-from crosscue.replay.base import Block, Images, Ledger, Topic
+from crosscue.replay.columns import Block, Images, Topic
 from crosscue.replay.decode.packets import NO_PICTURE, NOT_DECODED
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Plan, Source

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import Int64s
+from crosscue.replay.columns import Int64s
 from crosscue.replay.mobileye.clock import (
     GAP_NS,
     LONG_GAP,

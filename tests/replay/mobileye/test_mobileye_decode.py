@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Ledger, Table
+from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Table
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.layout import VARIANTS

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import Block, CanFrames, Floats, Ledger, Table
+from crosscue.replay.columns import Block, CanFrames, Floats, Table
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.can.encode import FRAME_NS, LATENCY_NS, bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import Mounting

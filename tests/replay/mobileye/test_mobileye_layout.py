@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import SchemaError
+from crosscue.replay.errors import SchemaError
 from crosscue.replay.mobileye.bits import extract, payloads_of, place, words_of
 from crosscue.replay.mobileye.layout import VARIANTS, Message, describe, layout, parse
 from crosscue.replay.mobileye.wire import columns_of, from_given, from_raw, values_of

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import Block, CanFrames, Ledger, Table
+from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.decode import decoder_for
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import Mounting
 from crosscue.replay.mobileye.layout import layout

@@ -12,7 +12,7 @@ import lz4.frame
 import pytest
 import zstandard
 
-from crosscue.replay.base import DEFAULT_LIMITS
+from crosscue.replay.limits import DEFAULT_LIMITS
 from support.mcap_files import MAGIC, ChunkOf, channel, header, message, record, schema, text
 from support.measured import measured
 from support.rosbag_files import header_field

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from crosscue.detectors.images import MAX_PIXELS
-from crosscue.replay.base import DEFAULT_LIMITS, MIB
+from crosscue.replay.limits import DEFAULT_LIMITS, MIB
 from support.can_files import blf, random_frames
 from support.measured import measured
 from support.mf4_files import unsorted

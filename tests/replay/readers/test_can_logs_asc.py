@@ -8,7 +8,8 @@ from pathlib import Path
 import can
 import pytest
 
-from crosscue.replay.base import DATA, ERROR, REMOTE, LogFormatError
+from crosscue.replay.columns import DATA, ERROR, REMOTE
+from crosscue.replay.errors import LogFormatError
 from crosscue.replay.logs.opening import open_log
 from support.can_files import Sent, assert_equal_to_python_can, read_back
 from support.data import shared

@@ -13,7 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import ERROR, NOT_ASKED_TIME, Ledger, Limits, LogFormatError, Selection
+from crosscue.replay.base import Selection
+from crosscue.replay.columns import ERROR
+from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import NOT_ASKED_TIME, Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.logs.opening import open_log
 from support.can_files import (
     START_NS,

@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import DATA, ERROR, REMOTE, LogFormatError, Selection
+from crosscue.replay.base import Selection
+from crosscue.replay.columns import DATA, ERROR, REMOTE
+from crosscue.replay.errors import LogFormatError
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.can_text import dialect as can_text
 from crosscue.replay.readers.can_text import digits

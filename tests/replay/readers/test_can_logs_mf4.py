@@ -13,15 +13,11 @@ import can
 import numpy as np
 import pytest
 
-from crosscue.replay.base import (
-    EVERYTHING,
-    CrosscueError,
-    Ledger,
-    Limits,
-    LogFormatError,
-    Selection,
-    Table,
-)
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.columns import Table
+from crosscue.replay.errors import CrosscueError, LogFormatError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.mf4.blocks import Blocks
 from support.can_files import Sent, assert_equal_to_python_can, random_frames, read_back

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from crosscue.replay.base import CanFrames, Ledger
+from crosscue.replay.columns import CanFrames
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from support.can_files import Sent, by_bus, random_frames, read_back
 from support.data import shared

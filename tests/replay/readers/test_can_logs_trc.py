@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import DATA, ERROR, REMOTE, LogFormatError
+from crosscue.replay.columns import DATA, ERROR, REMOTE
+from crosscue.replay.errors import LogFormatError
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.can_text.lines import CHUNK_BYTES
 from crosscue.replay.readers.can_text.message_numbers import GO_BACK, MISFIT, MISSING

@@ -11,15 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval.cli import run
-from crosscue.replay.base import (
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Images,
-    LogError,
-    LogFormatError,
-    Selection,
-)
+from crosscue.replay.base import Selection
+from crosscue.replay.columns import Block, Images
+from crosscue.replay.errors import LogError, LogFormatError
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
 from crosscue.replay.logs.opening import open_log
 from support.accounted import read
 from support.videos import number_of, numbers_at_times, video

@@ -13,18 +13,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import (
-    BLOCK_BYTES,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Images,
-    Limits,
-    LogError,
-    LogFormatError,
-    Selection,
-    UnknownFormatError,
-)
+from crosscue.replay.base import Selection
+from crosscue.replay.columns import BLOCK_BYTES, Block, Images
+from crosscue.replay.errors import LogError, LogFormatError, UnknownFormatError
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
+from crosscue.replay.limits import Limits
 from crosscue.replay.logs.opening import open_log
 from support.accounted import read
 from support.data import shared

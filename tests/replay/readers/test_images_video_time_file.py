@@ -10,8 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import DEFAULT_LIMITS, Limits, LogFormatError, LogTooLargeError
+from crosscue.replay.errors import LogFormatError, LogTooLargeError
 from crosscue.replay.files.time_file_names import find_time_file, time_file_of_video
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.time_file import TimeFile, read_time_file
 
 quick = settings(

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.replay.base import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Limits, Selection
+from crosscue.replay.base import Selection
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
+from crosscue.replay.limits import Limits
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.mcap.reader import open_mcap
 from support.mcap_files import (

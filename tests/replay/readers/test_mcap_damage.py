@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import zstandard
 
-from crosscue.replay.base import DEFAULT_LIMITS, CrosscueError, Limits, LogFormatError
+from crosscue.replay.errors import CrosscueError, LogFormatError
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.mcap.reader import open_mcap
 from support.mcap_damage import Kind, copies, judge, sound_files, sound_parts
 from support.mcap_files import (
@@ -491,7 +492,7 @@ def test_chunks_without_checksum_are_read_after_damaged_one(
 
 
 def test_file_truncated_while_open_is_reported(tmp_path: Path) -> None:
-    from crosscue.replay.base import Ledger
+    from crosscue.replay.ledger import Ledger
 
     path = tmp_path / "log.mcap"
     coded = McapFile(sound_parts("zstd", is_chunked=True)).coded()

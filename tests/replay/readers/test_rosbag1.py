@@ -14,14 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag1 import Reader
 
-from crosscue.replay.base import (
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Limits,
-    LogError,
-    LogFormatError,
-    Selection,
-)
+from crosscue.replay.base import Selection
+from crosscue.replay.errors import LogError, LogFormatError
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
+from crosscue.replay.limits import Limits
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.rosbag1.reader import open_bag
 from support.data import shared
@@ -465,7 +461,7 @@ def test_chunk_with_too_many_records_is_not_read_completely(tmp_path: Path) -> N
     body = connection(0, b"/a") + message(0, START_NS, b"") * 70_000
     path = bag(tmp_path / "a.bag", chunk(bz2.compress(body), b"bz2", size=len(body)))
     limits = Limits(records_per_chunk=1000)
-    from crosscue.replay.base import Ledger
+    from crosscue.replay.ledger import Ledger
 
     ledger = Ledger("a")
     with open_bag(path, limits) as log:

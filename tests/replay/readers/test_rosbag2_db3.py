@@ -14,14 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import Reader
 
-from crosscue.replay.base import (
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Ledger,
-    LogError,
-    LogFormatError,
-    Selection,
-)
+from crosscue.replay.base import Selection
+from crosscue.replay.errors import LogError, LogFormatError
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.rosbag2.db3 import open_db3
 from crosscue.replay.readers.rosbag2.tables import Tables

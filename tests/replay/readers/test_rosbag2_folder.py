@@ -14,7 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import Reader
 
-from crosscue.replay.base import NOT_ASKED_TIME, LogError, Selection
+from crosscue.replay.base import Selection
+from crosscue.replay.errors import LogError
+from crosscue.replay.ledger import NOT_ASKED_TIME
 from crosscue.replay.logs.opening import open_log
 from support.data import shared
 from support.rosbag_files import Row, by_topic, read_rows, rows_of, write_folder
@@ -276,7 +278,7 @@ def test_compressed_file_cut_near_start_is_refused_with_its_name(tmp_path: Path)
 def test_decompression_stops_at_size_limit(tmp_path: Path) -> None:
     import zstandard
 
-    from crosscue.replay.base import Limits
+    from crosscue.replay.limits import Limits
     from crosscue.replay.readers.rosbag2.split import unpack
 
     packed = tmp_path / "a.db3.zstd"
@@ -317,7 +319,7 @@ def test_temporary_files_are_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyP
     scratch.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(scratch))
     with open_log(folder) as log:
-        from crosscue.replay.base import Ledger
+        from crosscue.replay.ledger import Ledger
 
         blocks = log.read(Ledger("a"))
         next(iter(blocks))

@@ -14,7 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import DEFAULT_LIMITS, EVERYTHING, CrosscueError, Ledger, Selection
+from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.ledger import Ledger
+from crosscue.replay.limits import DEFAULT_LIMITS
 from crosscue.replay.readers.rosbag2 import db3
 from crosscue.replay.readers.rosbag2.db3 import open_db3
 from crosscue.replay.readers.rosbag2.pages import PageRows, page_rows

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.replay.base import Ledger, Table
+from crosscue.replay.columns import Table
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.readers.text_log import MAX_LINE, Row, TextLog
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crosscue.replay.base import Block, Table, Topic
+from crosscue.replay.columns import Block, Table, Topic
 from crosscue.replay.vehicle.drafting.camera import Mounting, camera_lines
 from crosscue.replay.vehicle.drafting.text import _quoted, draft, examine
 from support.memory_log import MemoryLog

@@ -8,7 +8,9 @@ from typing import Final
 import numpy as np
 import pytest
 
-from crosscue.replay.base import DATA, EVERYTHING, Block, CanFrames, Ledger, Table, Topic
+from crosscue.replay.base import EVERYTHING
+from crosscue.replay.columns import DATA, Block, CanFrames, Table, Topic
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.signals.extractor import Extractor
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.signals.plan import plan

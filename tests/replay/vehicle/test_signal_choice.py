@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 import pytest
 
-from crosscue.replay.base import Floats
 from crosscue.replay.can.database import CanDatabase
+from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.drafting.candidates import WHEELS, Candidate, Kind, candidates
 from crosscue.replay.vehicle.drafting.choice import Choices, choose
 from crosscue.replay.vehicle.drafting.observed import Bus, Observed

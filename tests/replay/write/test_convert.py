@@ -22,9 +22,11 @@ from mcap.writer import Writer as PeerWriter
 from rosbags.highlevel import AnyReader
 
 from crosscue.eval.cli import run as crosscue
-from crosscue.replay.base import Block, CanFrames, Ledger, Messages, OutputError, Topic
+from crosscue.replay.columns import Block, CanFrames, Messages, Topic
 from crosscue.replay.encode.copy_ranges import copy_ranges
+from crosscue.replay.errors import OutputError
 from crosscue.replay.files.partial_file import PartialFile
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.write.convert import BAD_SCHEMA, NO_TYPE, TOO_EARLY, LogWriter
 from crosscue.replay.write.mcap import Compression, McapWriter, Stretch

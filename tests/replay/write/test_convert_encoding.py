@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from crosscue.replay.base import (
+from crosscue.replay.columns import (
     LENGTH_UNKNOWN,
     Block,
     CanFrames,
     Images,
-    Ledger,
     Messages,
     Rows,
     Table,
@@ -26,6 +25,7 @@ from crosscue.replay.base import (
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.refuse import MISFIT
 from crosscue.replay.encode.outgoing import TIME_MISFIT, Outgoing
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import Encoders
 from support.ros_messages import (
     block_of,

@@ -9,17 +9,10 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import (
-    BLOCK_ROWS,
-    NOT_ASKED_TIME,
-    NOT_ASKED_TOPIC,
-    Block,
-    Int64s,
-    Ledger,
-    Limits,
-    Messages,
-    Selection,
-)
+from crosscue.replay.base import Selection
+from crosscue.replay.columns import BLOCK_ROWS, Block, Int64s, Messages
+from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.channels import UNKNOWN, Declarations
 from crosscue.replay.readers.mcap.checks import Checks
 from crosscue.replay.readers.mcap.chunks.rows import Rows

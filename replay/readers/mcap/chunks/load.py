@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 from threading import Event
 from typing import Final, Self
 
-from crosscue.replay.base import Bytes, Limits
+from crosscue.replay.columns import Bytes
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.bytes import ByteFile
 from crosscue.replay.readers.mcap.chunks.inflate import inflate, inflate_prefix
 from crosscue.replay.readers.mcap.records import BrokenRecordError

@@ -12,7 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import Bytes, Limits
+from crosscue.replay.columns import Bytes
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.bytes import PIECE, ByteFile
 from crosscue.replay.readers.mcap.chunks.inflate import inflate
 from crosscue.replay.readers.mcap.chunks.rows import NEVER_IN_A_CHUNK, rows_by_scan
