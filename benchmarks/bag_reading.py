@@ -48,7 +48,7 @@ BYTES_A_SECOND: Final = 2_500_000
 MEASURED: Final = """
 import sys
 from pathlib import Path
-from crosscue.replay.base import Ledger
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 with open_log(sys.argv[1]) as log:
     for block in log.read(Ledger("a")):

@@ -30,7 +30,7 @@ DBC: Final = FORD / "ford_lincoln_base_pt.dbc"
 _OURS: Final = """
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings
-from crosscue.replay.base import Ledger
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 import crosscue.replay.readers.can_text.candump, crosscue.replay.seal.log
 began = time.process_time()

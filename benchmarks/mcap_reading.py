@@ -323,7 +323,7 @@ def memory(megabytes: int) -> None:
 PEAK = """
 import sys
 from pathlib import Path
-from crosscue.replay.base import Ledger
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 import crosscue.replay.readers.mcap.reader
 

@@ -1,7 +1,6 @@
 """The run folder, in which the stages exchange their results.
 
 A file gets its final name only when it is complete. A lock file names the process that is writing.
-The records of the manifest, the account and the candidates can be imported from here as well.
 """
 
 from __future__ import annotations
@@ -17,133 +16,24 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.eval.runs.tables.parquet import TableFolder
-from crosscue.replay.base import (
-    DEFAULT_LIMITS,
-    Limits,
-    RunError,
-    UnreadableRunError,
-    cannot_write,
-    door,
-    json_tree,
-    spelled,
-    strict_json,
-    unspelled,
-    write_text,
-)
+from crosscue.replay.errors import RunError, UnreadableRunError
+from crosscue.replay.files import door
 from crosscue.replay.files.partial_file import is_partial, is_still, lock, sweep
+from crosscue.replay.files.tree_text import json_tree, spelled, strict_json, unspelled
+from crosscue.replay.files.whole_file import cannot_write, write_text
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 from . import owned
-from .account import (
-    UNATTRIBUTED,
-    Account,
-    Line,
-    ScoredAccount,
-    SummedAccount,
-    account,
-    account_lines,
-    check,
-    details_of,
-    detecting_of,
-    joined_accounts,
-    line,
-    reading_of,
-    summed,
-)
-from .candidates import CandidateRow, candidate_lines, candidate_rows, not_looked_lines
 from .manifest import (
     FORMAT_VERSION,
-    OWN_FRAME,
-    ApproachRow,
     DecodeManifest,
-    DetectCounts,
-    DetectManifest,
-    DetectorRow,
-    DetectTimings,
     DriveManifest,
-    EstimateCounts,
-    EstimateManifest,
-    LandmarksUsed,
-    LogRow,
     Manifest,
-    MergedDrive,
-    MergedLog,
     MergedManifest,
     OtherVersionError,
-    PoseSummary,
-    SceneSummary,
-    TimeSegments,
     Timings,
-    json_schema,
     parse_manifest,
-    part_of,
 )
-
-__all__ = [
-    "FAILURE",
-    "FORMAT_VERSION",
-    "INPUT",
-    "LOCK",
-    "MANIFEST",
-    "MAX_MANIFEST_BYTES",
-    "OWN_FRAME",
-    "STAGED",
-    "TAGS",
-    "TIMINGS",
-    "UNATTRIBUTED",
-    "Account",
-    "ApproachRow",
-    "CandidateRow",
-    "DecodeManifest",
-    "DetectCounts",
-    "DetectManifest",
-    "DetectTimings",
-    "DetectorRow",
-    "DriveManifest",
-    "EstimateCounts",
-    "EstimateManifest",
-    "LandmarksUsed",
-    "Line",
-    "LogRow",
-    "Manifest",
-    "MergedDrive",
-    "MergedLog",
-    "MergedManifest",
-    "PoseSummary",
-    "RunFolder",
-    "SceneSummary",
-    "ScoredAccount",
-    "SummedAccount",
-    "TableFolder",
-    "TimeSegments",
-    "Timings",
-    "account",
-    "account_lines",
-    "candidate_lines",
-    "candidate_rows",
-    "check",
-    "clear",
-    "create",
-    "details_of",
-    "detecting_of",
-    "is_alive",
-    "joined_accounts",
-    "json_schema",
-    "line",
-    "locked",
-    "not_looked_lines",
-    "open_run",
-    "own_files",
-    "part_of",
-    "reading_of",
-    "refuse_files_of_user",
-    "signature",
-    "staged",
-    "summed",
-    "write_input",
-    "write_manifest",
-    "write_timings",
-]
-
 
 MANIFEST: Final = "manifest.json"
 LOCK: Final = ".lock"

@@ -238,7 +238,8 @@ def test_nothing_opens_file_of_ours_past_the_door() -> None:
 READS: Final = """
 import sys
 from pathlib import Path
-from crosscue.replay.base import door, read_at_most
+from crosscue.replay.files import door
+from crosscue.replay.files.bounded import read_at_most
 path = Path(sys.argv[1])
 print(len(door.read(path, 4 << 30)), len(read_at_most(path, 4 << 30)))
 """

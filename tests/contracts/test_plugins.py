@@ -40,11 +40,12 @@ class Lines:
 
     @property
     def topics(self):
-        from crosscue.replay.base import Topic
+        from crosscue.replay.columns import Topic
         return (Topic("/value", "crosscue/Table", "columns", declared=len(self.lines)),)
 
     def read(self, ledger, selection=None):
-        from crosscue.replay.base import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Block, Table
+        from crosscue.replay.columns import Block, Table
+        from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
         ledger.declare("/value", len(self.lines))
         good = []
         for line in self.lines:
