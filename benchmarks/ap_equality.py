@@ -39,9 +39,9 @@ from pycocotools.cocoeval import COCOeval
 from scipy.spatial.transform import Rotation
 from scipy.stats import beta
 
-from crosscue.detectors.base import Choice, Detections, Frame, View
-from crosscue.detectors.catalog.entries import entry, place_of
-from crosscue.detectors.catalog.fetch import fetch
+from crosscue.detectors.base import Detections, DetectorChoice, Frame, View
+from crosscue.detectors.catalog.entries import entry, weights_path
+from crosscue.detectors.catalog.fetch import fetch_weights
 from crosscue.detectors.catalog.places import card_path
 from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.registry import make
@@ -240,7 +240,9 @@ class Ours:
         text = text.replace(f"height_px = {own.height_px}", f"height_px = {size[1]}")
         text = re.sub(r"\ndecode = .*", "", text)
         card.write_text(text.replace("\n[input]\n", f'\n[input]\ndecode = "{decode}"\n'))
-        self.detector = make(Choice(model, "model", {"card": str(card), "score": min_score}))
+        self.detector = make(
+            DetectorChoice(model, "model", {"card": str(card), "score": min_score})
+        )
         self.numbers = {name: i for i, name in enumerate(entry(model).output.classes)}
 
     def __call__(self, path: Path) -> tuple[Found, float]:
@@ -459,13 +461,13 @@ def main() -> None:
         own_size = (card.input.width_px, card.input.height_px)
         if size != own_size and not card.input.is_resizable:
             continue
-        fetch(model)
+        fetch_weights(model)
         print(f"{model} at {text}")
         with tempfile.TemporaryDirectory() as name:
             ours = Ours(model, size, Path(name), MIN_SCORE)
             bare = None
             if card.output.kind == "yolox" and card.input.colour == "bgr":
-                bare = Bare(place_of(card, card.files[0]), size)
+                bare = Bare(weights_path(card, card.files[0]), size)
             if not args.times_only:
                 reduced = Ours(model, size, Path(name), MIN_SCORE, "reduced")
                 compare(bare, ours, reduced, drive, signs, args.evidence, text)

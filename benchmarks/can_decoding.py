@@ -27,7 +27,7 @@ from cantools.database.can.formats import dbc
 
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
-from crosscue.replay.can.layout import overlaps
+from crosscue.replay.can.layout import overlapping_signals
 from crosscue.replay.columns import BLOCK_ROWS, Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 
@@ -111,7 +111,7 @@ def ours(bus: Bus, database: CanDatabase, engine: EngineName) -> Callable[[], li
 
 def count_equal(database: CanDatabase, theirs: Cantools, blocks: list[Block]) -> int:
     """Return the number of compared values; overlapping signals, which differ, are left out."""
-    names = {m.key: m.topic_name for m in database.messages if not any(overlaps(m))}
+    names = {m.key: m.topic_name for m in database.messages if not any(overlapping_signals(m))}
     following = dict.fromkeys((b.topic for b in blocks), 0)
     by_topic: dict[str, list[Block]] = {}
     for block in blocks:

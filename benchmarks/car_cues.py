@@ -17,7 +17,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from crosscue.datasets.truth.truth import Truth, load
+from crosscue.datasets.truth.truth import Truth, read_truth
 from crosscue.detectors.cues.cars import (
     CarShapes,
     car_shapes,
@@ -69,7 +69,7 @@ def main() -> None:
     runs = sorted(path.parent for path in (study / "runs").glob("*/manifest.json"))
     for path in runs:
         run, drive = open_run(path), study / "drives" / path.name
-        truth, cars = load(drive / "truth.json"), true_cars(drive)
+        truth, cars = read_truth(drive / "truth.json"), true_cars(drive)
         for t_ns, cue, x, y in claims(run, run.drive_manifest().settings):
             kind = cue.rpartition("_")[0]
             verdict = is_true(truth, cue, t_ns)

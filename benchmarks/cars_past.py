@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crosscue.datasets.adapters.pandaset import read_poses
-from crosscue.datasets.real.annotate_pandaset import BEHIND_M, FAR_KERB_M, Boxes
+from crosscue.datasets.adapters.pandaset import read_pandaset_poses
+from crosscue.datasets.real.annotate_pandaset import BEHIND_M, FAR_KERB_M, VehicleBoxes
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.observed import Place
 from crosscue.detectors.cues.tracked.judge import (
@@ -88,7 +88,7 @@ def places(run: RunFolder) -> dict[int, Place]:
     }
 
 
-def owner(box_px: Sequence[float], boxes: Boxes, rows: np.ndarray) -> int | None:
+def owner(box_px: Sequence[float], boxes: VehicleBoxes, rows: np.ndarray) -> int | None:
     """Return the row of the 3-D box that a box in the picture overlaps most."""
     overlaps = [iou(boxes.outline_px[row], np.asarray(box_px)) for row in rows]
     best = int(np.argmax(overlaps)) if overlaps else 0
@@ -97,7 +97,7 @@ def owner(box_px: Sequence[float], boxes: Boxes, rows: np.ndarray) -> int | None
 
 def why_missed(
     row: int,
-    boxes: Boxes,
+    boxes: VehicleBoxes,
     rows: np.ndarray,
     cars: Sequence[CarMotion],
     seen: Sequence[Detections],
@@ -123,9 +123,9 @@ def why_missed(
 def main() -> None:
     """Print the number of frames missed for each reason, for both directions."""
     run, sequence = open_run(Path(sys.argv[1])), Path(sys.argv[2])
-    manifest, poses = run.drive_manifest(), read_poses(sequence)
+    manifest, poses = run.drive_manifest(), read_pandaset_poses(sequence)
     assert manifest.detected is not None
-    vehicle, boxes = manifest.settings, Boxes(sequence, poses)
+    vehicle, boxes = manifest.settings, VehicleBoxes(sequence, poses)
     steps = np.linalg.norm(np.diff(poses.xyz_m[:, :2], axis=0), axis=1)
     gone_m = np.concatenate([[0.0], np.cumsum(steps)])
     at, ego = places(run), EgoMotion(odometer_of(run))

@@ -25,7 +25,7 @@ from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, View
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import Seen
+from crosscue.detectors.cues.observed import FrameDetections
 from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.registry import chosen
 from crosscue.eval.pipeline.detect import detect_drive
@@ -49,7 +49,7 @@ def stored_frames() -> list[Detections]:
         corners = np.column_stack([rng.integers(0, 1100, 5), rng.integers(300, 600, 5)])
         boxes = np.hstack([corners, corners + np.array([120, 45])]).astype(np.float64)
         mask = np.arange(45)[:, None] >= 20 - 15 * np.sin(np.arange(120)[None, :] / 40)
-        masks = tuple(rle.encode(mask, (int(x), int(y)), (1280, 720)) for x, y in corners)
+        masks = tuple(rle.encode_mask(mask, (int(x), int(y)), (1280, 720)) for x, y in corners)
         row = Detections(t * 10**8, (1280, 720), boxes, np.full(5, 0.99), ("car",) * 5, masks)
         found.append(row)
     return found
@@ -60,7 +60,7 @@ def cue_seconds(found: list[Detections]) -> float:
     cues = CuePass(VEHICLE)
     began = time.process_time()
     for one in found:
-        cues(Seen(one.t_ns, (one,)))
+        cues(FrameDetections(one.t_ns, (one,)))
     return time.process_time() - began
 
 

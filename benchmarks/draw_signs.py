@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.signs.templates import FILES_PX, KINDS, Kind, file_name, size_of
+from crosscue.detectors.signs.templates import FILES_PX, KINDS, Kind, sign_size, template_file
 from crosscue.replay.columns import Bytes
 
 Rgba = NDArray[np.uint8]
@@ -44,7 +44,9 @@ def main() -> None:
         (into / name).mkdir(parents=True, exist_ok=True)
     for kind in KINDS:
         for height in FILES_PX:
-            cv2.imwrite(str(into / "detectors" / file_name(kind, height)), grey_sign(kind, height))
+            cv2.imwrite(
+                str(into / "detectors" / template_file(kind, height)), grey_sign(kind, height)
+            )
     for name, draw in SIGNS.items():
         rgba = draw(SCENE_PX)
         cv2.imwrite(str(into / "scenes" / f"{name}.png"), rgba[..., [2, 1, 0, 3]])
@@ -52,7 +54,7 @@ def main() -> None:
 
 def grey_sign(kind: Kind, height_px: int) -> Bytes:
     """Return a sign for the detector, reduced from a larger drawing to soften its edges."""
-    size = size_of(kind, height_px)
+    size = sign_size(kind, height_px)
     width, height = size[0] * _OVERSIZE, size[1] * _OVERSIZE
     if kind.startswith("one way"):
         large = _grey_one_way(width, height, is_left=kind == "one way left")

@@ -18,10 +18,10 @@ from statistics import median
 
 import numpy as np
 
-from crosscue.datasets.simulated.drive import DriveSettings, drive, sense, vehicle_text
+from crosscue.datasets.simulated.drive import DriveSettings, sense, true_motion, vehicle_text
 from crosscue.datasets.simulated.sensor_blocks import BUS, GYRO, MAGNETOMETER, sensor_blocks
 from crosscue.detectors import rle
-from crosscue.detectors.base import Choice, Detections, Found, Frame, View
+from crosscue.detectors.base import Detections, DetectorChoice, Found, Frame, View
 from crosscue.eval.pipeline.detect import detect_drive
 from crosscue.eval.pipeline.replay import estimate_run
 from crosscue.eval.runs.folder import create, open_run
@@ -67,7 +67,7 @@ class Busy:
         size = np.array([(120, 45), (120, 45), (90, 80), (60, 52), (30, 31), (14, 34)])
         boxes = np.hstack([corner, corner + size]).astype(np.float64)
         masks = tuple(
-            rle.encode(_outline(w, h), (int(x), int(y)), SIZE)
+            rle.encode_mask(_outline(w, h), (int(x), int(y)), SIZE)
             for (x, y), (w, h) in zip(corner, size.tolist(), strict=True)
         )
         return Detections(frame.t_ns, SIZE, boxes, np.full(6, 0.99), LABELS, masks)
@@ -104,7 +104,7 @@ def pictures(times: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Block:
 
 def write_log(path: Path, settings: DriveSettings) -> float:
     """Write the log and return its length in seconds."""
-    motion = drive(settings)
+    motion = true_motion(settings)
     first, last = int(motion.t_ns[0]), int(motion.t_ns[-1])
     with LogWriter(path, Ledger(str(path))) as writer:
         for topic in (BUS, GYRO, MAGNETOMETER, CAMERA):
@@ -129,7 +129,7 @@ def main() -> None:
         seconds = write_log(folder / "drive.mcap", settings)
         dbc = Path(__file__).parent.parent / "datasets" / "simulated" / "simulated_car.dbc"
         vehicle = parse(vehicle_text(settings, str(dbc)) + RANGES, "benchmark")
-        choice = Choice("busy", f"{__name__}:build")
+        choice = DetectorChoice("busy", f"{__name__}:build")
         run = create(folder / "run", overwrite=False)
         with open_log(folder / "drive.mcap") as log:
             detect_drive([log], vehicle, run, EVERYTHING, [choice])

@@ -25,7 +25,7 @@ from statistics import median
 import numpy as np
 
 from crosscue.datasets.scenes.drive import write_scene
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.detectors.base import Detections, Found, Frame, View
 from crosscue.eval import cli
@@ -107,7 +107,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         drive, run, cache = folder / "drive", folder / "run", folder / "cache.sqlite"
-        write_scene(drive, SceneSettings("C", camera=Camera(width_px=192, height_px=108)))
+        write_scene(drive, SceneSettings("C", camera=SceneCamera(width_px=192, height_px=108)))
         argv = [
             "replay",
             str(drive / "drive.mcap"),

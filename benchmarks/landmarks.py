@@ -27,11 +27,15 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
-from crosscue.localization.landmarks.features import Features
-from crosscue.localization.landmarks.images import grey_of, read_picture
+from crosscue.localization.landmarks.database import (
+    LandmarkDatabase,
+    LandmarkPosition,
+    LandmarkWriter,
+)
+from crosscue.localization.landmarks.features import Keypoints
+from crosscue.localization.landmarks.images import grey_of, read_encoded
 from crosscue.localization.landmarks.matcher import OrbMatcher, OrbSettings
-from crosscue.localization.landmarks.update import best_of
+from crosscue.localization.landmarks.update import best_candidate
 from crosscue.replay.columns import Floats
 from support.landmark_files import seen_from, some_features, wall
 
@@ -51,7 +55,7 @@ def build(path: Path, count: int) -> float:
         for i in range(count):
             y, x = divmod(i, side)
             xy_m = SPACING_M * np.array([x, y]) + rng.uniform(-2.0, 2.0, 2)
-            writer.add(Place(str(i), xy_m, 4.0 * np.eye(2)), made[i % 100])
+            writer.add(LandmarkPosition(str(i), xy_m, 4.0 * np.eye(2)), made[i % 100])
     return time.perf_counter() - began
 
 
@@ -69,7 +73,7 @@ def measure(path: Path, count: int) -> dict[str, float]:
             candidates = [database.near(xy, SD_M**2 * np.eye(2)) for xy in places]
             searched = time.perf_counter()
             for some in candidates:
-                best_of(seen, some, database, ORB)
+                best_candidate(seen, some, database, ORB)
             done = time.perf_counter()
             search_ms.append(1e3 * (searched - began) / FRAMES)
             match_ms.append(1e3 * (done - searched) / FRAMES)
@@ -111,14 +115,14 @@ def growth(sizes: list[int]) -> None:
 class Query:
     """A frame with its true position and the position estimated by the filter."""
 
-    seen: Features
+    seen: Keypoints
     true_m: Floats
     believed_m: Floats
 
 
 def ellipse(
     name: str,
-    marks: list[tuple[Floats, Features]],
+    marks: list[tuple[Floats, Keypoints]],
     queries: list[Query],
     sd_m: float,
     right_m: float,
@@ -128,7 +132,7 @@ def ellipse(
         path = Path(folder) / "marks.sqlite"
         with LandmarkWriter(path, "orb") as writer:
             for i, (xy_m, features) in enumerate(marks):
-                writer.add(Place(str(i), xy_m, 9.0 * np.eye(2)), features)
+                writer.add(LandmarkPosition(str(i), xy_m, 9.0 * np.eye(2)), features)
         with LandmarkDatabase(path) as database:
             everything = tuple(database)
             print(f"\n{name}: {len(marks)} landmarks, {len(queries)} frames, prior sd {sd_m:g} m")
@@ -140,7 +144,7 @@ def ellipse(
                     near = database.near(query.believed_m, sd_m**2 * np.eye(2))
                     some = near if use else everything
                     compared += len(some)
-                    best.append(best_of(query.seen, some, database, ORB))
+                    best.append(best_candidate(query.seen, some, database, ORB))
                 ms = 1e3 * (time.perf_counter() - began) / len(queries)
                 for threshold in (6.0, 10.0, 20.0):
                     right = false = 0
@@ -183,13 +187,13 @@ def real_street(data: Path) -> None:
     pose = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
     places = np.column_stack([pose[:, 2, 3], -pose[:, 0, 3]])
     seen = [
-        ORB.describe(grey_of(read_picture(folder / "image_l" / f"{i:06d}.png"))) for i in range(51)
+        ORB.describe(grey_of(read_encoded(folder / "image_l" / f"{i:06d}.png"))) for i in range(51)
     ]
     marks = [(places[i], seen[i]) for i in range(0, 31, 10)]
     rng = np.random.default_rng(4)
     for path in strangers:
         elsewhere = rng.uniform(-2000.0, 2000.0, 2)
-        marks.append((elsewhere, ORB.describe(grey_of(read_picture(path)))))
+        marks.append((elsewhere, ORB.describe(grey_of(read_encoded(path)))))
     rows = [i for i in range(51) if i % 10 or i > 30]
     queries = [Query(seen[i], places[i], places[i] + rng.normal(0.0, 5.0, 2)) for i in rows]
     ellipse("real street (KITTI) among real strangers", marks, queries, 5.0, 12.0)
@@ -201,7 +205,7 @@ def real_days(data: Path) -> None:
     if not folder.is_dir():
         return
     orb = OrbMatcher(OrbSettings(features=1000))
-    seen = {p.stem: orb.describe(grey_of(read_picture(p))) for p in folder.rglob("*.jpg")}
+    seen = {p.stem: orb.describe(grey_of(read_encoded(p))) for p in folder.rglob("*.jpg")}
     same = {
         ("gmb_q1", "gmb_db2"),
         ("gmb_q2", "gmb_db5"),

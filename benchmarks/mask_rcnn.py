@@ -35,20 +35,20 @@ from torchvision.models.detection.transform import GeneralizedRCNNTransform
 from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.detectors.base import Detections, Frame
-from crosscue.detectors.boxes import overlaps
+from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Calibration, Checkpoint, Facts
 from crosscue.detectors.networks.mask_rcnn.detector import (
     MaskRcnnDetector,
     MaskRcnnSettings,
     checkpoint_named,
     detector_of,
-    place,
+    place_picture,
     raw_score,
 )
 from crosscue.detectors.networks.mask_rcnn.network import (
     MEAN,
     SPREAD,
-    Plan,
+    NetworkPlan,
     build_network,
     set_limits,
 )
@@ -100,11 +100,11 @@ class PlainLoop:
     """Torchvision's inference on the part of the picture that ours uses."""
 
     network: Any
-    plan: Plan
+    plan: NetworkPlan
 
     def __call__(self, frame: Frame) -> dict[str, Tensor]:
         """Return the detections with pasted masks."""
-        placed = place(frame.pixels, self.plan).pixels
+        placed = place_picture(frame.pixels, self.plan).pixels
         height, width = placed.shape[:2]
         # The size equals the picture's, so that torchvision's transform does not scale it.
         self.network.transform = GeneralizedRCNNTransform(height, width, list(MEAN), list(SPREAD))
@@ -116,7 +116,7 @@ class PlainLoop:
     def detections(self, frame: Frame) -> Detections:
         """Return the detections in the frame's pixels, without masks."""
         found = self(frame)
-        placed = place(frame.pixels, self.plan)
+        placed = place_picture(frame.pixels, self.plan)
         boxes = found["boxes"].double().numpy() + np.tile(placed.corner_px, 2)
         labels = tuple(str(self.plan.classes[i - 1]) for i in found["labels"].tolist())
         return Detections(
@@ -176,14 +176,14 @@ class WholeOnnx:
         )
 
     def _input(self, frame: Frame) -> Tensor:
-        rgb = place(frame.pixels, self.plan).pixels[:, :, ::-1].transpose(2, 0, 1)
+        rgb = place_picture(frame.pixels, self.plan).pixels[:, :, ::-1].transpose(2, 0, 1)
         return torch.from_numpy(np.ascontiguousarray(rgb)).float() / 255.0
 
     def __call__(self, frame: Frame) -> Detections:
         """Return the detections without the masks, which it nevertheless pastes."""
         name = self.session.get_inputs()[0].name
         found, labels, scores, _ = self.session.run(None, {name: self._input(frame).numpy()})
-        placed = place(frame.pixels, self.plan)
+        placed = place_picture(frame.pixels, self.plan)
         boxes = (found.astype(np.float64) + np.tile(placed.corner_px, 2)) / np.tile(placed.scale, 2)
         names = tuple(str(self.plan.classes[i - 1]) for i in labels.tolist())
         return Detections(
@@ -283,7 +283,7 @@ def judged(found: Detections, scene: Scene, min_score: Least) -> Counter[str]:
     counts, met = Counter[str](), set[int]()
     for i in above(found, min_score):
         fractions = [
-            float(overlaps(box, found.boxes_px[i : i + 1])[0]) if name == found.labels[i] else 0.0
+            float(box_ious(box, found.boxes_px[i : i + 1])[0]) if name == found.labels[i] else 0.0
             for name, box in scene.truth
         ]
         best = max(range(len(fractions)), key=fractions.__getitem__, default=None)
@@ -363,7 +363,7 @@ def random_resnet() -> Checkpoint:
     """Return a ResNet-50 with random weights and scores by rank."""
     torch.manual_seed(0)
     names = ("car", *(f"class {i}" for i in range(89)))
-    plan = Plan(architecture="resnet50", classes=names, width_px=800)
+    plan = NetworkPlan(architecture="resnet50", classes=names, width_px=800)
     network = build_network(plan)
     heads = network.roi_heads
     with torch.no_grad():

@@ -25,13 +25,13 @@ def main() -> None:
         whole[300:360, 500:620] = box
         return bytes(coco.encode(whole)["counts"])
 
-    text = rle.encode(box, CORNER, SIZE)
+    text = rle.encode_mask(box, CORNER, SIZE)
     tree = {"size": list(SIZE[::-1]), "counts": text}
-    if theirs() != text or not np.array_equal(coco.decode(tree), rle.decode(text, SIZE)):
+    if theirs() != text or not np.array_equal(coco.decode(tree), rle.decode_mask(text, SIZE)):
         raise SystemExit("the two differ")
     jobs: dict[str, tuple[Callable[[], object], Callable[[], object]]] = {
-        "encode": (lambda: rle.encode(box, CORNER, SIZE), theirs),
-        "decode": (lambda: rle.decode(text, SIZE), lambda: coco.decode(tree)),
+        "encode": (lambda: rle.encode_mask(box, CORNER, SIZE), theirs),
+        "decode": (lambda: rle.decode_mask(text, SIZE), lambda: coco.decode(tree)),
         "area": (lambda: rle.area_px(text), lambda: coco.area(tree)),
     }
     for name, pair in jobs.items():

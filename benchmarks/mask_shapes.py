@@ -19,10 +19,10 @@ import numpy as np
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
-from crosscue.detectors.boxes import overlaps
+from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.cues.observed import nose_of
 from crosscue.detectors.networks.mask_rcnn.detector import build
-from crosscue.detectors.training.annotations import LabelledPicture, LabelledSet, read_coco
+from crosscue.detectors.training.annotations import LabelledPicture, LabelledSet, read_training_coco
 from crosscue.detectors.training.scores import detections_on
 from crosscue.replay.columns import Floats
 
@@ -45,7 +45,7 @@ def pairs(
         for i, label in enumerate(detections.labels):
             if label != name or detections.scores[i] <= score or not truth:
                 continue
-            fractions = overlaps(detections.boxes_px[i], boxes)
+            fractions = box_ious(detections.boxes_px[i], boxes)
             best = int(fractions.argmax())
             mask = truth[best].mask
             if fractions[best] >= SAME_OBJECT and isinstance(mask, bytes):
@@ -54,7 +54,7 @@ def pairs(
 
 def height_px(mask: bytes, size_px: tuple[int, int]) -> int:
     """Return the number of rows from the first to the last row of the object."""
-    rows = np.flatnonzero(rle.decode(mask, size_px).any(axis=1))
+    rows = np.flatnonzero(rle.decode_mask(mask, size_px).any(axis=1))
     return int(rows[-1] - rows[0]) + 1
 
 
@@ -94,7 +94,7 @@ def main() -> None:
         "--after", type=int, default=0, metavar="N", help="leave out the first N pictures"
     )
     args = parser.parse_args()
-    whole = read_coco(args.folder / "coco.json", args.folder / "images", CLASSES)
+    whole = read_training_coco(args.folder / "coco.json", args.folder / "images", CLASSES)
     labelled = replace(whole, pictures=whole.pictures[args.after :])
     found = list(detections_on(labelled, build(network=args.network)))
     for name in CLASSES[1:]:

@@ -39,7 +39,7 @@ from crosscue.replay.readers.mcap.bytes import ByteFile
 from crosscue.replay.readers.mcap.channels import TopicBook
 from crosscue.replay.readers.mcap.reader import open_mcap
 from crosscue.replay.readers.mcap.segments import find_segments
-from crosscue.replay.readers.mcap.walk import Chunk, Walk
+from crosscue.replay.readers.mcap.walk import UnreadChunk, Walk
 
 DATA = Path(os.environ.get("CROSSCUE_DATA", Path(__file__).parents[2] / "shared" / "data"))
 RAW_CAN = (
@@ -208,7 +208,7 @@ def bare(path: Path, is_checked: bool = False) -> int:
         file, segment.begin, segment.end, segment.known_chunks(file, DEFAULT_LIMITS), DEFAULT_LIMITS
     )
     for item in walk:
-        if isinstance(item, Chunk) and item.head is not None:
+        if isinstance(item, UnreadChunk) and item.head is not None:
             body: bytes | memoryview = file.read(item.body_at, item.head.body_size).data
             if item.head.compression == "zstd":
                 body = inflater.decompress(body)

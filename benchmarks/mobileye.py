@@ -23,8 +23,8 @@ from crosscue.replay.columns import BLOCK_ROWS, Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
-from crosscue.replay.mobileye.geometry import Mounting
-from crosscue.replay.mobileye.layout import Columns, Field, Message, layout
+from crosscue.replay.mobileye.geometry import DevicePosition
+from crosscue.replay.mobileye.layout import BitField, Columns, Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.mobileye.tables import table_block
 
@@ -33,7 +33,7 @@ IMAGES: Final = 3000
 OBJECTS: Final = 8
 CANTOOLS_FRAMES: Final = 20_000
 MS: Final = 1_000_000
-SETTINGS: Final = MobileyeSettings(mounting=Mounting(1.8, 0.0))
+SETTINGS: Final = MobileyeSettings(mounting=DevicePosition(1.8, 0.0))
 
 
 def simulated_bus() -> Block:
@@ -83,7 +83,7 @@ def _db_message(message: Message, instance: int) -> DbMessage:
     )
 
 
-def _signal(f: Field) -> Signal:
+def _signal(f: BitField) -> Signal:
     factor = f.scale / f.per
     big = f.order == "big"
     return Signal(
@@ -113,7 +113,7 @@ def theirs(database: cantools.database.Database, ids: list[int], payloads: list[
 
 def check_equal(block: Block, database: cantools.database.Database) -> None:
     """Check that both return the same positions of obstacles, before timing them."""
-    decoder = MobileyeDecoder("can1", Ledger("bench"), MobileyeSettings(mounting=Mounting()))
+    decoder = MobileyeDecoder("can1", Ledger("bench"), MobileyeSettings(mounting=DevicePosition()))
     tables = [b for b in (*decoder(block), *decoder.flush()) if b.topic.endswith("/obstacles")]
     mine = np.concatenate([b.rows["y_m"] for b in tables if isinstance(b.rows, Table)])
     assert isinstance(block.rows, CanFrames)

@@ -30,11 +30,11 @@ import crosscue
 from crosscue.datasets.scenes.drive import Imager, picture_times, write_scene
 from crosscue.datasets.scenes.faulty_labels import DETECTORS, PERFECT_LABELS
 from crosscue.datasets.scenes.layout import SCORED
-from crosscue.datasets.scenes.rendering.render import Picture, PictureSettings, Renderer
+from crosscue.datasets.scenes.rendering.render import PictureSettings, RenderedFrame, Renderer
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 from crosscue.datasets.scenes.world import World
 from crosscue.datasets.simulated.drive import START_NS
-from crosscue.datasets.truth.truth import load
+from crosscue.datasets.truth.truth import read_truth
 from crosscue.detectors.cues.cars import (
     CarShapes,
     car_shapes,
@@ -43,11 +43,11 @@ from crosscue.detectors.cues.cars import (
     parked_cars,
 )
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.scoring.drives import judge
 from crosscue.eval.scoring.drives import score as as_score
+from crosscue.eval.scoring.drives import score_drive
 from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, fraction
-from crosscue.eval.scoring.runs import tables_of
-from crosscue.eval.scoring.truth import load as load_truth
+from crosscue.eval.scoring.runs import read_run_tables
+from crosscue.eval.scoring.truth import read_scored_truth as load_truth
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
 from support.perfect_boxes import frames, is_there, role_at, true_cars
@@ -81,7 +81,7 @@ def score(drives: list[Path], min_visible: float) -> dict[str, tuple[Proportion,
     right: Claims = {}
     found: Claims = {}
     for number, drive in enumerate(drives):
-        truth, vehicle = load(drive / "truth.json"), load_vehicle(drive / "vehicle.toml")
+        truth, vehicle = read_truth(drive / "truth.json"), load_vehicle(drive / "vehicle.toml")
         for t_ns, cue, count in counts(drive, vehicle, min_visible):
             there = is_there(truth, cue, t_ns)
             if there is None:
@@ -136,13 +136,15 @@ def every_cue(layouts: list[str], folder: Path) -> None:
         scene = SceneSettings(layout=layout, camera=camera_of_width(640))
         files = write_scene(drive, scene, imager=PERFECT_LABELS, is_calibrated=False)
         crosscue.replay_drive(files.log, drive / "run", detectors=DETECTORS.split(","))
-        judged.append(judge(tables_of(open_run(drive / "run")), load_truth(files.truth, layout)))
+        judged.append(
+            score_drive(read_run_tables(open_run(drive / "run")), load_truth(files.truth, layout))
+        )
     print(f"{len(judged)} simulated drives, perfect masks: precision; recall")
     for name, cue in as_score(judged).cues.items():
         print(f"  {name:20} {_text(cue.precision)}; {_text(cue.recall)}")
 
 
-def _objects(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
+def _objects(world: World, settings: SceneSettings) -> Iterator[tuple[int, RenderedFrame]]:
     """Yield frames without colours until the car is at the intersection."""
     renderer = Renderer(world, settings.camera, PictureSettings(samples=1))
     no_codes = np.zeros(world.ground.road.shape, np.uint8)

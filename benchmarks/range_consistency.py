@@ -13,7 +13,7 @@ import sys
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.ranging.object_tracks import Motion, ObjectTracks
+from crosscue.detectors.ranging.object_tracks import CarStep, ObjectTracks
 from crosscue.detectors.ranging.range_from_motion import HeightErrors
 from crosscue.detectors.ranging.standard_sizes import ASPECT_SPREAD, BOX_SPREAD, HOUSINGS
 
@@ -48,7 +48,7 @@ def track(rng: np.random.Generator) -> NDArray[np.float64]:
         width = housing.width_m * own * shape * px_per_m
         x, y = CENTER_PX[0] + RIGHT_M * px_per_m, CENTER_PX[1] - 3.0 * px_per_m
         boxes = np.stack([x - width / 2, y - height / 2, x + width / 2, y + height / 2], axis=1)
-        motion = Motion(float(step_m * scale), 0.0, 0.0, 0.1)
+        motion = CarStep(float(step_m * scale), 0.0, 0.0, 0.1)
         ranged = tracks(motion, boxes, height, ["dark", "dark"])[:2]
         true_m = np.array(STARTS_M)[: len(ranged)] - now_m
         found.append(

@@ -56,7 +56,7 @@ def road_masks(run: RunFolder, size_px: tuple[int, int]) -> Iterator[NDArray[np.
     """Yield the road mask of each frame in order, shape (height, width)."""
     table = run.table("road", ["mask", "mask_width_px", "mask_height_px"]).to_pylist()
     for row in table:
-        mask = rle.decode(row["mask"], (row["mask_width_px"], row["mask_height_px"]))
+        mask = rle.decode_mask(row["mask"], (row["mask_width_px"], row["mask_height_px"]))
         whole = cv2.resize(mask.astype(np.uint8), size_px, interpolation=cv2.INTER_NEAREST)
         yield np.asarray(whole, np.bool_)
 

@@ -30,13 +30,13 @@ from estimate import (  # type: ignore[import-not-found]  # a script next to thi
 
 from crosscue.datasets.simulated.drive import DriveSettings, vehicle_text
 from crosscue.detectors import rle
-from crosscue.detectors.base import Choice
+from crosscue.detectors.base import DetectorChoice
 from crosscue.detectors.images import Encoded
 from crosscue.eval.pipeline.detect import detect_drive
 from crosscue.eval.pipeline.replay import estimate_run
-from crosscue.eval.recording import save
+from crosscue.eval.recording import save_rrd
 from crosscue.eval.runs.folder import RunFolder, create, open_run
-from crosscue.eval.runs.stored_images import camera_of, read_pictures
+from crosscue.eval.runs.stored_images import read_pictures, run_camera
 from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.logs.opening import open_log
@@ -64,7 +64,7 @@ def make_run(folder: Path, minutes: float) -> tuple[RunFolder, float]:
     vehicle = parse(vehicle_text(settings, str(dbc)) + RANGES, "benchmark")
     run = create(folder / "run", overwrite=False)
     with open_log(folder / "drive.mcap") as log:
-        detect_drive([log], vehicle, run, EVERYTHING, [Choice("busy", "estimate:build")])
+        detect_drive([log], vehicle, run, EVERYTHING, [DetectorChoice("busy", "estimate:build")])
     estimate_run(open_run(run.path))
     return run, seconds
 
@@ -77,7 +77,7 @@ def picture_bytes(run: RunFolder) -> int:
         nonlocal total
         total += len(encoded.content)
 
-    camera = camera_of(run)
+    camera = run_camera(run)
     assert camera is not None
     read_pictures(camera, add)
     return total
@@ -93,7 +93,7 @@ def frame_by_frame(run: RunFolder, path: Path) -> None:
         content = bytes(encoded.content)
         recording.log("camera", rr.EncodedImage(contents=content, media_type="image/jpeg"))
 
-    camera = camera_of(run)
+    camera = run_camera(run)
     assert camera is not None
     read_pictures(camera, picture)
     detected = run.drive_manifest().detected
@@ -103,7 +103,7 @@ def frame_by_frame(run: RunFolder, path: Path) -> None:
         for found in frame.seen.objects:
             classes = np.zeros(found.size_px[::-1], np.uint8)
             for label, mask in zip(found.labels, found.masks, strict=True):
-                classes[rle.decode(mask, found.size_px)] = CLASSES[label]
+                classes[rle.decode_mask(mask, found.size_px)] = CLASSES[label]
             labels = [f"{a} {b:.2f}" for a, b in zip(found.labels, found.scores, strict=True)]
             boxes = rr.Boxes2D(
                 array=found.boxes_px, array_format=rr.Box2DFormat.XYXY, labels=labels
@@ -127,7 +127,7 @@ def main() -> None:
     """Write the drive once and record it several times both ways."""
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 2.0
     cases: dict[str, Callable[[RunFolder, Path], None]] = {
-        "crosscue, bulk columns": save,
+        "crosscue, bulk columns": save_rrd,
         "frame by frame": frame_by_frame,
     }
     with tempfile.TemporaryDirectory() as name:

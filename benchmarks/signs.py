@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.detectors.base import Detections, Frame
-from crosscue.detectors.boxes import overlaps
+from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.signs.detector import POINTS_DRAWN, SignSettings, build, orb_points
 from crosscue.detectors.signs.templates import AMERICAN, Kind, drawings
 from crosscue.replay.columns import Bytes, Floats
@@ -153,7 +153,7 @@ def ours(grey: Bytes) -> Found:
 
 def is_right(found: Found, kind: str, box: Floats) -> bool:
     """Return whether the sign is among the detections, with its label."""
-    return any(label == kind and overlaps(box, b[None])[0] > 0.25 for label, b in found)
+    return any(label == kind and box_ious(box, b[None])[0] > 0.25 for label, b in found)
 
 
 def streets() -> list[Bytes]:

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 import cv2
 
 from crosscue.datasets.scenes.drive import jpeg, write_scene
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.datasets.scenes.settings import SceneSettings, world_of
 
@@ -62,7 +62,7 @@ def main() -> None:
         )
     with TemporaryDirectory() as folder:
         began = time.process_time()
-        files = write_scene(Path(folder) / "drive", SceneSettings("C", 1, camera=Camera()))
+        files = write_scene(Path(folder) / "drive", SceneSettings("C", 1, camera=SceneCamera()))
         spent = time.process_time() - began
         size = files.log.stat().st_size / 1e6
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

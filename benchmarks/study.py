@@ -26,10 +26,10 @@ from crosscue.localization.town.drive import (
     drive_many,
     drive_traced,
 )
-from crosscue.localization.town.settings import Drive
+from crosscue.localization.town.settings import TownDrive
 from crosscue.replay.columns import Floats
 
-SETTINGS = Drive()
+SETTINGS = TownDrive()
 STEPS = 3000
 
 

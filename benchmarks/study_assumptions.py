@@ -24,46 +24,58 @@ from crosscue.eval.studies.town.range_study import law_m
 from crosscue.eval.studies.town.settings import UNTIL_LOST, FieldStudy, LandmarkStudy
 from crosscue.eval.studies.town.work import chunks_of
 from crosscue.eval.studies.words import km, percent
-from crosscue.localization.town.drive import Keys, Outcome, Result, drive_many, drive_traced
+from crosscue.localization.town.drive import (
+    DriveOutcome,
+    DriveResult,
+    Keys,
+    drive_many,
+    drive_traced,
+)
 from crosscue.localization.town.random_stream import key_of
-from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
+from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
 
-NEES = Result._fields.index("nees")
+NEES = DriveResult._fields.index("nees")
 FINE_M = 1e-4
 PARTS = ("field", "nees", "landmarks")
 LANDMARKS = {
-    "as studied": Drive(),
-    "penalty 10 degrees (45)": Drive(navigation=Navigation(penalty_deg=10.0)),
-    "penalty 180 degrees": Drive(navigation=Navigation(penalty_deg=180.0)),
-    "intersections recognised within 15 m (30)": Drive(
+    "as studied": TownDrive(),
+    "penalty 10 degrees (45)": TownDrive(navigation=Navigation(penalty_deg=10.0)),
+    "penalty 180 degrees": TownDrive(navigation=Navigation(penalty_deg=180.0)),
+    "intersections recognised within 15 m (30)": TownDrive(
         navigation=Navigation(recognise_within_m=15.0)
     ),
-    "intersections recognised within 60 m": Drive(navigation=Navigation(recognise_within_m=60.0)),
-    "landmark or goal given up within 5 m (20)": Drive(navigation=Navigation(arrive_within_m=5.0)),
-    "landmark or goal given up within 50 m": Drive(navigation=Navigation(arrive_within_m=50.0)),
-    "landmark position 1 m s.d. (5)": Drive(sensors=Sensors(landmark_sd_m=1.0)),
-    "landmark position 20 m s.d.": Drive(sensors=Sensors(landmark_sd_m=20.0)),
-    "blocks 50 to 100 m (50 to 300)": Drive(city=City(longest_block_m=100.0)),
-    "blocks 200 to 300 m": Drive(city=City(shortest_block_m=200.0)),
-    "no dead ends (3 %)": Drive(city=City(dead_end_fraction=0.0)),
-    "dead ends 15 %": Drive(city=City(dead_end_fraction=0.15)),
-    "no one-way streets (15 %)": Drive(city=City(one_way_fraction=0.0)),
-    "one-way streets 50 %": Drive(city=City(one_way_fraction=0.5)),
-    "all cities 10 km2 (1 to 100)": Drive(city=City(smallest_km2=10.0, largest_km2=10.0)),
-    "all cities 100 km2": Drive(city=City(smallest_km2=100.0)),
+    "intersections recognised within 60 m": TownDrive(
+        navigation=Navigation(recognise_within_m=60.0)
+    ),
+    "landmark or goal given up within 5 m (20)": TownDrive(
+        navigation=Navigation(arrive_within_m=5.0)
+    ),
+    "landmark or goal given up within 50 m": TownDrive(navigation=Navigation(arrive_within_m=50.0)),
+    "landmark position 1 m s.d. (5)": TownDrive(sensors=Sensors(landmark_sd_m=1.0)),
+    "landmark position 20 m s.d.": TownDrive(sensors=Sensors(landmark_sd_m=20.0)),
+    "blocks 50 to 100 m (50 to 300)": TownDrive(city=City(longest_block_m=100.0)),
+    "blocks 200 to 300 m": TownDrive(city=City(shortest_block_m=200.0)),
+    "no dead ends (3 %)": TownDrive(city=City(dead_end_fraction=0.0)),
+    "dead ends 15 %": TownDrive(city=City(dead_end_fraction=0.15)),
+    "no one-way streets (15 %)": TownDrive(city=City(one_way_fraction=0.0)),
+    "one-way streets 50 %": TownDrive(city=City(one_way_fraction=0.5)),
+    "all cities 10 km2 (1 to 100)": TownDrive(city=City(smallest_km2=10.0, largest_km2=10.0)),
+    "all cities 100 km2": TownDrive(city=City(smallest_km2=100.0)),
 }
 FIELD = {
     "as studied": FieldStudy(),
     "compass 30 degrees (25)": FieldStudy(compass_2sigma_deg=30.0),
-    "blocks 50 to 100 m (50 to 300)": FieldStudy(drive=Drive(city=City(longest_block_m=100.0))),
-    "blocks 200 to 300 m": FieldStudy(drive=Drive(city=City(shortest_block_m=200.0))),
+    "blocks 50 to 100 m (50 to 300)": FieldStudy(drive=TownDrive(city=City(longest_block_m=100.0))),
+    "blocks 200 to 300 m": FieldStudy(drive=TownDrive(city=City(shortest_block_m=200.0))),
     "town of 4 km2 (1)": FieldStudy(town_km2=4.0),
     "town of 25 km2": FieldStudy(town_km2=25.0),
-    "wheels slip a third (0.003)": FieldStudy(drive=Drive(sensors=Sensors(slip_per_sqrt_m=0.001))),
-    "wheels slip three times": FieldStudy(drive=Drive(sensors=Sensors(slip_per_sqrt_m=0.009))),
-    "wheels slip ten times": FieldStudy(drive=Drive(sensors=Sensors(slip_per_sqrt_m=0.03))),
+    "wheels slip a third (0.003)": FieldStudy(
+        drive=TownDrive(sensors=Sensors(slip_per_sqrt_m=0.001))
+    ),
+    "wheels slip three times": FieldStudy(drive=TownDrive(sensors=Sensors(slip_per_sqrt_m=0.009))),
+    "wheels slip ten times": FieldStudy(drive=TownDrive(sensors=Sensors(slip_per_sqrt_m=0.03))),
     "compass errors last 3.6 m (1.876)": FieldStudy(
-        drive=Drive(sensors=Sensors(compass_interval_m=3.6))
+        drive=TownDrive(sensors=Sensors(compass_interval_m=3.6))
     ),
 }
 
@@ -77,7 +89,7 @@ def landmarks(drives: int, seed: int) -> None:
         for chunk in chunks_of(study.cases(), drives, seed):
             parts.setdefault(chunk.case, []).append(drive_many(chunk.settings, chunk.seeds()))
         rows = [
-            dict(zip(Result._fields, np.concatenate(parts[case]).T, strict=True))
+            dict(zip(DriveResult._fields, np.concatenate(parts[case]).T, strict=True))
             for case in sorted(parts)
         ]
         for compared in comparisons_of(study, rows):
@@ -93,7 +105,7 @@ def field(drives: int, seed: int) -> None:
     print(f"{'':42} {'lost after, km':>24} {'lost within 75 minutes':>24}")
     for name, study in FIELD.items():
         rows = drive_many(study.settings(has_landmarks=False), seeds_of(seed, drives))
-        lost = rows[rows[:, 0] == Outcome.LOST, 1]
+        lost = rows[rows[:, 0] == DriveOutcome.LOST, 1]
         print(f"{name:42} {km(mean_of(lost), 1):>24} {100 * len(lost) / drives:22.0f} %")
     straight_m = law_m(FieldStudy().settings(has_landmarks=False))
     print(f"straight driving as studied, by the law r ds D: {straight_m / 1e3:.1f} km")
@@ -133,9 +145,11 @@ def nees(drives: int, seed: int) -> None:
     )
 
 
-def coarse_and_fine(compass_deg: float | None, goals: int) -> list[Drive]:
+def coarse_and_fine(compass_deg: float | None, goals: int) -> list[TownDrive]:
     return [
-        Drive(sensors=Sensors(compass_2sigma_deg=compass_deg, encoder_step_m=step_m), goals=goals)
+        TownDrive(
+            sensors=Sensors(compass_2sigma_deg=compass_deg, encoder_step_m=step_m), goals=goals
+        )
         for step_m in (Sensors().encoder_step_m, FINE_M)
     ]
 

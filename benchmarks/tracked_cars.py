@@ -21,12 +21,12 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from crosscue.datasets.truth.truth import load
+from crosscue.datasets.truth.truth import read_truth
 from crosscue.detectors.cues.observed import Place
-from crosscue.detectors.cues.tracked.judge import along, crossing_gates, is_past, judge
+from crosscue.detectors.cues.tracked.judge import along, count_cars, crossing_gates, is_past
 from crosscue.detectors.cues.tracked.motion import CarMotion
 from crosscue.detectors.cues.tracked.tracks import CarTracks
-from crosscue.detectors.ranging.object_tracks import Motion
+from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.eval.scoring.intervals import wilson
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
@@ -65,7 +65,7 @@ def true_cars(drive: Path) -> dict[int, list[TrueCar]]:
     return cars
 
 
-def motions(drive: Path) -> dict[int, Motion]:
+def motions(drive: Path) -> dict[int, CarStep]:
     """Return the true motion of the rear axle since the previous frame, by time."""
     found = {}
     last: tuple[float, float, float, int] | None = None
@@ -78,7 +78,7 @@ def motions(drive: Path) -> dict[int, Motion]:
             turned = math.remainder(here[2] - last[2], 2.0 * math.pi)
             ahead = (x - last[0]) * math.cos(last[2]) + (y - last[1]) * math.sin(last[2])
             way_m = math.copysign(math.dist(here[:2], last[:2]), ahead)
-            found[here[3]] = Motion(way_m, 1e-4, turned, (here[3] - last[3]) * 1e-9)
+            found[here[3]] = CarStep(way_m, 1e-4, turned, (here[3] - last[3]) * 1e-9)
         last = here
     return found
 
@@ -95,7 +95,7 @@ def places(drive: Path) -> dict[int, Place]:
 
 def judge_drive(drive: Path, totals: Totals) -> None:
     """Count a drive: cross traffic and parked cars by frame, the other cues by car."""
-    truth, vehicle = load(drive / "truth.json"), load_vehicle(drive / "vehicle.toml")
+    truth, vehicle = read_truth(drive / "truth.json"), load_vehicle(drive / "vehicle.toml")
     camera, settings = vehicle.camera, vehicle.cars
     moved, at, known = motions(drive), places(drive), true_cars(drive)
     times = np.array(sorted(moved))
@@ -107,7 +107,7 @@ def judge_drive(drive: Path, totals: Totals) -> None:
         if ego is None:
             continue
         cars, place = tracks([found], ego), at.get(found.t_ns)
-        one = judge(cars, tracks.standing(), tracks.seen, camera, settings, place)
+        one = count_cars(cars, tracks.standing(), tracks.seen, camera, settings, place)
         for name, sides in (("cross_traffic", one.crossing), ("parked", one.parked)):
             for side in ("left", "right"):
                 there = is_there(truth, f"{name}_{side}", found.t_ns)
@@ -152,14 +152,14 @@ def known_as(car: CarMotion, known: Sequence[TrueCar]) -> TrueCar | None:
 
 
 def _between(
-    moved: dict[int, Motion], times: np.ndarray, last_ns: int | None, t_ns: int
-) -> Motion | None:
+    moved: dict[int, CarStep], times: np.ndarray, last_ns: int | None, t_ns: int
+) -> CarStep | None:
     if last_ns is None:
-        return Motion(0.0, 0.0, 0.0, 0.1)
+        return CarStep(0.0, 0.0, 0.0, 0.1)
     some = [moved[int(t)] for t in times[(times > last_ns) & (times <= t_ns)]]
     if not some:
         return None
-    return Motion(
+    return CarStep(
         sum(one.way_m or 0.0 for one in some),
         sum(one.var_m2 for one in some),
         sum(one.turned_rad for one in some),

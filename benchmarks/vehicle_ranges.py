@@ -20,7 +20,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
-from crosscue.detectors.boxes import overlaps
+from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.ranging.standard_sizes import VEHICLES
 from crosscue.detectors.ranging.vehicle_range import (
     GroundCamera,
@@ -72,7 +72,7 @@ def _pairs(run: Path, folder: Path) -> Iterator[tuple[dict[str, Any], float]]:
             continue
         near = boxes.get(row["frame"], np.empty((0, 5)))
         box = np.array([row[name] for name in ("x0", "y0", "x1", "y1")])
-        shared = overlaps(box, near[:, :4]) if len(near) else np.zeros(1)
+        shared = box_ious(box, near[:, :4]) if len(near) else np.zeros(1)
         if shared.max() > MIN_IOU:
             yield row, float(near[int(np.argmax(shared)), 4])
 

@@ -164,11 +164,11 @@ def check_dataset(
     Raises:
         AssertionError: The contract is broken; the message states where.
     """
-    from crosscue.datasets.truth.truth import load, write_carried
+    from crosscue.datasets.truth.truth import read_truth, write_carried
 
     with open_log(log) as opened:
         written = write_carried(opened.format, log, folder)
-    truth = load(written)
+    truth = read_truth(written)
     rows, _ = _read(log)
     times = [t_ns for topic in rows.values() for t_ns, _ in topic]
     _expect(

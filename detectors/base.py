@@ -119,7 +119,7 @@ class Detections:
         Raises:
             ValueError: It has no mask, or the mask is not of this picture's size.
         """
-        return rle.decode(self.masks[i], self.size_px)
+        return rle.decode_mask(self.masks[i], self.size_px)
 
     def column_heights_px(self, i: int) -> NDArray[np.float64] | None:
         """Count one detection's pixels in each column of the picture; None where it has no mask.
@@ -196,7 +196,7 @@ class RoadMask:
         Raises:
             ValueError: The mask is damaged or of another size.
         """
-        return rle.decode(self.mask, self.mask_size_px)
+        return rle.decode_mask(self.mask, self.mask_size_px)
 
 
 Found: TypeAlias = Detections | RoadMask
@@ -289,7 +289,7 @@ def _fault_of_boxes(found: Detections, labels: Sequence[str] | None) -> str | No
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class DetectorChoice:
     """A requested detector, not yet built.
 
     Attributes:

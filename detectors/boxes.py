@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 _BLOCK: Final = 128
 
 
-def overlaps(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+def box_ious(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
     """Intersection over union of one box with each of N others, shape (N,)."""
     low = np.maximum(box[:2], others[:, :2])
     high = np.minimum(box[2:], others[:, 2:])
@@ -20,7 +20,7 @@ def overlaps(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[n
     return np.asarray(both / np.maximum(areas - both, 1e-12), np.float64)
 
 
-def best_of(
+def non_maximum_suppression(
     boxes: NDArray[np.float64],
     scores: NDArray[np.float64],
     groups: NDArray[np.int64],
@@ -61,14 +61,14 @@ def is_best_label(
     """Mark the boxes that no better box of their group with another label suppresses, shape (N,).
 
     Boxes of one label are left to the network's own suppression. Arguments are those of
-    ``best_of``; ``labels`` has shape (N,).
+    ``non_maximum_suppression``; ``labels`` has shape (N,).
     """
     is_kept = np.zeros(len(scores), np.bool_)
     order = np.lexsort([-scores, groups])
     for some in np.split(order, np.flatnonzero(np.diff(groups[order])) + 1):
         for i in some:
             rivals = some[is_kept[some] & (labels[some] != labels[i])]
-            is_kept[i] = not (overlaps(boxes[i], boxes[rivals]) > max_overlap).any()
+            is_kept[i] = not (box_ious(boxes[i], boxes[rivals]) > max_overlap).any()
     return is_kept
 
 

@@ -75,7 +75,7 @@ def read_file(path: Path, max_bytes: int = DEFAULT_LIMITS.message_bytes) -> Enco
     return Encoded(coding, memoryview(content))
 
 
-def size_of(picture: Encoded) -> tuple[int, int]:
+def picture_size(picture: Encoded) -> tuple[int, int]:
     """Read width and height from the picture's header.
 
     Raises:
@@ -102,11 +102,11 @@ def check(picture: Encoded) -> tuple[int, int]:
 
     Raises:
         LogFormatError: The picture is empty, damaged, truncated or of an unsupported coding.
-        LogTooLargeError: As ``size_of``.
+        LogTooLargeError: As ``picture_size``.
     """
     if not len(picture.content):
         raise LogFormatError("empty picture")
-    size = size_of(picture)
+    size = picture_size(picture)
     if picture.layout is None and (why := damage_of(bytes(picture.content), picture.coding)):
         raise LogFormatError(f"{picture.coding} {why}")
     return size
@@ -132,7 +132,7 @@ def decode(
 
     Raises:
         LogFormatError: The picture is damaged, truncated or of an unsupported coding.
-        LogTooLargeError: As ``size_of``.
+        LogTooLargeError: As ``picture_size``.
     """
     size = check(picture)
     if picture.layout is not None:

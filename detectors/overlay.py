@@ -67,7 +67,7 @@ class Drawer:
         import cv2
 
         pixels, _ = decode(picture)
-        _, encoded = cv2.imencode(".jpg", draw(pixels, found, counts))
+        _, encoded = cv2.imencode(".jpg", draw_detections(pixels, found, counts))
         path = self.folder / f"{t_ns}.jpg"
         write_bytes(path, encoded.tobytes())
         self._written.append(path)
@@ -79,7 +79,7 @@ class Drawer:
         self._every *= 2
 
 
-def draw(
+def draw_detections(
     pixels: Bytes, found: Sequence[Found], counts: Mapping[str, int], enlarge: float = 1.0
 ) -> Bytes:
     """Return a copy with tinted road, boxes with labels, and the positive cues at the bottom.
@@ -123,7 +123,7 @@ def draw_frame(
     enlarge = max(size[0] / width_px, 0.5)
     if not found:
         return np.asarray(pixels, np.uint8)
-    canvas = draw(pixels, found, counts, 0.8 * enlarge)
+    canvas = draw_detections(pixels, found, counts, 0.8 * enlarge)
     for one in found:
         if isinstance(one, Detections):
             for box, mask in zip(one.boxes_px, one.masks, strict=True):
@@ -146,7 +146,7 @@ def _line(
     cv2.polylines(canvas, [whole], False, colour, max(round(enlarge), 1), cv2.LINE_AA)
 
 
-def picture_of(pixels: Bytes, found: Found) -> bytes:
+def encode_overlay(pixels: Bytes, found: Found) -> bytes:
     """Encode a picture as JPEG with one detector's boxes and labels, or road, drawn in."""
     import cv2
 

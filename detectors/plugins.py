@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator
 
 from crosscue.detectors.registry import BUILTIN
 from crosscue.replay.formats import FORMATS, DataSet, Format
-from crosscue.replay.plugins import GROUPS, Kind, Plugin, described, load, offered
+from crosscue.replay.plugins import GROUPS, Kind, Plugin, described, load_entry_point, offered
 from crosscue.replay.vehicle.vehicle import BUILTIN_CUES, CueSpec
 from crosscue.results import Listing
 
@@ -59,7 +59,7 @@ def plugins() -> Plugins:
         for point in offered(kind):
             problem = ""
             try:
-                made = load(point, wanted[kind])
+                made = load_entry_point(point, wanted[kind])
                 if kind == "detector" and not callable(made):
                     problem = f"{point.value} cannot be called; expected a factory"
             except ImportError as error:

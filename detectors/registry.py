@@ -23,7 +23,7 @@ from typing import Final, cast
 from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.plugins import GROUPS
 
-from .base import Choice, Detector
+from .base import Detector, DetectorChoice
 from .box_detector import FunctionDetector
 from .catalog import places as catalog
 from .catalog.card import read_card, read_weights
@@ -52,7 +52,9 @@ _WEIGHTS: Final = (".onnx", ".pt", ".pth", ".safetensors", ".tflite", ".xml")
 _PARTS: Final = ("view", "identity", "__call__")
 
 
-def chosen(names: str | Sequence[object], sections: Mapping[str, Choice]) -> tuple[Choice, ...]:
+def chosen(
+    names: str | Sequence[object], sections: Mapping[str, DetectorChoice]
+) -> tuple[DetectorChoice, ...]:
     """Return the detectors of a list such as ``cars,signs,my.toml,pack.mod:make``.
 
     Args:
@@ -74,18 +76,18 @@ def chosen(names: str | Sequence[object], sections: Mapping[str, Choice]) -> tup
     return found
 
 
-def _choice(name: object, sections: Mapping[str, Choice]) -> Choice:
+def _choice(name: object, sections: Mapping[str, DetectorChoice]) -> DetectorChoice:
     if not isinstance(name, str):
         return _choice_of_object(name)
     if name in sections:
         return sections[name]
     if name.endswith(".toml"):
         stem = name.replace("\\", "/").rsplit("/", 1)[-1].removesuffix(".toml")
-        return Choice(stem, "model", {"card": name})
-    return Choice(name, name)
+        return DetectorChoice(stem, "model", {"card": name})
+    return DetectorChoice(name, name)
 
 
-def _choice_of_object(given: object) -> Choice:
+def _choice_of_object(given: object) -> DetectorChoice:
     """Return the choice of a detector that is a class, a function or an object."""
     kind = given if isinstance(given, type) or isfunction(given) else type(given)
     name = getattr(given, "name", kind.__name__)
@@ -100,7 +102,7 @@ def _choice_of_object(given: object) -> Choice:
         factory = given
     else:
         factory = partial(_itself, given)
-    choice = Choice(str(name), f"{kind.__module__}:{kind.__qualname__}", factory=factory)
+    choice = DetectorChoice(str(name), f"{kind.__module__}:{kind.__qualname__}", factory=factory)
     return replace(choice, identity=make(choice).identity)
 
 
@@ -108,7 +110,7 @@ def _itself(given: object) -> object:
     return given
 
 
-def knows_simulated_only(choice: Choice) -> bool:
+def knows_simulated_only(choice: DetectorChoice) -> bool:
     """Whether a detector runs a network that was trained on simulated scenes only."""
     if choice.kind not in _EMBEDDED_BY:
         return False
@@ -116,18 +118,18 @@ def knows_simulated_only(choice: Choice) -> bool:
     return bool(choice.settings.get(setting, embedded) == embedded)
 
 
-def is_plugin(choice: Choice) -> bool:
+def is_plugin(choice: DetectorChoice) -> bool:
     """Whether a detector is code of the user's: a ``module:factory`` or an entry point."""
     return choice.kind not in BUILTIN and choice.kind not in catalog.names()
 
 
-def known(sections: Mapping[str, Choice]) -> list[str]:
+def known(sections: Mapping[str, DetectorChoice]) -> list[str]:
     """List all names that can be used."""
     offered = (point.name for point in entry_points(group=GROUP))
     return sorted({*sections, *BUILTIN, *catalog.names(), *offered})
 
 
-def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
+def make(choice: DetectorChoice, table: Mapping[str, str] = BUILTIN) -> Detector:
     """Build one detector.
 
     Raises:
@@ -141,7 +143,7 @@ def make(choice: Choice, table: Mapping[str, str] = BUILTIN) -> Detector:
     return _built(choice, factory, place)
 
 
-def _built(choice: Choice, factory: Callable[..., object], place: str) -> Detector:
+def _built(choice: DetectorChoice, factory: Callable[..., object], place: str) -> Detector:
     """Build a detector with its settings, and check that it is one.
 
     Raises:
@@ -164,7 +166,7 @@ def _built(choice: Choice, factory: Callable[..., object], place: str) -> Detect
     return cast("Detector", built)
 
 
-def check(choice: Choice, table: Mapping[str, str] = BUILTIN) -> None:
+def check(choice: DetectorChoice, table: Mapping[str, str] = BUILTIN) -> None:
     """Refuse a detector that does not exist, without building it.
 
     Raises:
@@ -181,15 +183,17 @@ def check(choice: Choice, table: Mapping[str, str] = BUILTIN) -> None:
         read_weights(found, weights_folder(found, path))
 
 
-def _with_card(choice: Choice, table: Mapping[str, str]) -> Choice:
+def _with_card(choice: DetectorChoice, table: Mapping[str, str]) -> DetectorChoice:
     """Return a model of the catalog as a detector with its card."""
     if choice.kind not in catalog.names() or choice.kind in table:
         return choice
     card = str(catalog.card_path(choice.kind))
-    return Choice(choice.name, "model", {**choice.settings, "card": card})
+    return DetectorChoice(choice.name, "model", {**choice.settings, "card": card})
 
 
-def _factory_of(choice: Choice, table: Mapping[str, str]) -> tuple[str, Callable[..., object]]:
+def _factory_of(
+    choice: DetectorChoice, table: Mapping[str, str]
+) -> tuple[str, Callable[..., object]]:
     """Return the ``module:factory`` of a detector, and the imported factory."""
     place = table.get(choice.kind) or _offered(choice.kind) or choice.kind
     module, colon, factory = place.partition(":")

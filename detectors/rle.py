@@ -25,7 +25,9 @@ _SIGN: Final = 0x10
 _LONGEST: Final = 7
 
 
-def encode(mask: NDArray[np.bool_], corner_px: tuple[int, int], size_px: tuple[int, int]) -> bytes:
+def encode_mask(
+    mask: NDArray[np.bool_], corner_px: tuple[int, int], size_px: tuple[int, int]
+) -> bytes:
     """Encode the mask of an object that is known only inside a box.
 
     Args:
@@ -126,7 +128,7 @@ def column_heights_px(text: bytes, size_px: tuple[int, int]) -> NDArray[np.float
     return np.diff(np.interp(borders, np.concatenate([[0], edges]), counted))
 
 
-def decode(text: bytes, size_px: tuple[int, int]) -> NDArray[np.bool_]:
+def decode_mask(text: bytes, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     """Decode the mask of the whole picture, shape (height, width).
 
     Raises:
@@ -172,7 +174,7 @@ def outline(
         return []
     x0, y0 = (int(v) for v in np.maximum(np.floor(box_px[:2]) - 1, 0))
     x1, y1 = (int(v) for v in np.ceil(box_px[2:]) + 1)
-    return borders(decode(mask, size_px)[y0:y1, x0:x1], (x0, y0))
+    return borders(decode_mask(mask, size_px)[y0:y1, x0:x1], (x0, y0))
 
 
 def borders(mask: NDArray[np.bool_], corner_px: tuple[int, int]) -> list[NDArray[np.float64]]:

@@ -11,7 +11,7 @@ from crosscue.replay.columns import Block, Bytes, Images
 from crosscue.replay.errors import CrosscueError, LogError, UsageError, one_line
 
 from .base import Detections, Detector, Found, Frame, View, fault_of, reportable
-from .images import NOT_DECODED, Encoded, decode, encoded, reduction, size_of
+from .images import NOT_DECODED, Encoded, decode, encoded, picture_size, reduction
 from .ranging.lens import VERSION, with_lenses
 from .result_cache import ResultCache, picture_key
 
@@ -46,7 +46,7 @@ class FrameResult:
 
 
 @dataclass(slots=True)
-class Counts:
+class FrameCounts:
     """Account of the frames, by detector name where it differs."""
 
     frames: int = 0
@@ -90,7 +90,7 @@ class Runner:
     on_skip: Callable[[int, str, str], None]
     light_labels: tuple[str, ...] = ()
     is_one_size: bool = False
-    counts: Counts = field(default_factory=Counts)
+    counts: FrameCounts = field(default_factory=FrameCounts)
     _size_px: tuple[int, int] | None = None
 
     def __call__(self, block: Block) -> Iterator[FrameResult]:
@@ -124,7 +124,7 @@ class Runner:
 
     def _decode(self, prepared: _Prepared) -> bool:
         try:
-            prepared.size_px = size_of(prepared.picture)
+            prepared.size_px = picture_size(prepared.picture)
             self._size_px = self._size_px or prepared.size_px
             if self.is_one_size and prepared.size_px != self._size_px:
                 self.on_skip(prepared.t_ns, OTHER_SIZE, f"{prepared.size_px}, not {self._size_px}")

@@ -33,7 +33,7 @@ def embedded(name: str) -> Path:
     return Path(__file__).with_name("checkpoints") / name
 
 
-def packed(tensors: Mapping[str, Tensor], key: str, description: str) -> bytes:
+def pack_weights(tensors: Mapping[str, Tensor], key: str, description: str) -> bytes:
     """Return the bytes of a file with weights and description.
 
     Args:
@@ -63,7 +63,7 @@ def serialised(tensors: Mapping[str, Tensor], words: Mapping[str, str]) -> bytes
     return b"".join((len(text).to_bytes(8, "little"), text, memoryview(content)[start:]))
 
 
-def unpacked(content: bytes, key: str, path: Path) -> tuple[str | None, dict[str, Tensor]]:
+def unpack_weights(content: bytes, key: str, path: Path) -> tuple[str | None, dict[str, Tensor]]:
     """Return description and weights; the description is None if ``key`` is missing.
 
     Raises:

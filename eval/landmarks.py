@@ -21,8 +21,12 @@ from crosscue.eval.fit.landmarks.database import (
 )
 from crosscue.eval.logs.log import DriveIfGiven, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
-from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
-from crosscue.localization.landmarks.images import grey_of, read_picture
+from crosscue.localization.landmarks.database import (
+    LandmarkDatabase,
+    LandmarkPosition,
+    LandmarkWriter,
+)
+from crosscue.localization.landmarks.images import grey_of, read_encoded
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.safe_text import visible
@@ -89,7 +93,7 @@ class LandmarkList(Result):
     path: Path = field(metadata=HIDDEN)
     kind: str = field(metadata=json_key("matcher"))
     total: int = field(metadata=json_key("landmarks"))
-    places: tuple[Place, ...] = field(metadata=json_key("listed"))
+    places: tuple[LandmarkPosition, ...] = field(metadata=json_key("listed"))
 
     def lines(self) -> Iterator[str]:
         """Yield a line for the database, and one for each landmark."""
@@ -98,7 +102,7 @@ class LandmarkList(Result):
         yield from map(_place_line, self.places)
 
 
-def _place_line(place: Place) -> str:
+def _place_line(place: LandmarkPosition) -> str:
     sd_x, sd_y = math.sqrt(place.cov_m2[0, 0]), math.sqrt(place.cov_m2[1, 1])
     turn = "      -" if place.heading_rad is None else f"{math.degrees(place.heading_rad):7.1f}"
     x, y = place.xy_m
@@ -297,7 +301,7 @@ def match_landmarks(
         raise UsageError(f"best: {best}, expected 1 or more")
     settings = vehicle_given(vehicle)
     comparing = matcher_for(settings, matcher)
-    seen = comparing.describe(grey_of(read_picture(Path(image))))
+    seen = comparing.describe(grey_of(read_encoded(Path(image))))
     compared = 0
     found: list[tuple[float, int, Match, str]] = []
     with open_for(Path(database), comparing) as known:

@@ -47,9 +47,9 @@ from .range_track import (
     NOTHING,
     RangeTrack,
     Verdict,
-    advance,
+    advance_range,
     follow,
-    measure,
+    fuse_range,
     predict_without_odometry,
 )
 from .temporal import (
@@ -279,7 +279,7 @@ class Approaches:
     def _predicted(self, track: RangeTrack, evidence: FrameEvidence, moved_m: float) -> RangeTrack:
         if evidence.travelled_m is None or not _has_way(evidence):
             return predict_without_odometry(track, moved_m, self._filter)
-        return advance(track, evidence.travelled_m, evidence.travelled_var_m2, self._filter)
+        return advance_range(track, evidence.travelled_m, evidence.travelled_var_m2, self._filter)
 
     def _over(self, current: _Open) -> str | None:
         """Reason why the approach is over; None if it is not."""
@@ -453,7 +453,7 @@ class Approaches:
         self, track: RangeTrack, range_m: float, var_m2: float
     ) -> tuple[RangeTrack, float | None]:
         near_m = self._fusion.dissent_within_m
-        track, verdict = measure(track, range_m, var_m2, self._filter, near_m)
+        track, verdict = fuse_range(track, range_m, var_m2, self._filter, near_m)
         if verdict is Verdict.WAITS:
             self.counts["ranges waiting for a second observation"] += 1
             return track, None

@@ -35,7 +35,7 @@ from .factor_graph import USUAL_FADE, CueNode, FactorGraph, log_odds
 from .independence import effective_sample_fraction
 
 
-class Learned(NamedTuple):
+class FittedEdge(NamedTuple):
     """One edge with fitted rates if the feature is present or absent; ``scale`` is its exponent."""
 
     feature: int
@@ -87,8 +87,8 @@ class CueMessages:
     cue: str
     can_start: bool
     fade: Fade
-    near: tuple[Learned, ...]
-    far: tuple[Learned, ...]
+    near: tuple[FittedEdge, ...]
+    far: tuple[FittedEdge, ...]
     published_near: tuple[Published, ...]
     published_far: tuple[Published, ...]
 
@@ -191,9 +191,9 @@ _Table = Mapping[tuple[str, str, bool], Rates]
 
 def _learned(
     graph: FactorGraph, cue: CueNode, near: bool, rates: _Table, scales: Mapping[str, float]
-) -> tuple[Learned, ...]:
+) -> tuple[FittedEdge, ...]:
     return tuple(
-        Learned(place, one.if_there, one.if_not, scales[feature])
+        FittedEdge(place, one.if_there, one.if_not, scales[feature])
         for place, feature in enumerate(graph.feature_names)
         if (one := rates.get((cue.name, feature, near))) is not None
     )

@@ -84,7 +84,7 @@ def update(belief: RangeBelief, measured_m: float, sensor_var_m2: float) -> Rang
     return RangeBelief(float(mean_m), float(var_m2))
 
 
-def smooth(
+def smooth_ranges(
     filtered: Sequence[RangeBelief], travelled_m: Sequence[float], odometry_var_m2: Sequence[float]
 ) -> list[RangeBelief]:
     """Smooth all steps with all measurements (Rauch, Tung, Striebel, 1965).

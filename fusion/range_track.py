@@ -50,7 +50,7 @@ NOTHING: Final = RangeTrack()
 MIN_EFFECTIVE_SAMPLES: Final = 1e-9
 
 
-def advance(
+def advance_range(
     track: RangeTrack, travelled_m: float, var_m2: float, settings: RangeFilter
 ) -> RangeTrack:
     """Predict the track over a distance.
@@ -83,10 +83,10 @@ def predict_without_odometry(
         return track
     sd_m = math.sqrt(first.var_m2)
     gone = track._replace(unseen_m=track.unseen_m + widens_m)
-    return advance(gone, 0.0, widens_m * (widens_m + 2.0 * sd_m), settings)
+    return advance_range(gone, 0.0, widens_m * (widens_m + 2.0 * sd_m), settings)
 
 
-def measure(
+def fuse_range(
     track: RangeTrack,
     measured_m: float,
     sensor_var_m2: float,

@@ -96,7 +96,7 @@ class MotionNoise:
                 raise ValueError(f"{name}: expected >= 0, got {getattr(self, name)}")
 
 
-class Motion(NamedTuple):
+class MotionStep(NamedTuple):
     """One step of the motion model.
 
     Attributes:
@@ -128,7 +128,7 @@ class Updated(NamedTuple):
 
 def bicycle(
     mean: Floats, accel_mps2: float, steering_rad: float, dt_s: float, wheelbase_m: float
-) -> Motion:
+) -> MotionStep:
     """Equations 5 and 6 with their Jacobians by state and by (acceleration, steering).
 
     The dissertation's curvature is steering / wheelbase, without the tangent.
@@ -140,7 +140,7 @@ def bicycle(
     return _drive(mean, accel_mps2, dt_s, distance_m, distance_m * curvature, distance_by, turn_by)
 
 
-def turning(mean: Floats, accel_mps2: float, yaw_rate_radps: float, dt_s: float) -> Motion:
+def turning(mean: Floats, accel_mps2: float, yaw_rate_radps: float, dt_s: float) -> MotionStep:
     """The same arc by yaw rate, with Jacobians by state and by (acceleration, yaw rate)."""
     distance_m = mean[SPEED] * dt_s + 0.5 * accel_mps2 * dt_s**2
     distance_by = np.array([dt_s, 0.5 * dt_s**2, 0.0])
@@ -148,7 +148,7 @@ def turning(mean: Floats, accel_mps2: float, yaw_rate_radps: float, dt_s: float)
     return _drive(mean, accel_mps2, dt_s, distance_m, yaw_rate_radps * dt_s, distance_by, turn_by)
 
 
-def predict(
+def predict_ekf(
     belief: PoseBelief, accel_mps2: float, steering_rad: float, dt_s: float, noise: MotionNoise
 ) -> PoseBelief:
     """Predict over ``dt_s`` with the given acceleration and road-wheel angle (eq. 5 and 6).
@@ -200,10 +200,15 @@ def predict_odometry(
     _check_inputs(dt_s, distance_m=distance_m, turn_rad=turn_rad)
     if not (distance_var_m2 >= 0.0 and turn_var_rad2 >= 0.0 and accel_var_m2ps3 >= 0.0):
         raise ValueError(f"variances: expected >= 0, got {distance_var_m2}, {turn_var_rad2}")
-    after = pose_filter.predict(
-        packed(belief), distance_m, turn_rad, distance_var_m2, turn_var_rad2, accel_var_m2ps3 * dt_s
+    after = pose_filter.predict_pose(
+        pack_belief(belief),
+        distance_m,
+        turn_rad,
+        distance_var_m2,
+        turn_var_rad2,
+        accel_var_m2ps3 * dt_s,
     )
-    return unpacked(belief.t_ns + round(dt_s * 1e9), after)
+    return unpack_belief(belief.t_ns + round(dt_s * 1e9), after)
 
 
 def coast(
@@ -282,9 +287,9 @@ def update_position(
     (var_x, cov_xy), (_, var_y) = cov_m2.tolist()
     gate = math.inf if gate_nis is None else gate_nis
     found = pose_filter.update_position(
-        packed(belief), float(xy_m[0]), float(xy_m[1]), var_x, cov_xy, var_y, gate
+        pack_belief(belief), float(xy_m[0]), float(xy_m[1]), var_x, cov_xy, var_y, gate
     )
-    after = unpacked(belief.t_ns, found.state) if found.is_accepted else belief
+    after = unpack_belief(belief.t_ns, found.state) if found.is_accepted else belief
     return Updated(after, found.is_accepted, innovation, found.nis)
 
 
@@ -306,7 +311,7 @@ def _drive(
     turn_rad: float,
     distance_by: Floats,
     turn_by: Floats,
-) -> Motion:
+) -> MotionStep:
     """Transform the arc to the map; ``*_by`` are derivatives by speed and by the two inputs."""
     step = arc(distance_m, turn_rad)
     heading = mean[HEADING]
@@ -329,7 +334,7 @@ def _drive(
             mean[SPEED] + accel_mps2 * dt_s,
         ]
     )
-    return Motion(after, by_state, by_input)
+    return MotionStep(after, by_state, by_input)
 
 
 def _walk(summed: Floats, walked: Floats, dt_s: float) -> Floats:
@@ -342,7 +347,7 @@ def _walk(summed: Floats, walked: Floats, dt_s: float) -> Floats:
 
 def _predicted(
     belief: PoseBelief,
-    motion: Motion,
+    motion: MotionStep,
     dt_s: float,
     accel_mps2: float,
     noise: MotionNoise,
@@ -365,8 +370,8 @@ def _update_one(
     nis = float(innovation[0] ** 2 / (belief.cov[measured, measured] + var))
     if gate_nis is not None and nis > gate_nis:
         return Updated(belief, False, innovation, nis)
-    after = pose_filter.update(packed(belief), measured, float(innovation[0]), var)
-    return Updated(unpacked(belief.t_ns, after), True, innovation, nis)
+    after = pose_filter.update_state(pack_belief(belief), measured, float(innovation[0]), var)
+    return Updated(unpack_belief(belief.t_ns, after), True, innovation, nis)
 
 
 def _belief(t_ns: int, mean: Floats, cov: Floats) -> PoseBelief:
@@ -395,13 +400,13 @@ def _check_measurement(innovation: Floats, cov: Floats) -> None:
         raise ValueError(f"measurement covariance: expected positive definite, got {cov.tolist()}")
 
 
-def packed(belief: PoseBelief) -> State:
+def pack_belief(belief: PoseBelief) -> State:
     """Convert a belief to a state, without its time."""
     p = belief.cov
     return State(*map(float, (*belief.mean, *p[0], *p[1, 1:], *p[2, 2:], p[3, 3])))
 
 
-def unpacked(t_ns: int, state: State) -> PoseBelief:
+def unpack_belief(t_ns: int, state: State) -> PoseBelief:
     """Convert a state and a time to a belief."""
     x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
     cov = np.array([[xx, xy, xh, xv], [xy, yy, yh, yv], [xh, yh, hh, hv], [xv, yv, hv, vv]])

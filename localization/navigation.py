@@ -2,8 +2,8 @@
 
     decision = argmin over options of |heading after - bearing to goal after| + penalty
 
-``choose`` maps headings and bearings to a decision, for any number of roads at any angle. The
-penalty grows each time the same option is taken at the same intersection, which the dissertation
+``choose_option`` maps headings and bearings to a decision, for any number of roads at any angle.
+The penalty grows each time the same option is taken at the same intersection, which the dissertation
 compares to tabu search. Intersections are recognised by the *estimated* position only.
 """
 
@@ -48,7 +48,7 @@ def option_cost(heading_rad: float, bearing_rad: float, penalty_rad: float) -> f
     return abs(wrap(heading_rad - bearing_rad)) + penalty_rad
 
 
-def choose(
+def choose_option(
     headings_rad: NDArray[np.float64],
     bearings_rad: NDArray[np.float64],
     penalties_rad: NDArray[np.float64],

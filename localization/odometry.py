@@ -133,7 +133,7 @@ class OdometrySettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WheelSpeeds:
+class WheelSamples:
     """N samples of two rear or of all four wheels.
 
     Attributes:
@@ -283,7 +283,7 @@ class Pending:
     turn_values: Floats = field(default_factory=lambda: np.empty(0))
 
 
-class Odometry(NamedTuple):
+class OdometryWindow(NamedTuple):
     """Result of one window."""
 
     increments: Increments
@@ -299,12 +299,12 @@ class _Clean(NamedTuple):
 
 
 def integrate(
-    wheels: WheelSpeeds,
+    wheels: WheelSamples,
     settings: OdometrySettings,
     turn: TurnSignal | None = None,
     pending: Pending | None = None,
     until_ns: int | None = None,
-) -> Odometry:
+) -> OdometryWindow:
     """Compute distance and change of heading from each wheel row to the next.
 
     Args:
@@ -347,10 +347,12 @@ def integrate(
     )
     last = max(ready - 1, 0)
     rest = Pending(t_ns[last:], axle_mps[last:], yaw_radps[last:])
-    return Odometry(made, rest if joined is None else _keep_turn(rest, joined, until_ns), counts)
+    return OdometryWindow(
+        made, rest if joined is None else _keep_turn(rest, joined, until_ns), counts
+    )
 
 
-def first_reading(wheels: WheelSpeeds, settings: OdometrySettings) -> tuple[int, float] | None:
+def first_reading(wheels: WheelSamples, settings: OdometrySettings) -> tuple[int, float] | None:
     """Time and rear-axle speed in m/s of the first finite row; None without one."""
     axle_mps, _ = _at_rear_axle(wheels, settings)
     rows = np.flatnonzero(np.isfinite(axle_mps))
@@ -363,7 +365,7 @@ def _check_geometry(settings: OdometrySettings, turn: TurnSignal | None) -> None
         raise ValueError("wheelbase_m: needed for steering and for front wheels, got None")
 
 
-def _at_rear_axle(wheels: WheelSpeeds, settings: OdometrySettings) -> tuple[Floats, Floats]:
+def _at_rear_axle(wheels: WheelSamples, settings: OdometrySettings) -> tuple[Floats, Floats]:
     """Speed of the rear axle's centre, and yaw rate by the difference of left and right wheels."""
     speeds = wheels.signed_mps() * settings.wheel_scales[-wheels.wheels_mps.shape[1] :]
     left, right = speeds[:, -2], speeds[:, -1]

@@ -88,7 +88,7 @@ def arc(distance_m: float, turn_rad: float) -> Arc:
     )
 
 
-def predict(
+def predict_pose(
     state: State,
     distance_m: float,
     turn_rad: float,
@@ -132,7 +132,7 @@ def predict(
     )
 
 
-def update(state: State, measured: int, innovation: float, var: float) -> State:
+def update_state(state: State, measured: int, innovation: float, var: float) -> State:
     """Fuse a measurement of one state.
 
     Args:
@@ -252,7 +252,7 @@ def major_axis_m(var_x: float, cov_xy: float, var_y: float) -> float:
     return 4.0 * math.sqrt(max(0.5 * (var_x + var_y) + radius, 0.0))
 
 
-def nees(ex: float, ey: float, eh: float, state: State) -> float:
+def pose_nees(ex: float, ey: float, eh: float, state: State) -> float:
     """Normalised estimation error squared of x, y and heading, by the Cholesky factor."""
     a = math.sqrt(state.xx)
     b, c = state.xy / a, state.xh / a

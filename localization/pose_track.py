@@ -30,9 +30,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .angles import wrap
-from .ekf import PoseBelief, coast, packed, unpacked
+from .ekf import PoseBelief, coast, pack_belief, unpack_belief
 from .odometry import Increments
-from .pose_filter import HEADING, SPEED, major_axis_m, predict, update
+from .pose_filter import HEADING, SPEED, major_axis_m, predict_pose, update_state
 
 Floats: TypeAlias = NDArray[np.float64]
 Int64s: TypeAlias = NDArray[np.int64]
@@ -289,7 +289,7 @@ def start_belief(
     return PoseBelief(t_ns, mean, np.diag(sd**2))
 
 
-def advance(
+def advance_pose(
     state: TrackState,
     increments: Increments,
     settings: TrackSettings,
@@ -337,7 +337,7 @@ _NEVER: Final = np.iinfo(np.int64).max
 
 
 class _Run:
-    """State during a call of ``advance``."""
+    """State during a call of ``advance_pose``."""
 
     def __init__(
         self,
@@ -349,7 +349,7 @@ class _Run:
     ) -> None:
         self.settings = settings
         self.t_ns = state.belief.t_ns
-        self.state = packed(state.belief)
+        self.state = pack_belief(state.belief)
         self.travelled_m = state.travelled_m
         self.counted_ns = state.counted_ns
         self.counted_m = state.counted_m
@@ -416,7 +416,7 @@ class _Run:
                 break
             self._handle_events()
         innovation = speed_mps - self.state[SPEED]
-        self.state = update(self.state, SPEED, innovation, speed_var)
+        self.state = update_state(self.state, SPEED, innovation, speed_var)
         if self.event_ns == stop_ns:
             self._handle_events()
         if self.every_interval:
@@ -426,7 +426,9 @@ class _Run:
         self, to_ns: int, distance_m: float, turn_rad: float, distance_var: float, turn_var: float
     ) -> None:
         speed_var = self.settings.accel_var_m2ps3 * ((to_ns - self.t_ns) * 1e-9)
-        self.state = predict(self.state, distance_m, turn_rad, distance_var, turn_var, speed_var)
+        self.state = predict_pose(
+            self.state, distance_m, turn_rad, distance_var, turn_var, speed_var
+        )
         self.travelled_m += abs(distance_m)
         self.t_ns = to_ns
 
@@ -436,12 +438,12 @@ class _Run:
         self.tally["coast_ns"] += stop_ns - self.t_ns
         while self.t_ns < stop_ns:
             to_ns = min(self.event_ns, stop_ns)
-            before = unpacked(self.t_ns, self.state)
+            before = unpack_belief(self.t_ns, self.state)
             dt_s = (to_ns - self.t_ns) * 1e-9
             after = coast(
                 before, dt_s, self.settings.accel_var_m2ps3, self.settings.coast_turn_var_rad2ps
             )
-            self.state, self.t_ns = packed(after), to_ns
+            self.state, self.t_ns = pack_belief(after), to_ns
             if to_ns < stop_ns:
                 self._handle_events()
 
@@ -463,10 +465,10 @@ class _Run:
         self._find_event()
 
     def _measure(self) -> None:
-        found = self.measurements.update(unpacked(self.t_ns, self.state), self.travelled_m)
+        found = self.measurements.update(unpack_belief(self.t_ns, self.state), self.travelled_m)
         if found is None:
             return
-        self.state = packed(found)
+        self.state = pack_belief(found)
         if self.every_interval:
             self._keep_row()
 
@@ -495,7 +497,7 @@ class _Run:
             return
         self.tally["headings_accepted"] += 1
         self.counted_ns, self.counted_m = self.t_ns, self.travelled_m
-        self.state = update(self.state, HEADING, innovation, var_rad2)
+        self.state = update_state(self.state, HEADING, innovation, var_rad2)
 
     def _is_due(self) -> bool:
         if self.counted_ns is None:
@@ -518,7 +520,7 @@ class _Run:
         poses = np.array(self.poses).reshape(-1, 12)
         used = np.array(self.used, dtype=np.float64).reshape(-1, 6)
         state = TrackState(
-            belief=unpacked(self.t_ns, self.state),
+            belief=unpack_belief(self.t_ns, self.state),
             travelled_m=self.travelled_m,
             counted_ns=self.counted_ns,
             counted_m=self.counted_m,

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from .ekf import PoseBelief, packed, unpacked
+from .ekf import PoseBelief, pack_belief, unpack_belief
 from .fixes import NO_FIXES, Fixes
 from .pose_filter import at_point, update_position
 
@@ -82,7 +82,7 @@ class PositionUpdates:
             self.counts.thinned += 1
             return None
         ahead_m, left_m = self.lever_m
-        antenna = at_point(packed(belief), ahead_m, left_m)
+        antenna = at_point(pack_belief(belief), ahead_m, left_m)
         moved_m = self.delay_s * antenna.speed_mps
         x_m = float(fix.xy_m[0, 0]) + moved_m * math.cos(antenna.heading_rad)
         y_m = float(fix.xy_m[0, 1]) + moved_m * math.sin(antenna.heading_rad)
@@ -94,7 +94,7 @@ class PositionUpdates:
         self.counts.accepted += 1
         self._counted_ns = belief.t_ns
         self._used.append((belief.t_ns, x_m, y_m, xx, xy, yy))
-        return unpacked(belief.t_ns, at_point(done.state, -ahead_m, -left_m))
+        return unpack_belief(belief.t_ns, at_point(done.state, -ahead_m, -left_m))
 
     def let_go(self, before_ns: int) -> None:
         """Drop positions that are before all further odometry."""

@@ -22,7 +22,7 @@ from .angles import wrap
 from .ekf import PoseBelief
 from .fixes import NO_FIXES, Fixes
 from .odometry import BY_NOTHING, Increments
-from .pose_filter import State, predict
+from .pose_filter import State, predict_pose
 from .pose_track import Headings
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class Smoothed:
     cov: Floats
 
 
-def smooth(
+def smooth_poses(
     start: PoseBelief,
     increments: Increments,
     headings: Headings,
@@ -149,7 +149,7 @@ def _steps(times: Int64s, increments: Increments) -> list[tuple[Floats, Floats]]
             to = min(until, stops[i])
             fraction = (to - now) / (stops[i] - starts[i])
             distance, turn, distance_var, turn_var = (fraction * value for value in rows[i])
-            state = predict(state, distance, turn, distance_var, turn_var, 0.0)
+            state = predict_pose(state, distance, turn, distance_var, turn_var, 0.0)
             aside_var += distance_var if is_blind[i] else 0.0
             now = to
             i += now == stops[i]

@@ -20,13 +20,13 @@ Function = TypeVar("Function", bound=Callable[..., object])
 _PACKAGE = __name__.rpartition(".")[0].partition(".")[0]
 
 
-def compiled(function: Function) -> Function:
+def compile_function(function: Function) -> Function:
     """Compile a function and every crosscue function that it calls."""
     return cast("Function", _dispatcher(function))
 
 
 def kept(function: Function) -> Function:
-    """Like ``compiled``, with a cache on disk that is valid until one of the sources changes."""
+    """Like ``compile_function``, with a cache on disk, valid until one of the sources changes."""
     return cast("Function", _kept(function))
 
 

@@ -83,19 +83,19 @@ FORMATS: Final[dict[str, Format]] = {
     "kitti-raw": Format(
         (),
         ("oxts/data", "oxts/timestamps.txt", "oxts/*.txt"),
-        "crosscue.datasets.adapters.kitti:open_drive",
+        "crosscue.datasets.adapters.kitti:open_kitti",
         "KITTI raw drive",
     ),
     "kitti-odometry": Format(
         (),
         ("image_[0-9]/*.png",),
-        "crosscue.datasets.adapters.kitti_odometry:open_sequence",
+        "crosscue.datasets.adapters.kitti_odometry:open_kitti_odometry",
         "KITTI odometry sequence",
     ),
     "phone-drive": Format(
         (),
         ("*_phone.csv",),
-        "crosscue.datasets.adapters.phone_drive:open_drive",
+        "crosscue.datasets.adapters.phone_drive:open_phone_drive",
         "smartphone driving data set (folder)",
     ),
     "nuscenes": Format(
@@ -107,7 +107,7 @@ FORMATS: Final[dict[str, Format]] = {
     "pandaset": Format(
         (),
         ("camera/*/poses.json",),
-        "crosscue.datasets.adapters.pandaset:open_sequence",
+        "crosscue.datasets.adapters.pandaset:open_pandaset",
         "PandaSet sequence",
     ),
     "video": Format(

@@ -59,7 +59,7 @@ def offered(kind: Kind) -> list[EntryPoint]:
     return sorted(points, key=lambda point: (point.name, point.value))
 
 
-def load(point: EntryPoint, wanted: type[T]) -> T:
+def load_entry_point(point: EntryPoint, wanted: type[T]) -> T:
     """Load the object of an entry point.
 
     Raises:
@@ -90,7 +90,7 @@ def loaded(kind: Kind, wanted: type[T], taken: Collection[str]) -> Iterator[tupl
     seen = {*taken}
     for point in offered(kind):
         try:
-            found = load(point, wanted)
+            found = load_entry_point(point, wanted)
             if point.name in seen:
                 raise ImportError("its name is taken; give it another")
         except ImportError as error:

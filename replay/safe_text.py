@@ -23,7 +23,7 @@ def visible(text: str) -> str:
     )
 
 
-def cells(text: str) -> int:
+def terminal_cells(text: str) -> int:
     """Return the number of terminal columns that ``text`` occupies."""
     if text.isascii():
         return len(text)
@@ -52,7 +52,7 @@ def table(
             shortened.
     """
     shown = [[visible(cell) for cell in row] for row in [head, *rows]]
-    widths = [max(cells(row[i]) for row in shown) for i in range(len(head))]
+    widths = [max(terminal_cells(row[i]) for row in shown) for i in range(len(head))]
     over = sum(widths) + 2 * (len(widths) - 1) - width
     while over > 0:
         widest = max(text_columns, key=lambda i: widths[i])
@@ -67,11 +67,11 @@ def table(
 
 def wrapped(sentence: str, width: int, lead: str = "- ") -> str:
     """Wrap a bullet point over several lines; words longer than a line are split."""
-    room = width - cells(lead)
+    room = width - terminal_cells(lead)
     lines = [""]
     for word in visible(sentence).split():
         joined = f"{lines[-1]} {word}" if lines[-1] else word
-        if cells(joined) <= room:
+        if terminal_cells(joined) <= room:
             lines[-1] = joined
             continue
         rest = word
@@ -80,23 +80,23 @@ def wrapped(sentence: str, width: int, lead: str = "- ") -> str:
             lines.append(part)
             rest = rest[len(part) :]
     filled = [line for line in lines if line]
-    indents = [lead, *[" " * cells(lead)] * len(filled)]
+    indents = [lead, *[" " * terminal_cells(lead)] * len(filled)]
     return "\n".join(indent + line for indent, line in zip(indents, filled, strict=False))
 
 
 def _fitted(cell: str, width: int, *, left: bool) -> str:
-    if cells(cell) > width:
+    if terminal_cells(cell) > width:
         # Names of topics differ more often at the end, so two thirds of the width go there.
         head = max((width - 1) // 3, 1)
         cell = _first(cell, head) + _CUT + _first(cell[::-1], width - 1 - head)[::-1]
-    room = " " * (width - cells(cell))
+    room = " " * (width - terminal_cells(cell))
     return cell + room if left else room + cell
 
 
 def _first(text: str, width: int) -> str:
     taken = ""
     for c in text:
-        if cells(taken) + cells(c) > width:
+        if terminal_cells(taken) + terminal_cells(c) > width:
             break
         taken += c
     return taken

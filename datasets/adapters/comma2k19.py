@@ -31,7 +31,7 @@ from crosscue.replay.files.closing import Closing
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
 
-from .npy import Column, read_column
+from .npy import ArrayColumn, read_column
 
 CUT, UNREADABLE = "array file is cut", "array cannot be read"
 STEP_NS: Final = 1_000_000_000
@@ -130,14 +130,14 @@ class _Source:
     topic: Topic
     t_ns: Int64s
     rows: Callable[[slice], Rows]
-    files: tuple[Column, ...]
+    files: tuple[ArrayColumn, ...]
     reach_ns: Int64s = field(init=False)
 
     def __post_init__(self) -> None:
         self.reach_ns = np.maximum.accumulate(self.t_ns) if len(self.t_ns) else self.t_ns
 
 
-class Segment(Closing):
+class CommaSegment(Closing):
     """One segment folder as a ``Log``."""
 
     format: Final = "comma2k19"
@@ -205,7 +205,7 @@ class Segment(Closing):
         """Release the mapped files."""
         self._sources = []
 
-    def _column(self, relative: str) -> Column | None:
+    def _column(self, relative: str) -> ArrayColumn | None:
         path = self.path / "processed_log" / relative
         if not path.is_file():
             return None
@@ -215,7 +215,7 @@ class Segment(Closing):
             self._unreadable.append(str(error))
             return None
 
-    def _has(self, column: Column, kinds: str, width: int = 0) -> bool:
+    def _has(self, column: ArrayColumn, kinds: str, width: int = 0) -> bool:
         """Check that rows are numbers of these kinds with ``width`` columns; 0 for scalars."""
         rows, sides = column.rows, column.rows.shape[1:]
         has_columns = len(sides) == 1 and sides[0] >= width > 0
@@ -273,7 +273,7 @@ class Segment(Closing):
 
 
 def _frames_of(
-    address: Column, payload: Column, index: NDArray[np.intp]
+    address: ArrayColumn, payload: ArrayColumn, index: NDArray[np.intp]
 ) -> Callable[[slice], Rows]:
     def frames(part: slice) -> CanFrames:
         rows = index[part]
@@ -324,6 +324,6 @@ def _to_ns(seconds: Values) -> Int64s:
     return np.where(is_time, t_ns, NO_TIME).astype(np.int64)
 
 
-def open_segment(path: Path, limits: Limits) -> Segment:
+def open_segment(path: Path, limits: Limits) -> CommaSegment:
     """Open a segment folder; see ``crosscue.replay.formats.FORMATS``."""
-    return Segment(path)
+    return CommaSegment(path)

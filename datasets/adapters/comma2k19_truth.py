@@ -22,7 +22,7 @@ POSE_FILE: Final = "pose.tum"
 LATEST_S: Final = 9e9
 
 
-def write(path: Path, folder: Path) -> Path:
+def write_comma_truth(path: Path, folder: Path) -> Path:
     """Write the camera's true trajectory, relative to its first position.
 
     Raises:

@@ -37,12 +37,12 @@ from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.held_rows import CameraDrive
 from crosscue.replay.readers.images.files import PictureFiles, list_pictures
 from crosscue.replay.readers.time_file import read_time_file
-from crosscue.replay.readers.timed_files import TimedFiles, list_files, pair
+from crosscue.replay.readers.timed_files import TimedFiles, list_files, pair_with_times
 from crosscue.replay.seal.touched import Touched, open_noted
 
-from .kitti_labels import read_labels
+from .kitti_labels import read_kitti_labels
 from .kitti_odometry import BOX, SETUP, projection
-from .kitti_oxts import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse
+from .kitti_oxts import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse_oxts
 
 POSE_FILE: Final = "pose.tum"
 # Default period of frames, if positions and speeds do not determine it.
@@ -123,7 +123,7 @@ class Oxts:
                 number += 1
 
 
-class Drive(CameraDrive):
+class KittiDrive(CameraDrive):
     """One drive as a ``Log``."""
 
     format: Final = "kitti-raw"
@@ -172,7 +172,7 @@ class Drive(CameraDrive):
         return projection(file, str(int(camera.rpartition("_")[2])))
 
 
-def open_drive(path: Path, limits: Limits) -> Drive:
+def open_kitti(path: Path, limits: Limits) -> KittiDrive:
     """Open a drive's folder; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
@@ -183,14 +183,14 @@ def open_drive(path: Path, limits: Limits) -> Drive:
     return _open_tracking(path, limits)
 
 
-def write_truth(path: Path, folder: Path) -> Path:
+def write_kitti_truth(path: Path, folder: Path) -> Path:
     """Write the INS trajectory of a drive, relative to its first position.
 
     Raises:
         LogFormatError: There are fewer than two packets with times.
         OutputError: It cannot be written.
     """
-    oxts = open_drive(path, DEFAULT_LIMITS).oxts
+    oxts = open_kitti(path, DEFAULT_LIMITS).oxts
     packets = _in_time_order(_packets(list(oxts.lines()))) if oxts is not None else None
     if packets is None or len(packets) < 2:
         raise LogFormatError(f"{path}/oxts: fewer than two packets; the drive contains no truth")
@@ -228,11 +228,11 @@ def _objects(path: Path, oxts: Oxts | None, folder: Path) -> tuple[str | None, i
     if oxts is None or single is None or not (path / "label_02" / single.name).is_file():
         return None, 0
     pictures = path / "image_02" / single.stem
-    found = read_labels(path / "label_02" / single.name, pictures, oxts.period_ns)
+    found = read_kitti_labels(path / "label_02" / single.name, pictures, oxts.period_ns)
     return found.objects.save(folder, "KITTI tracking (CC BY-NC-SA 3.0): label_02"), found.lost
 
 
-def _open_raw(path: Path, limits: Limits) -> Drive:
+def _open_raw(path: Path, limits: Limits) -> KittiDrive:
     cameras: list[PictureFiles] = []
     unreadable: list[Unreadable] = []
     touched = Touched()
@@ -248,7 +248,7 @@ def _open_raw(path: Path, limits: Limits) -> Drive:
         why = unreadable[0][3] if unreadable else "no image_0x and no oxts with files in data/"
         raise LogFormatError(f"{path}: no stream of a KITTI raw drive can be read: {why}")
     notices = ["velodyne_points: laser scans are not read"]
-    return Drive(
+    return KittiDrive(
         path,
         cameras,
         None if packets is None else Oxts(packets, touched=touched),
@@ -283,7 +283,7 @@ def _timed(
         touched.add(time_file, 0, time_file.stat().st_size)
         times = read_time_file(time_file, limits)
         if paths:
-            return pair(paths, times)
+            return pair_with_times(paths, times)
     except LogFormatError as error:
         unreadable.append((topic, "times cannot be read", len(paths) or None, str(error)))
         return None
@@ -292,7 +292,7 @@ def _timed(
     return None
 
 
-def _open_tracking(path: Path, limits: Limits) -> Drive:
+def _open_tracking(path: Path, limits: Limits) -> KittiDrive:
     singles = sorted((path / "oxts").glob("*.txt"))
     if len(singles) != 1:
         raise LogFormatError(
@@ -319,7 +319,7 @@ def _open_tracking(path: Path, limits: Limits) -> Drive:
         f"{name}: the tracking set has no times; they are computed from frame numbers, "
         f"{oxts.period_ns * 1e-6:g} ms each ({why}), starting at 0"
     )
-    return Drive(path, cameras, oxts, limits, touched, notices=[notice])
+    return KittiDrive(path, cameras, oxts, limits, touched, notices=[notice])
 
 
 def _driven_period_s(oxts: Oxts) -> float | None:
@@ -383,7 +383,7 @@ def _account(
         ledger.spoil(name, "a packet without its time", timeless)
         ledger.skip(name, NOT_ASKED_TIME, n - timeless - int(np.count_nonzero(wanted)))
     for place, t_ns, raw in some:
-        why = raw if isinstance(raw, str) else parse(raw)
+        why = raw if isinstance(raw, str) else parse_oxts(raw)
         if isinstance(why, str):
             ledger.drop(name, "not an OXTS packet", 1, f"{place}: {why}", t_ns)
 
@@ -393,7 +393,7 @@ def _packets(some: Sequence[Line]) -> Packets:
     good = [
         (t_ns, row)
         for _, t_ns, raw in some
-        if not isinstance(raw, str) and not isinstance(row := parse(raw), str)
+        if not isinstance(raw, str) and not isinstance(row := parse_oxts(raw), str)
     ]
     rows = np.array([row for _, row in good], dtype=np.float64).reshape(-1, len(COLUMNS))
     return Packets(np.array([t_ns for t_ns, _ in good], dtype=np.int64), rows)

@@ -37,14 +37,14 @@ UNLABELLED: Final = ("car", "person")
 VISIBLE: Final = {0: 1.0, 1: 0.7, 2: 0.3}
 
 
-class Labelled(NamedTuple):
+class SequenceLabels(NamedTuple):
     """Objects of a sequence, and the number of damaged lines."""
 
     objects: Objects
     lost: int
 
 
-def read_labels(file: Path, pictures: Path, period_ns: int) -> Labelled:
+def read_kitti_labels(file: Path, pictures: Path, period_ns: int) -> SequenceLabels:
     """Read the labels of a sequence, frame by frame.
 
     Args:
@@ -93,7 +93,7 @@ def read_labels(file: Path, pictures: Path, period_ns: int) -> Labelled:
                 x_m=round(numbers[12], 3),
                 y_m=round(-numbers[10], 3),
             )
-    return Labelled(objects, lost)
+    return SequenceLabels(objects, lost)
 
 
 def _size_px(pictures: Path) -> tuple[int, int]:

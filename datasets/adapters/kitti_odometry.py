@@ -47,7 +47,7 @@ BOX: Final = Mounting(x_m=-0.05, y_m=0.32, z_m=0.93, roll_rad=None, pitch_rad=No
 AXES: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-class Poses(NamedTuple):
+class CameraTrajectory(NamedTuple):
     """Trajectory of the left grey camera.
 
     Attributes:
@@ -78,7 +78,7 @@ class Poses(NamedTuple):
         )
 
 
-class Drive(CameraDrive):
+class KittiOdometryDrive(CameraDrive):
     """One sequence as a ``Log``."""
 
     format: Final = "kitti-odometry"
@@ -115,7 +115,7 @@ def projection(file: Path, camera: str) -> tuple[float, float, float] | None:
     return None
 
 
-def open_sequence(path: Path, limits: Limits) -> Drive:
+def open_kitti_odometry(path: Path, limits: Limits) -> KittiOdometryDrive:
     """Open a sequence's folder; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
@@ -141,7 +141,7 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
     if (file := pose_file(path)) is not None:
         touched.add(file, 0, file.stat().st_size)
         try:
-            poses = read_poses(path, limits)
+            poses = read_kitti_poses(path, limits)
             topic = Topic("odometry", "nav_msgs/msg/Odometry", "columns", declared=poses.declared)
             odometry = HeldRows(topic, poses.t_ns, poses.odometry(), poses.losses)
         except LogFormatError as error:
@@ -150,7 +150,9 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
     numbers = () if odometry is None else (odometry,)
     if numbers:
         notices.append("odometry: computed from the true poses; do not score poses based on it")
-    return Drive(path, cameras, numbers, limits, touched, unreadable=unreadable, notices=notices)
+    return KittiOdometryDrive(
+        path, cameras, numbers, limits, touched, unreadable=unreadable, notices=notices
+    )
 
 
 def pose_file(path: Path) -> Path | None:
@@ -162,7 +164,7 @@ def pose_file(path: Path) -> Path | None:
     return None
 
 
-def read_poses(path: Path, limits: Limits = DEFAULT_LIMITS) -> Poses:
+def read_kitti_poses(path: Path, limits: Limits = DEFAULT_LIMITS) -> CameraTrajectory:
     """Read the poses of a sequence.
 
     Raises:
@@ -188,17 +190,17 @@ def read_poses(path: Path, limits: Limits = DEFAULT_LIMITS) -> Poses:
         )
     turn = Rotation.from_matrix(AXES @ matrices[:, :, :3] @ AXES.T)
     declared = max(len(times), len(found))
-    return Poses(t_ns, matrices[:, :, 3] @ AXES.T, turn, losses, declared)
+    return CameraTrajectory(t_ns, matrices[:, :, 3] @ AXES.T, turn, losses, declared)
 
 
-def write_truth(path: Path, folder: Path) -> Path:
+def write_kitti_odometry_truth(path: Path, folder: Path) -> Path:
     """Write the trajectory of the left grey camera.
 
     Raises:
         LogFormatError: The sequence has no poses.
         OutputError: It cannot be written.
     """
-    poses = read_poses(path)
+    poses = read_kitti_poses(path)
     note = "KITTI odometry: the left grey camera; x ahead, y left, z up of the first picture"
     folder.mkdir(parents=True, exist_ok=True)
     wxyz = poses.turn.as_quat()[:, [3, 0, 1, 2]]

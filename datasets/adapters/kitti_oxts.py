@@ -94,7 +94,7 @@ class Packets:
         )
 
 
-def parse(line: str | bytes) -> tuple[float, ...] | str:
+def parse_oxts(line: str | bytes) -> tuple[float, ...] | str:
     """Parse the thirty numbers of a line, or return the reason why it is not a packet."""
     parts: Sequence[str | bytes] = line[:LINE_BYTES].split()
     if len(parts) != len(COLUMNS):

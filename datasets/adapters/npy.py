@@ -13,7 +13,7 @@ from crosscue.replay.errors import LogFormatError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Column:
+class ArrayColumn:
     """The readable rows of one array file.
 
     Attributes:
@@ -32,7 +32,7 @@ class Column:
         return self.declared - len(self.rows)
 
 
-def read_column(path: Path) -> Column:
+def read_column(path: Path) -> ArrayColumn:
     """Map an array file, or the complete rows of a truncated file.
 
     Raises:
@@ -59,10 +59,10 @@ def read_column(path: Path) -> Column:
         # In column-major order, a row is complete only if the last column contains it.
         present = max(0, min(shape[0], cells - (width - 1) * shape[0]))
     if present == 0:
-        return Column(path, np.empty((0, *shape[1:]), dtype), shape[0])
+        return ArrayColumn(path, np.empty((0, *shape[1:]), dtype), shape[0])
     if by_columns and len(shape) > 1:
         flat = np.memmap(path, dtype, "r", offset, ((width - 1) * shape[0] + present,))
         by_column = [flat[i * shape[0] : i * shape[0] + present] for i in range(width)]
-        return Column(path, np.stack(by_column, axis=1).reshape(present, *shape[1:]), shape[0])
+        return ArrayColumn(path, np.stack(by_column, axis=1).reshape(present, *shape[1:]), shape[0])
     mapped = np.memmap(path, dtype, "r", offset, (present, *shape[1:]))
-    return Column(path, mapped, shape[0])
+    return ArrayColumn(path, mapped, shape[0])

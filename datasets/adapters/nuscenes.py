@@ -119,7 +119,7 @@ class SceneTables:
         return self.calibrated.get(str(rows[0]["calibrated_sensor_token"])) if rows else None
 
 
-def read_tables(scene: Scene) -> SceneTables:
+def read_scene_tables(scene: Scene) -> SceneTables:
     """Read the rows of one scene.
 
     Raises:
@@ -177,7 +177,7 @@ def _has(row: Row, *keys: str) -> bool:
     )
 
 
-class Drive(CameraDrive):
+class NuscenesDrive(CameraDrive):
     """One scene as a ``Log``."""
 
     format: Final = "nuscenes"
@@ -235,13 +235,13 @@ def matrix_of(row: Row, scene: Scene) -> tuple[float, float, float]:
     return focal, x, y
 
 
-def open_scene(path: Path, limits: Limits) -> Drive:
+def open_scene(path: Path, limits: Limits) -> NuscenesDrive:
     """Open a scene; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
         LogFormatError: The scene does not exist, or has no camera.
     """
-    tables = read_tables(find_scene(path))
+    tables = read_scene_tables(find_scene(path))
     scene, touched = tables.scene, Touched()
     for file in tables.files:
         touched.add(file, 0, file.stat().st_size)
@@ -269,7 +269,7 @@ def open_scene(path: Path, limits: Limits) -> Drive:
         held.append(_odometry(tables))
     if not cameras and not held:
         raise LogFormatError(f"{path}: {scene.name}: no picture of a camera in sample_data.json")
-    return Drive(tables, path, cameras, held, limits, touched, unreadable)
+    return NuscenesDrive(tables, path, cameras, held, limits, touched, unreadable)
 
 
 def _timed(root: Path, rows: Sequence[Row]) -> TimedFiles:

@@ -21,7 +21,15 @@ from crosscue.datasets.truth.tum import Trajectory, write_tum
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogFormatError
 
-from .nuscenes import FRONT, SceneTables, ego_poses, find_scene, matrix_of, numbers, read_tables
+from .nuscenes import (
+    FRONT,
+    SceneTables,
+    ego_poses,
+    find_scene,
+    matrix_of,
+    numbers,
+    read_scene_tables,
+)
 from .nuscenes_tables import Row, RowsOf, checked, whole_table
 
 POSE_FILE: Final = "pose.tum"
@@ -51,14 +59,14 @@ class _Camera(NamedTuple):
     center_px: tuple[float, float]
 
 
-def write(path: Path, folder: Path) -> Path:
+def write_nuscenes_truth(path: Path, folder: Path) -> Path:
     """Write the truth of a scene.
 
     Raises:
         LogFormatError: There are no poses, or a table is damaged.
         OutputError: It cannot be written.
     """
-    tables = read_tables(find_scene(path))
+    tables = read_scene_tables(find_scene(path))
     poses = ego_poses(tables)
     folder.mkdir(parents=True, exist_ok=True)
     note = "nuScenes: the ego frame, the middle of the rear axle, in its map's axes"

@@ -46,7 +46,7 @@ _GNSS: Final = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Poses:
+class PandasetPoses:
     """Trajectory of a camera.
 
     Attributes:
@@ -84,7 +84,7 @@ class Poses:
         return Table({"speed_x_mps": self.speed_mps(), "yaw_rate_radps": yaw_rate})
 
 
-class Drive(CameraDrive):
+class PandasetDrive(CameraDrive):
     """One sequence as a ``Log``."""
 
     format: Final = "pandaset"
@@ -116,7 +116,7 @@ READ_ON_OPENING: Final = (
 )
 
 
-def open_sequence(path: Path, limits: Limits) -> Drive:
+def open_pandaset(path: Path, limits: Limits) -> PandasetDrive:
     """Open a sequence's folder; see ``crosscue.replay.formats.FORMATS``.
 
     Raises:
@@ -150,10 +150,12 @@ def open_sequence(path: Path, limits: Limits) -> Drive:
         why = unreadable[0][3] if unreadable else "no camera with pictures and timestamps.json"
         raise LogFormatError(f"{path}: no stream of a PandaSet sequence can be read: {why}")
     notices = ("lidar: sweeps are not read",) if (path / "lidar").is_dir() else ()
-    return Drive(path, cameras, rows, limits, touched, unreadable=unreadable, notices=notices)
+    return PandasetDrive(
+        path, cameras, rows, limits, touched, unreadable=unreadable, notices=notices
+    )
 
 
-def read_poses(path: Path, camera: str = FRONT) -> Poses:
+def read_pandaset_poses(path: Path, camera: str = FRONT) -> PandasetPoses:
     """Read the poses of a camera.
 
     Args:
@@ -179,17 +181,17 @@ def read_poses(path: Path, camera: str = FRONT) -> Poses:
     if n < 2 or not np.isfinite(xyz).all() or not (np.diff(t_ns) > 0).all():
         raise LogFormatError(f"{folder / 'poses.json'}: {n} poses in order; expected two or more")
     forward, left = (turn.apply(axis) for axis in ((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)))
-    return Poses(t_ns[:n], xyz[:n], forward[:n], left[:n], max(len(t_ns), len(xyz)))
+    return PandasetPoses(t_ns[:n], xyz[:n], forward[:n], left[:n], max(len(t_ns), len(xyz)))
 
 
-def write_truth(path: Path, folder: Path) -> Path:
+def write_pandaset_truth(path: Path, folder: Path) -> Path:
     """Write the trajectory of the front camera.
 
     Raises:
         LogFormatError: The sequence has no poses.
         OutputError: It cannot be written.
     """
-    poses = read_poses(path)
+    poses = read_pandaset_poses(path)
     up = np.cross(poses.forward, poses.left)
     turn = Rotation.from_matrix(np.stack([poses.forward, poses.left, up], axis=2))
     wxyz = turn.as_quat()[:, [3, 0, 1, 2]]
@@ -215,7 +217,7 @@ def write_truth(path: Path, folder: Path) -> Path:
 def _odometry(path: Path) -> HeldRows | None:
     if not (path / "camera" / FRONT / "poses.json").is_file():
         return None
-    poses = read_poses(path)
+    poses = read_pandaset_poses(path)
     topic = Topic("odometry", "nav_msgs/msg/Odometry", "columns", declared=poses.declared)
     return HeldRows(topic, poses.t_ns, poses.odometry())
 

@@ -118,7 +118,7 @@ FIX: Final = _Stream(
 )
 
 
-class Drive(CameraDrive):
+class PhoneDrive(CameraDrive):
     """One folder as a ``Log``."""
 
     format: Final = "phone-drive"
@@ -137,7 +137,7 @@ class _Lines(NamedTuple):
     losses: tuple[Loss, ...]
 
 
-def open_drive(path: Path, limits: Limits) -> Drive:
+def open_phone_drive(path: Path, limits: Limits) -> PhoneDrive:
     """Read both files of a folder.
 
     Raises:
@@ -157,7 +157,7 @@ def open_drive(path: Path, limits: Limits) -> Drive:
         rows += [_held(name, one, lines) for name, one in streams.items()]
         if kind == "phone":
             rows.append(_fixes(lines))
-    return Drive(path, (), rows, limits, touched)
+    return PhoneDrive(path, (), rows, limits, touched)
 
 
 def _read(file: Path, wanted: set[str]) -> _Lines:

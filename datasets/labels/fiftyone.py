@@ -5,7 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from crosscue.datasets.truth.annotations import Annotations, Picture, Sizes, Thing, size_of
+from crosscue.datasets.truth.annotations import (
+    Annotation,
+    Annotations,
+    Picture,
+    Sizes,
+    labelled_size,
+)
 from crosscue.replay.errors import AnnotationError
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
@@ -58,7 +64,7 @@ def read_fiftyone(path: Path, sizes: Sizes) -> Annotations:
     for name, rows in by_picture.items():
         stem = Path(name).stem if name.lower().endswith((".jpg", ".png", ".jpeg")) else name
         stem = stem.rpartition("/")[2]
-        size = size_of(stem, sizes, file)
+        size = labelled_size(stem, sizes, file)
         things = [_thing(row, classes, size, f"{file}: {name}") for row in rows or ()]
         pictures.append(Picture(stem, size, None, None, tuple(things)))
     used = {thing.label for one in pictures for thing in one.things}
@@ -66,14 +72,14 @@ def read_fiftyone(path: Path, sizes: Sizes) -> Annotations:
     return Annotations(str(file), tuple(names), tuple(pictures))
 
 
-def _thing(row: Any, classes: list[Any], size: tuple[int, int], where: str) -> Thing:
+def _thing(row: Any, classes: list[Any], size: tuple[int, int], where: str) -> Annotation:
     try:
         label, (x, y, w, h) = row["label"], (float(side) for side in row["bounding_box"])
         # FiftyOne writes class numbers if there is a list of classes, else class names.
         name = str(classes[label]) if isinstance(label, int) else str(label)
         score = row.get("confidence")
         box = (x * size[0], y * size[1], (x + w) * size[0], (y + h) * size[1])
-        return Thing(name, box, score=None if score is None else float(score), place=where)
+        return Annotation(name, box, score=None if score is None else float(score), place=where)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError):
         raise AnnotationError(
             f"{where}: expected label and bounding_box (x, y, width, height as fractions)"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-from crosscue.datasets.truth.annotations import Annotations, Picture, Thing
+from crosscue.datasets.truth.annotations import Annotation, Annotations, Picture
 from crosscue.replay.errors import AnnotationError
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
@@ -120,8 +120,8 @@ def _boxes(results: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
             yield row
 
 
-def _thing(row: Mapping[str, Any], size: tuple[int, int], where: str) -> Thing:
+def _thing(row: Mapping[str, Any], size: tuple[int, int], where: str) -> Annotation:
     value = row["value"]
     x, y, w, h = (float(value[name]) / 100.0 for name in ("x", "y", "width", "height"))
     box = (x * size[0], y * size[1], (x + w) * size[0], (y + h) * size[1])
-    return Thing(str(value["rectanglelabels"][0]), box, place=where)
+    return Annotation(str(value["rectanglelabels"][0]), box, place=where)

@@ -50,7 +50,7 @@ LABEL_FORMATS: Final[dict[str, LabelFormat]] = {
 }
 
 
-def read_labels(path: Path, sizes: Sizes, kind: str | None = None) -> Annotations:
+def read_tool_labels(path: Path, sizes: Sizes, kind: str | None = None) -> Annotations:
     """Read the export of a labelling tool.
 
     Args:

@@ -8,7 +8,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from crosscue.datasets.truth.annotations import Annotations, Picture, Sizes, Thing, size_of
+from crosscue.datasets.truth.annotations import (
+    Annotation,
+    Annotations,
+    Picture,
+    Sizes,
+    labelled_size,
+)
 from crosscue.datasets.truth.box_labels import read_box_labels
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
@@ -53,12 +59,12 @@ def read_yolo(path: Path, sizes: Sizes) -> Annotations:
     pictures = []
     for one in (picture for part in parts for picture in part.pictures):
         stem = Path(one.name).stem
-        size = size_of(stem, sizes, path)
+        size = labelled_size(stem, sizes, path)
         things = []
         for box in one.boxes:
             x0, y0, x1, y1 = box.box
             in_px = (x0 * size[0], y0 * size[1], x1 * size[0], y1 * size[1])
-            things.append(Thing(box.label, in_px, place=one.name))
+            things.append(Annotation(box.label, in_px, place=one.name))
         pictures.append(Picture(stem, size, None, None, tuple(things)))
     classes = dict.fromkeys(name for part in parts for name in part.classes)
     return Annotations(str(path), tuple(classes), tuple(pictures))

@@ -26,7 +26,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.datasets.adapters.pandaset import FRONT, Poses, read_poses
+from crosscue.datasets.adapters.pandaset import FRONT, PandasetPoses, read_pandaset_poses
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
 from crosscue.replay.columns import Floats
 from crosscue.replay.files.tree_text import json_tree
@@ -53,10 +53,10 @@ ALONG: Final = ("oncoming_cars", "outgoing_cars")
 ACROSS_DEG: Final = 45.0
 
 
-class Boxes:
+class VehicleBoxes:
     """Vehicles ahead that are inside the front camera's pictures."""
 
-    def __init__(self, sequence: Path, poses: Poses) -> None:
+    def __init__(self, sequence: Path, poses: PandasetPoses) -> None:
         """Read the boxes of a sequence."""
         import pyarrow.parquet as pq
 
@@ -100,15 +100,15 @@ class Boxes:
         return np.asarray(heads & (self.motion == "Moving"))
 
 
-def annotate(sequence: Path, folder: Path = FOLDER) -> Path:
+def annotate_sequence(sequence: Path, folder: Path = FOLDER) -> Path:
     """Write the truth of the sequence.
 
     Raises:
         LogFormatError: The sequence has no poses.
         OutputError: It cannot be written.
     """
-    poses = read_poses(sequence)
-    boxes = Boxes(sequence, poses)
+    poses = read_pandaset_poses(sequence)
+    boxes = VehicleBoxes(sequence, poses)
     start_ns, end_ns = int(poses.t_ns[0]), int(poses.t_ns[-1]) + 1
     gone_m = _travelled_m(poses)
     # Distance of each vehicle from the camera in the first frame, like crosswalk and kerb.
@@ -177,7 +177,12 @@ _SOURCE: Final = (
 
 
 def _spans(
-    cue: str, poses: Poses, boxes: Boxes, rows: NDArray[np.bool_], *, with_visible: bool
+    cue: str,
+    poses: PandasetPoses,
+    boxes: VehicleBoxes,
+    rows: NDArray[np.bool_],
+    *,
+    with_visible: bool,
 ) -> list[CueTruth]:
     """Return runs of frames with equal truth as adjacent spans; visibility is in tenths."""
     present = np.bincount(boxes.frame[rows], minlength=len(poses.t_ns)) > 0
@@ -201,12 +206,12 @@ def _spans(
     ]
 
 
-def _travelled_m(poses: Poses) -> Floats:
+def _travelled_m(poses: PandasetPoses) -> Floats:
     steps = np.linalg.norm(np.diff(poses.xyz_m[:, :2], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def _ranges(poses: Poses, gone_m: Floats, camera_x_m: float) -> str:
+def _ranges(poses: PandasetPoses, gone_m: Floats, camera_x_m: float) -> str:
     """Return the ranges of the rear axle at every picture as CSV text."""
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
@@ -218,7 +223,7 @@ def _ranges(poses: Poses, gone_m: Floats, camera_x_m: float) -> str:
 
 
 def _projected(
-    boxes: dict[str, Any], poses: Poses, intrinsics: tuple[float, float, float]
+    boxes: dict[str, Any], poses: PandasetPoses, intrinsics: tuple[float, float, float]
 ) -> tuple[Floats, Floats]:
     """Return outlines of N boxes in their pictures, shape (N, 4), and depths of their centres."""
     focal, center_x, center_y = intrinsics
@@ -259,4 +264,4 @@ def _intrinsics(sequence: Path) -> tuple[float, float, float]:
 
 
 if __name__ == "__main__":
-    print(annotate(*map(Path, sys.argv[1:3])))
+    print(annotate_sequence(*map(Path, sys.argv[1:3])))

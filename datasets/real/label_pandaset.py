@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from crosscue.datasets.adapters.pandaset import FRONT, Poses, read_poses
+from crosscue.datasets.adapters.pandaset import FRONT, PandasetPoses, read_pandaset_poses
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.tree_text import json_tree, strict_json
@@ -63,7 +63,7 @@ def write_labels(sequence: Path, output: Path) -> Path:
     """
     import pyarrow.parquet as pq
 
-    poses = read_poses(sequence)
+    poses = read_pandaset_poses(sequence)
     found = json_tree((sequence / "camera" / FRONT / "intrinsics.json").read_bytes())
     camera = np.array([found[name] for name in ("fx", "fy", "cx", "cy")], np.float64)
     path = sequence / "annotations" / "cuboids.parquet"
@@ -123,7 +123,7 @@ def write_labels(sequence: Path, output: Path) -> Path:
 
 
 def _projected(
-    rows: dict[str, Any], row: int, poses: Poses, frame: int, camera: Floats
+    rows: dict[str, Any], row: int, poses: PandasetPoses, frame: int, camera: Floats
 ) -> _Seen | None:
     """Return a box in the picture, or None if it is completely outside."""
     size = np.array([rows[f"{name}_m"][row] for name in ("width", "length", "height")])

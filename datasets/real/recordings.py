@@ -97,7 +97,7 @@ def recording(name: str) -> Recording:
         raise VehicleError(explain(error, text, str(path), Recording)) from None
 
 
-def place_of(known: Recording, environment: Mapping[str, str] = os.environ) -> Path:
+def recording_folder(known: Recording, environment: Mapping[str, str] = os.environ) -> Path:
     """Return the cache folder of a recording, which is distinct for each list of files."""
     of_files = hashlib.sha256("".join(file.sha256 for file in known.files).encode()).hexdigest()
     asked = environment.get(VARIABLE)
@@ -105,7 +105,7 @@ def place_of(known: Recording, environment: Mapping[str, str] = os.environ) -> P
     return base / of_files[:16] / known.name
 
 
-def fetch(
+def fetch_recording(
     known: Recording,
     given: Path | None = None,
     on_progress: Progress = lambda name, done, total: None,
@@ -128,7 +128,7 @@ def fetch(
         CrosscueError: A file cannot be fetched, or is not the published one.
         OutputError: The cache cannot be written.
     """
-    place, total, done = place_of(known, environment), known.size_bytes, 0
+    place, total, done = recording_folder(known, environment), known.size_bytes, 0
     source = _folder_in(known, given)
     at_hand = None
     if source is None and environment.get(DATA):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 
 from .mobileye import MOUNTING
 
@@ -20,8 +20,8 @@ STOP_SIGN_M: Final = (0.71690, 2.79455)
 TRAFFIC_LIGHT_M: Final = (1.00036, 4.00404)
 
 
-def vehicle_text(
-    camera: Camera, *, mounting_yaw_rad: float, declination_rad: float, heading_rad: float
+def scene_vehicle_text(
+    camera: SceneCamera, *, mounting_yaw_rad: float, declination_rad: float, heading_rad: float
 ) -> str:
     """Return the file's text for a camera and compass, with the heading at the start."""
     stop, light = STOP_SIGN_M, TRAFFIC_LIGHT_M

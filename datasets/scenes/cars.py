@@ -10,7 +10,15 @@ from typing import Final
 import numpy as np
 from numpy.random import Generator
 
-from crosscue.datasets.scenes.rendering.mesh import Floats, Mesh, Rgb, disc, joined, quad, triangles
+from crosscue.datasets.scenes.rendering.mesh import (
+    Floats,
+    Mesh,
+    Rgb,
+    disc,
+    merge_meshes,
+    quad,
+    triangles,
+)
 
 SKIRT_M: Final = 0.24
 GLASS: Final[Rgb] = (0.09, 0.11, 0.13)
@@ -20,7 +28,7 @@ TILL_SHUT_M: Final = 0.012
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class CarShape:
     """Shape of a kind of car, seen from the right: x from tail (0) to nose, z up.
 
     Attributes:
@@ -53,31 +61,31 @@ class Shape:
 
 
 SHAPES: Final = {
-    "sedan": Shape(
+    "sedan": CarShape(
         ((0.0, 0.72), (0.06, 0.96), (0.9, 1.02), (3.35, 0.96), (4.35, 0.76), (4.62, 0.62),
          (4.7, 0.45)),
         ((0.55, 1.0), (1.45, 1.42), (2.55, 1.45), (3.45, 0.95)),
         (2.15,), 0.90, 0.62, (0.95, 3.75),
     ),
-    "hatchback": Shape(
+    "hatchback": CarShape(
         ((0.0, 0.70), (0.04, 0.98), (0.6, 1.02), (2.95, 0.98), (3.75, 0.80), (3.98, 0.64),
          (4.05, 0.45)),
         ((0.05, 0.98), (0.42, 1.43), (1.9, 1.48), (3.1, 0.96)),
         (1.0, 1.95), 0.87, 0.62, (0.68, 3.22),
     ),
-    "suv": Shape(
+    "suv": CarShape(
         ((0.0, 0.80), (0.04, 1.10), (0.6, 1.14), (3.25, 1.10), (4.3, 0.92), (4.58, 0.78),
          (4.65, 0.55)),
         ((0.05, 1.10), (0.36, 1.66), (2.3, 1.72), (3.35, 1.09)),
         (1.1, 2.2), 0.94, 0.68, (0.88, 3.65), 0.37,
     ),
-    "pickup": Shape(
+    "pickup": CarShape(
         ((0.0, 0.85), (0.02, 1.12), (2.1, 1.14), (4.15, 1.10), (5.2, 0.95), (5.5, 0.84),
          (5.55, 0.6)),
         ((2.0, 1.12), (2.16, 1.74), (3.35, 1.78), (4.2, 1.10)),
         (2.95,), 0.97, 0.70, (1.05, 4.45), 0.39,
     ),
-    "van": Shape(
+    "van": CarShape(
         ((0.0, 0.85), (0.02, 1.05), (0.6, 1.08), (4.1, 1.02), (4.75, 0.84), (4.98, 0.70),
          (5.05, 0.5)),
         ((0.03, 1.04), (0.18, 1.74), (2.9, 1.78), (4.3, 1.0)),
@@ -105,7 +113,7 @@ class Look:
     paint: Rgb
 
     @property
-    def shape(self) -> Shape:
+    def shape(self) -> CarShape:
         """Shape of its kind."""
         return SHAPES[self.kind]
 
@@ -127,7 +135,7 @@ def car(look: Look, *, lamps_on: bool, brakes_on: bool) -> Mesh:
         *_wheels(shape),
         *_ends(shape, lamps_on=lamps_on, brakes_on=brakes_on),
     ]
-    return joined(parts).placed(-shape.length_m / 2, 0.0)
+    return merge_meshes(parts).placed(-shape.length_m / 2, 0.0)
 
 
 def _upper(points: tuple[tuple[float, float], ...]) -> Floats:
@@ -155,10 +163,10 @@ def _slab(
     parts.append(
         quad([(x1, -low, foot_m), (x1, low, foot_m), (x1, high, z1), (x1, -high, z1)], rgb)
     )
-    return joined(parts)
+    return merge_meshes(parts)
 
 
-def _cabin(shape: Shape, paint: Rgb) -> list[Mesh]:
+def _cabin(shape: CarShape, paint: Rgb) -> list[Mesh]:
     edge = _upper(shape.cabin)
     belt = min(edge[0, 1], edge[-1, 1])
     roof = shape.height_m
@@ -191,7 +199,9 @@ def _cabin(shape: Shape, paint: Rgb) -> list[Mesh]:
     return parts
 
 
-def _windows(shape: Shape, edge: Floats, belt: float, half: Callable[[float], float]) -> list[Mesh]:
+def _windows(
+    shape: CarShape, edge: Floats, belt: float, half: Callable[[float], float]
+) -> list[Mesh]:
     inset = 0.09
     sill, head = belt + 0.05, shape.height_m - inset
     xs = np.linspace(edge[0, 0], edge[-1, 0], 40)
@@ -213,7 +223,7 @@ def _windows(shape: Shape, edge: Floats, belt: float, half: Callable[[float], fl
     return parts
 
 
-def _wheels(shape: Shape) -> list[Mesh]:
+def _wheels(shape: CarShape) -> list[Mesh]:
     parts = []
     r = shape.wheel_radius_m
     for x in shape.wheels_m:
@@ -234,7 +244,7 @@ def _wheels(shape: Shape) -> list[Mesh]:
     return parts
 
 
-def _ends(shape: Shape, *, lamps_on: bool, brakes_on: bool) -> list[Mesh]:
+def _ends(shape: CarShape, *, lamps_on: bool, brakes_on: bool) -> list[Mesh]:
     nose, tail = shape.length_m + TILL_SHUT_M, -TILL_SHUT_M
     w = shape.half_width_m
     low = shape.body[-2][1]

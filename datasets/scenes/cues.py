@@ -6,12 +6,12 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
-from crosscue.datasets.scenes.rendering.render import Picture
+from crosscue.datasets.scenes.rendering.render import RenderedFrame
 from crosscue.datasets.truth.truth import CueTruth
 from crosscue.replay.vehicle.cue_table import CUES
 
 from .layout import Layout
-from .world import Thing
+from .world import SceneObject
 
 # Min size of a recognizable object.
 MIN_PIXELS: Final = 12
@@ -29,11 +29,11 @@ class Presence(NamedTuple):
 ABSENT: Final = Presence(0, 0.0)
 
 
-Shows = Callable[[Layout, Thing, float], bool]
-Simulated = Callable[[Layout, Picture], Presence]
+Shows = Callable[[Layout, SceneObject, float], bool]
+Simulated = Callable[[Layout, RenderedFrame], Presence]
 
 
-def present(layout: Layout, picture: Picture) -> dict[str, Presence]:
+def present(layout: Layout, picture: RenderedFrame) -> dict[str, Presence]:
     """Return the presence of every cue in a picture."""
     return {name: SIMULATED[name](layout, picture) for name in CUES if name in SIMULATED}
 
@@ -41,7 +41,7 @@ def present(layout: Layout, picture: Picture) -> dict[str, Presence]:
 def _things(shows: Shows, max_m: float = math.inf) -> Simulated:
     """Return a rule that counts the objects of a cue that are large enough to be labelled."""
 
-    def simulated(layout: Layout, picture: Picture) -> Presence:
+    def simulated(layout: Layout, picture: RenderedFrame) -> Presence:
         found = ABSENT
         for seen in picture.seen:
             if seen.distance_m > max_m or not shows(layout, seen.thing, picture.t_s):
@@ -57,12 +57,12 @@ def _sign(category: str) -> Simulated:
     return _things(lambda _, thing, __: thing.category == category)
 
 
-def _goes_left(thing: Thing) -> bool:
+def _goes_left(thing: SceneObject) -> bool:
     return thing.heading_rad > 0.0
 
 
 def _crossing(*, left: bool) -> Simulated:
-    def shows(_: Layout, thing: Thing, __: float) -> bool:
+    def shows(_: Layout, thing: SceneObject, __: float) -> bool:
         moves = thing.velocity != (0.0, 0.0)
         return _is_car(thing, "cross") and moves and _goes_left(thing) == left
 
@@ -75,7 +75,7 @@ def _parked(*, left: bool) -> Simulated:
     )
 
 
-def _is_past(layout: Layout, thing: Thing, t_s: float) -> bool:
+def _is_past(layout: Layout, thing: SceneObject, t_s: float) -> bool:
     x = thing.at[0] + thing.shift(t_s)[0]
     return _is_car(thing, "oncoming", "outgoing", "parked_past") and x > layout.end_m
 
@@ -86,15 +86,15 @@ def _cars_past(role: str) -> Simulated:
     )
 
 
-def _is_car(thing: Thing, *roles: str) -> bool:
+def _is_car(thing: SceneObject, *roles: str) -> bool:
     return thing.role in roles and thing.category == "car"
 
 
-def _always(is_there: Callable[[Layout, Picture], bool]) -> Simulated:
+def _always(is_there: Callable[[Layout, RenderedFrame], bool]) -> Simulated:
     return lambda layout, picture: Presence(1, 1.0) if is_there(layout, picture) else ABSENT
 
 
-def _runs_on(layout: Layout, picture: Picture) -> bool:
+def _runs_on(layout: Layout, picture: RenderedFrame) -> bool:
     return layout.has_ahead and picture.view.rear_axle[0] > layout.end_m - LANES_REACH_M
 
 

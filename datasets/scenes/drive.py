@@ -13,9 +13,9 @@ from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
-from crosscue.datasets.scenes.export.coco import Objects
-from crosscue.datasets.scenes.rendering.camera import Camera
-from crosscue.datasets.scenes.rendering.render import Picture, PictureSettings, Renderer
+from crosscue.datasets.scenes.export.coco import DriveAnnotations
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
+from crosscue.datasets.scenes.rendering.render import PictureSettings, RenderedFrame, Renderer
 from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.datasets.simulated.drive import (
     FILES_OF_DRIVE,
@@ -40,7 +40,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 from crosscue.results import Result
 
-from .car_file import vehicle_text
+from .car_file import scene_vehicle_text
 from .conditions import Conditions
 from .cues import CueRuns, present
 from .layout import Layout
@@ -109,13 +109,13 @@ class Imager(NamedTuple):
     """
 
     name: str
-    pictures: Callable[[World, SceneSettings], Iterator[tuple[int, Picture]]]
-    encode: Callable[[Picture, PictureSettings], bytes]
+    pictures: Callable[[World, SceneSettings], Iterator[tuple[int, RenderedFrame]]]
+    encode: Callable[[RenderedFrame, PictureSettings], bytes]
     coding: ImageCoding
     is_painted: bool = True
 
 
-def pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
+def pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, RenderedFrame]]:
     """Yield times and pictures of a run, without writing anything."""
     renderer = Renderer(world, settings.camera, settings.picture)
     for number, t_ns in enumerate(picture_times(world, settings).tolist()):
@@ -129,7 +129,7 @@ def picture_times(world: World, settings: SceneSettings) -> Int64s:
     return np.arange(int(motion.t_ns[0]), int(motion.t_ns[-1]), step, dtype=np.int64)
 
 
-def jpeg(picture: Picture, quality: int) -> bytes:
+def jpeg(picture: RenderedFrame, quality: int) -> bytes:
     """Encode a picture as JPEG."""
     import cv2
 
@@ -137,14 +137,14 @@ def jpeg(picture: Picture, quality: int) -> bytes:
     return bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
 
 
-def _photograph(picture: Picture, settings: PictureSettings) -> bytes:
+def _photograph(picture: RenderedFrame, settings: PictureSettings) -> bytes:
     return jpeg(picture, settings.jpeg_quality)
 
 
 PHOTOGRAPHS: Final = Imager("", pictures, _photograph, "jpeg")
 
 
-def sparse_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
+def sparse_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, RenderedFrame]]:
     """Yield photographs every ``SPACING_M`` of the last ``FROM_M``, or ``SPACING_S`` if slower."""
     renderer, motion = Renderer(world, settings.camera, settings.picture), world.approach.motion
     last_m, last_ns = -math.inf, 0
@@ -239,7 +239,7 @@ class _Record:
         self._imager = imager
         self.layout, self.conditions = layout, conditions
         self.world, self.settings = world, settings
-        self.objects = Objects()
+        self.objects = DriveAnnotations()
         approach = 0 if layout.is_intersection else None
         self._cues = CueRuns(1_000_000_000 // settings.rate_hz, approach)
         self._ranges: list[str] = []
@@ -256,7 +256,7 @@ class _Record:
             replace(block, topic=CAR_BUS) if block.topic == "/can" else block
             for block in sensor_blocks(sense(self._motion, self._car), self.conditions.seed)
         ]
-        batch: list[tuple[int, Picture]] = []
+        batch: list[tuple[int, RenderedFrame]] = []
         begin, until = -(2**62), START_NS
         late = np.random.default_rng([self.conditions.seed, 10])
         for t_ns, picture in self._imager.pictures(self.world, self.settings):
@@ -274,7 +274,7 @@ class _Record:
 
     def _second(
         self,
-        batch: list[tuple[int, Picture]],
+        batch: list[tuple[int, RenderedFrame]],
         others: Iterator[Block],
         device: Device,
         late: np.random.Generator,
@@ -287,7 +287,7 @@ class _Record:
         yield _calibration(times, log_ns, self.settings.camera)
         yield device.frames(times, [picture for _, picture in batch], MOBILEYE_BUS)
 
-    def _note(self, t_ns: int, picture: Picture) -> None:
+    def _note(self, t_ns: int, picture: RenderedFrame) -> None:
         to_start = -picture.view.rear_axle[0]
         self.objects.add(t_ns, picture, self.conditions.tags(self.layout), to_start)
         if t_ns < self._enter_ns:
@@ -299,7 +299,7 @@ class _Record:
 
     def vehicle_text(self, *, is_calibrated: bool) -> str:
         """Return the text of the vehicle file."""
-        text = vehicle_text(
+        text = scene_vehicle_text(
             self.settings.camera,
             mounting_yaw_rad=self._car.mounting_yaw_rad,
             declination_rad=self._car.declination_rad,
@@ -378,7 +378,7 @@ def _images(times: Int64s, log_ns: Int64s, coded: list[bytes], coding: ImageCodi
     return Block(IMAGES, np.maximum.accumulate(log_ns), images, header_ns=times)
 
 
-def _calibration(times: Int64s, log_ns: Int64s, camera: Camera) -> Block:
+def _calibration(times: Int64s, log_ns: Int64s, camera: SceneCamera) -> Block:
     _, plan = standard_type("sensor_msgs/msg/CameraInfo")
     n, (cx, cy), f = len(times), camera.centre_px, camera.focal
     layout = template_of(

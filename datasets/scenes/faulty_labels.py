@@ -1,8 +1,8 @@
 """Label images of a simulated drive, with the faults of a simulated detector.
 
 No network is used. Masks come from the renderer, and missed objects, false detections and errors
-are drawn according to ``Faults``, whose values are plausible but were not measured. Faults are
-correlated in time: the error of each object, road and false detection is the sum of a part that is
+are drawn according to ``DetectorFaults``, whose values are plausible but were not measured. Faults
+are correlated in time: the error of each object, road and false detection is the sum of a part that is
 constant during the drive, a part that decays over a second, and a part of the single frame.
 Consecutive frames are therefore wrong together, as they are with networks.
 """
@@ -18,7 +18,12 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from crosscue.datasets.scenes.rendering.render import Picture, PictureSettings, Renderer, Seen
+from crosscue.datasets.scenes.rendering.render import (
+    PictureSettings,
+    RenderedFrame,
+    RenderedObject,
+    Renderer,
+)
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.datasets.simulated.drive import START_NS
 from crosscue.detectors.label_images import LabelledObject, label_image
@@ -62,7 +67,7 @@ class Sight(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Faults:
+class DetectorFaults:
     """Performance of the simulated detector on pictures with a width of 640 pixels.
 
     Attributes:
@@ -119,14 +124,14 @@ class Faults:
     false_roads: float = 1.2
 
 
-DEFAULTS: Final = Faults()
+DEFAULTS: Final = DetectorFaults()
 
 
 @dataclass(slots=True)
 class _Errors:
     """Standard normal errors that are correlated in time, one sequence for each key."""
 
-    faults: Faults
+    faults: DetectorFaults
     seed: int
     known: dict[int, tuple[Generator, float, float, float]] = field(default_factory=dict)
 
@@ -162,7 +167,9 @@ class _FalseObject:
 class FaultyLabels:
     """Simulated detector during one drive."""
 
-    def __init__(self, world: World, settings: SceneSettings, faults: Faults = DEFAULTS) -> None:
+    def __init__(
+        self, world: World, settings: SceneSettings, faults: DetectorFaults = DEFAULTS
+    ) -> None:
         """Draw the constant faults of the drive."""
         self._world, self._faults = world, faults
         picture = PictureSettings(samples=1)
@@ -183,7 +190,7 @@ class FaultyLabels:
             1.0 - 0.2 * conditions.rain
         )
 
-    def picture(self, t_s: float) -> Picture:
+    def picture(self, t_s: float) -> RenderedFrame:
         """Return the label image at a time as a picture."""
         picture, ground = self._renderer.owners(t_s, self._codes)
         found = [
@@ -192,7 +199,7 @@ class FaultyLabels:
         found.sort(key=lambda pair: -pair[0])
         objects = [one for _, one in found] + self._false_finds(picture, t_s)
         image = label_image(self._road(ground, picture, t_s), objects)
-        return Picture(t_s, image, picture.view, picture.owner, picture.seen)
+        return RenderedFrame(t_s, image, picture.view, picture.owner, picture.seen)
 
     def _chance(self, category: Category, height_px: float) -> float:
         sight = self._faults.sights[category]
@@ -201,7 +208,7 @@ class FaultyLabels:
         return sight.best * self._clear / (1.0 + math.exp(-max(min(step, 30.0), -30.0)))
 
     def _found(
-        self, seen: Seen, picture: Picture, t_s: float
+        self, seen: RenderedObject, picture: RenderedFrame, t_s: float
     ) -> tuple[float, LabelledObject] | None:
         thing = seen.thing
         x0, y0, x1, y1 = seen.box_px
@@ -225,7 +232,7 @@ class FaultyLabels:
         sd = math.sqrt(2.0) * self._faults.height_sd_fraction
         return math.exp(sd * self._errors(10_000 + number, t_s))
 
-    def _false_finds(self, picture: Picture, t_s: float) -> list[LabelledObject]:
+    def _false_finds(self, picture: RenderedFrame, t_s: float) -> list[LabelledObject]:
         found = []
         focal = self._renderer.camera.focal
         for number, one in enumerate(self._false):
@@ -243,7 +250,9 @@ class FaultyLabels:
                 found.append(_block(category, x * wide_px, y * high_px, high))
         return found
 
-    def _road(self, ground: NDArray[np.uint8], picture: Picture, t_s: float) -> NDArray[np.bool_]:
+    def _road(
+        self, ground: NDArray[np.uint8], picture: RenderedFrame, t_s: float
+    ) -> NDArray[np.bool_]:
         to_kerb_m = max(NEAR_KERB_M - picture.view.rear_axle[0], 0.0)
         faults, best = self._faults, self._faults.road_best * self._clear
         side = best / (1.0 + math.exp((to_kerb_m - faults.road_half_m) / 8.0))
@@ -266,7 +275,7 @@ def _beside(world: World, category: Category, rng: Generator) -> tuple[float, fl
 
 
 def _ground_codes(
-    world: World, faults: Faults, rng: Generator
+    world: World, faults: DetectorFaults, rng: Generator
 ) -> tuple[NDArray[np.uint8], dict[int, float]]:
     """Return a map of areas that may be detected as road, and rates of false areas by code."""
     from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M, along_curve
@@ -320,8 +329,8 @@ def _block(category: Category, x_px: float, y_px: float, height_px: float) -> La
 
 
 def label_pictures(
-    world: World, settings: SceneSettings, faults: Faults = DEFAULTS
-) -> Iterator[tuple[int, Picture]]:
+    world: World, settings: SceneSettings, faults: DetectorFaults = DEFAULTS
+) -> Iterator[tuple[int, RenderedFrame]]:
     """Yield times and label images from ``FROM_M`` before the intersection up to it.
 
     A stationary vehicle sees almost nothing new, so that there are fewer images then.
@@ -339,7 +348,7 @@ def label_pictures(
         yield t_ns, labels.picture(t_s)
 
 
-def png(picture: Picture, _: PictureSettings) -> bytes:
+def png(picture: RenderedFrame, _: PictureSettings) -> bytes:
     """Encode a picture without loss."""
     import cv2
 
@@ -348,7 +357,7 @@ def png(picture: Picture, _: PictureSettings) -> bytes:
 
 
 # Faultless detector: exact masks of all objects that are visible by at least two thirds.
-NO_FAULTS: Final = Faults(
+NO_FAULTS: Final = DetectorFaults(
     sights=dict.fromkeys(LABELS, Sight(1.0, 1e-3)),
     height_sd_fraction=0.0,
     false_things={},
@@ -364,7 +373,7 @@ NO_FAULTS: Final = Faults(
 )
 
 
-def _perfect_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, Picture]]:
+def _perfect_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, RenderedFrame]]:
     clear = replace(world, conditions=replace(world.conditions, light="noon", rain=0.0))
     return label_pictures(clear, settings, NO_FAULTS)
 

@@ -13,10 +13,10 @@ from typing import Final
 import numpy as np
 from numpy.random import Generator
 
-from crosscue.datasets.scenes.rendering.render import Picture, Seen
+from crosscue.datasets.scenes.rendering.render import RenderedFrame, RenderedObject
 from crosscue.replay.columns import Block, Int64s, Table
 from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
-from crosscue.replay.mobileye.geometry import Mounting
+from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.mobileye.tables import table_block
 
@@ -24,14 +24,14 @@ from .layout import Layout
 from .motion import FRONT_M, lane_y_m
 from .world import World
 
-MOUNTING: Final = Mounting(x_m=FRONT_M)
+MOUNTING: Final = DevicePosition(x_m=FRONT_M)
 SETTINGS: Final = MobileyeSettings(revision="classic", mounting=MOUNTING)
 SOLID, ROAD_EDGE, DOUBLE = 1, 3, 4
 STANDING, MOVING, ONCOMING, PARKED = 1, 3, 4, 5
 
 
 @dataclass(frozen=True, slots=True)
-class Faults:
+class DeviceFaults:
     """Performance of the device.
 
     Attributes:
@@ -58,17 +58,17 @@ class Faults:
 class Device:
     """A Mobileye during one drive, with the state of its tracks."""
 
-    def __init__(self, world: World, rng: Generator, faults: Faults | None = None) -> None:
+    def __init__(self, world: World, rng: Generator, faults: DeviceFaults | None = None) -> None:
         """Begin without tracks."""
         self._world = world
         self._rng = rng
-        self._faults = Faults() if faults is None else faults
+        self._faults = DeviceFaults() if faults is None else faults
         self._reports: dict[int, bool] = {}
         self._scale: dict[int, float] = {}
         self._age: dict[int, int] = {}
         self._sees_past = False
 
-    def frames(self, times_ns: Int64s, pictures: Sequence[Picture], bus: str) -> Block:
+    def frames(self, times_ns: Int64s, pictures: Sequence[RenderedFrame], bus: str) -> Block:
         """Return CAN frames for pictures grabbed at ``times_ns``."""
         rows = [
             row
@@ -83,7 +83,7 @@ class Device:
         tables.append(self._lanes(times_ns, pictures, latency, bus))
         return encode_tables(tables, SETTINGS, bus)
 
-    def _obstacles(self, t_ns: int, picture: Picture) -> list[dict[str, float]]:
+    def _obstacles(self, t_ns: int, picture: RenderedFrame) -> list[dict[str, float]]:
         x, y, heading = picture.view.rear_axle
         c, s = np.cos(heading), np.sin(heading)
         rows = []
@@ -99,7 +99,7 @@ class Device:
             rows.append(self._row(t_ns, seen, picture, ahead, left))
         return rows
 
-    def _is_reported(self, seen: Seen, ahead: float, left: float) -> bool:
+    def _is_reported(self, seen: RenderedObject, ahead: float, left: float) -> bool:
         faults, number = self._faults, seen.thing.number
         front = ahead - FRONT_M
         if front < 1.0 or front > faults.reach_m or seen.visible < faults.min_visible:
@@ -118,7 +118,7 @@ class Device:
         return self._reports[number]
 
     def _row(
-        self, t_ns: int, seen: Seen, picture: Picture, ahead: float, left: float
+        self, t_ns: int, seen: RenderedObject, picture: RenderedFrame, ahead: float, left: float
     ) -> dict[str, float]:
         thing, faults = seen.thing, self._faults
         number = thing.number
@@ -146,7 +146,7 @@ class Device:
         }
 
     def _lanes(
-        self, times_ns: Int64s, pictures: Sequence[Picture], latency: Int64s, bus: str
+        self, times_ns: Int64s, pictures: Sequence[RenderedFrame], latency: Int64s, bus: str
     ) -> Block:
         layout, rng = self._world.layout, self._rng
         lines = lane_lines_m(layout)

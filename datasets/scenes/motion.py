@@ -21,7 +21,7 @@ Turn = Literal["left", "right", "ahead"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Approach:
+class ApproachMotion:
     """One approach in the intersection's frame.
 
     Attributes:
@@ -45,7 +45,7 @@ def lane_y_m(layout: Layout) -> float:
     return -(layout.half_width_m - parking) / 2
 
 
-def approach(layout: Layout, conditions: Conditions, rng: Generator) -> Approach:
+def approach(layout: Layout, conditions: Conditions, rng: Generator) -> ApproachMotion:
     """Simulate an approach from about 88 m, with a stop at sign or light, and the crossing."""
     ways: list[Turn] = []
     if layout.goes_ahead:
@@ -72,7 +72,9 @@ def approach(layout: Layout, conditions: Conditions, rng: Generator) -> Approach
     enter = float(t_s[np.argmax(motion.x_m >= 0.0)])
     waited = t_s[(speed < 0.05) & (along > 1.0)]
     green = float(waited[-1]) - 0.6 if is_light and conditions.is_red and len(waited) else -1.0
-    return Approach(motion, turn, green, enter, (float(t_s[inside][0]), float(t_s[inside][-1])))
+    return ApproachMotion(
+        motion, turn, green, enter, (float(t_s[inside][0]), float(t_s[inside][-1]))
+    )
 
 
 def _curvature(layout: Layout, turn: Turn, start_x: float) -> Floats:

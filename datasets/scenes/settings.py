@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.rendering.render import DEFAULTS, PictureSettings
 from crosscue.replay.errors import UsageError
 
 from .conditions import Conditions, conditions_of
 from .layout import Layout, layout_named
-from .world import World, build
+from .world import World, build_world
 
-CAMERA: Final = Camera()
+CAMERA: Final = SceneCamera()
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class SceneSettings:
     run: int = 1
     seed: int = 0
     rate_hz: int = 10
-    camera: Camera = CAMERA
+    camera: SceneCamera = CAMERA
     picture: PictureSettings = DEFAULTS
 
     def __post_init__(self) -> None:
@@ -54,7 +54,7 @@ class SceneSettings:
         return f"{self.layout}-{self.run:02d}"
 
 
-def camera_of_width(width_px: int) -> Camera:
+def camera_of_width(width_px: int) -> SceneCamera:
     """Return the camera of simulated drives for another width; the aspect ratio is 16 to 9.
 
     Raises:
@@ -62,13 +62,13 @@ def camera_of_width(width_px: int) -> Camera:
     """
     if not 64 <= width_px <= 3840 or width_px % 16:
         raise UsageError(f"width_px: {width_px}, expected a multiple of 16 from 64 to 3840")
-    return Camera(width_px=width_px, height_px=width_px * 9 // 16)
+    return SceneCamera(width_px=width_px, height_px=width_px * 9 // 16)
 
 
 def world_of(
     settings: SceneSettings, *, is_painted: bool = True
 ) -> tuple[Layout, Conditions, World]:
-    """Return layout, conditions and world of a run; see ``build`` for ``is_painted``."""
+    """Return layout, conditions and world of a run; see ``build_world`` for ``is_painted``."""
     layout = layout_named(settings.layout)
     conditions = conditions_of(layout, settings.run, settings.seed)
-    return layout, conditions, build(layout, conditions, is_painted=is_painted)
+    return layout, conditions, build_world(layout, conditions, is_painted=is_painted)

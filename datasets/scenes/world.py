@@ -19,7 +19,7 @@ from crosscue.datasets.scenes.rendering.ground import (
     with_levels,
 )
 from crosscue.datasets.scenes.rendering.lighting import Daylight, daylight
-from crosscue.datasets.scenes.rendering.mesh import Floats, Mesh, joined
+from crosscue.datasets.scenes.rendering.mesh import Floats, Mesh, merge_meshes
 from crosscue.datasets.scenes.rendering.scenery import (
     Shadows,
     building,
@@ -39,7 +39,7 @@ from crosscue.datasets.scenes.rendering.textures import Atlas, make_atlas
 from .cars import Look, any_look, car
 from .conditions import Conditions
 from .layout import NEAR_KERB_M, Layout
-from .motion import Approach, approach, lane_y_m
+from .motion import ApproachMotion, approach, lane_y_m
 
 Category = Literal[
     "car", "stop_sign", "traffic_light", "one_way_left", "one_way_right", "do_not_enter"
@@ -52,7 +52,7 @@ ALWAYS: Final = (-1e9, 1e9)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Thing:
+class SceneObject:
     """One labelled object.
 
     Attributes:
@@ -129,11 +129,11 @@ class World:
 
     layout: Layout
     conditions: Conditions
-    approach: Approach
+    approach: ApproachMotion
     light: Daylight
     ground: Ground
     scenery: Mesh
-    things: tuple[Thing, ...]
+    things: tuple[SceneObject, ...]
     atlas: Atlas
     patches: tuple[Patch, ...] = ()
 
@@ -146,7 +146,7 @@ class _Site:
     atlas: Atlas
     lamps_on: bool
     parts: list[Mesh] = field(default_factory=list)
-    things: list[Thing] = field(default_factory=list)
+    things: list[SceneObject] = field(default_factory=list)
     patches: list[Patch] = field(default_factory=list)
     shadows: Shadows = field(default_factory=Shadows)
     taken: list[tuple[float, float, float, float]] = field(default_factory=list)
@@ -175,7 +175,7 @@ class _Site:
         number = len(self.things)
         owned = None if later is None else later.owned_by(number)
         self.things.append(
-            Thing(
+            SceneObject(
                 number,
                 category,
                 role,
@@ -223,7 +223,7 @@ class _Site:
             self.shadows.solids.append((foot, 1.0))
 
 
-def _along_curve(thing: Thing, layout: Layout) -> Thing:
+def _along_curve(thing: SceneObject, layout: Layout) -> SceneObject:
     """Move an object to its position along a curve; a moving object follows the curve."""
     if layout.curve_per_m == 0.0:
         return thing
@@ -234,7 +234,7 @@ def _along_curve(thing: Thing, layout: Layout) -> Thing:
     return replace(thing, mesh=thing.mesh.aside(layout.aside_m), at=at)
 
 
-def build(layout: Layout, conditions: Conditions, *, is_painted: bool = True) -> World:
+def build_world(layout: Layout, conditions: Conditions, *, is_painted: bool = True) -> World:
     """Build the world of a run, which is determined by layout and conditions.
 
     Args:
@@ -258,7 +258,7 @@ def build(layout: Layout, conditions: Conditions, *, is_painted: bool = True) ->
     parts = (
         [part.aside(layout.aside_m) for part in site.parts] if layout.curve_per_m else site.parts
     )
-    scenery = joined([*parts, *(t.mesh for t in things if t.is_fixed)])
+    scenery = merge_meshes([*parts, *(t.mesh for t in things if t.is_fixed)])
     ground = _painted(site, light) if is_painted else unpainted(layout)
     patches = tuple(site.patches)
     return World(layout, conditions, drive, light, ground, scenery, things, site.atlas, patches)
@@ -468,7 +468,7 @@ def _sign(site: _Site, category: Category, x: float, y: float, z: float, turn: f
     site.add(category, "furniture", face.placed(x, y, turn, z), (x, y, z), turn, (0.02, wide, high))
 
 
-def _control(site: _Site, drive: Approach) -> None:
+def _control(site: _Site, drive: ApproachMotion) -> None:
     layout = site.layout
     w, far, end = layout.half_width_m, layout.far_kerb_m, layout.end_m
     if layout.control == "stop_sign":
@@ -488,7 +488,7 @@ def _control(site: _Site, drive: Approach) -> None:
         _sign(site, "do_not_enter", far + 1.0, side * (w + 3.2), 2.3, side * 0.5)
 
 
-def _lights(site: _Site, drive: Approach) -> None:
+def _lights(site: _Site, drive: ApproachMotion) -> None:
     """Add two lights on an arm over the road and one on the pole, beyond the intersection."""
     layout = site.layout
     w, end = layout.half_width_m, layout.end_m
@@ -543,7 +543,7 @@ def _parked(site: _Site, varied: Generator) -> None:
                     site.add_car(any_look(varied), "other", float(x), side * (w - 1.05), heading)
 
 
-def _traffic(site: _Site, conditions: Conditions, drive: Approach, varied: Generator) -> None:
+def _traffic(site: _Site, conditions: Conditions, drive: ApproachMotion, varied: Generator) -> None:
     layout = site.layout
     w, near, far = layout.half_width_m, NEAR_KERB_M, layout.far_kerb_m
     length_s = len(drive.motion) / 100.0
@@ -586,7 +586,7 @@ def _stream(
     heading: float,
     lane: float,
     rate_hz: float,
-    drive: Approach,
+    drive: ApproachMotion,
     length_s: float,
     varied: Generator,
 ) -> None:
@@ -621,7 +621,7 @@ def _outgoing(site: _Site, conditions: Conditions, varied: Generator) -> None:
         x += float(varied.uniform(9.0, 25.0))
 
 
-def _waiting(site: _Site, drive: Approach, varied: Generator) -> None:
+def _waiting(site: _Site, drive: ApproachMotion, varied: Generator) -> None:
     """Add an oncoming car that waits at the red light and starts when it turns green."""
     look, lane = any_look(varied), -lane_y_m(site.layout)
     go, speed = drive.green_s + 1.2, 4.5

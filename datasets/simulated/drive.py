@@ -91,7 +91,7 @@ class TrueMotion:
         return len(self.t_ns)
 
 
-def drive(settings: DriveSettings) -> TrueMotion:
+def true_motion(settings: DriveSettings) -> TrueMotion:
     """Return the true motion of the car."""
     rng = np.random.default_rng([settings.seed, 1])
     curvature, limit_mps = _road(settings, rng)

@@ -19,8 +19,8 @@ from .drive import (
     DriveSettings,
     TrueMotion,
     dbc_path,
-    drive,
     sense,
+    true_motion,
     vehicle_text,
     with_simulated_noise,
 )
@@ -54,7 +54,7 @@ def write_drive(folder: Path, settings: DriveSettings, *, overwrite: bool = Fals
     Raises:
         OutputError: A file exists already, or cannot be written.
     """
-    motion = drive(settings)
+    motion = true_motion(settings)
     sensed = sense(motion, settings)
     log = folder / "drive.mcap"
     ledger = Ledger(str(log))

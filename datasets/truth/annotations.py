@@ -36,7 +36,7 @@ FAR: Final = 0.4
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class Annotation:
     """One annotated object.
 
     Attributes:
@@ -78,7 +78,7 @@ class Picture:
     size_px: tuple[int, int]
     t_ns: int | None = None
     frame: int | None = None
-    things: tuple[Thing, ...] = ()
+    things: tuple[Annotation, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +116,7 @@ class LogPictures:
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class PictureTimes:
     """Log times of pictures.
 
     Attributes:
@@ -132,7 +132,7 @@ class Placed:
 Sizes = Mapping[str, tuple[int, int]]
 
 
-def size_of(stem: str, sizes: Sizes, path: Path) -> tuple[int, int]:
+def labelled_size(stem: str, sizes: Sizes, path: Path) -> tuple[int, int]:
     """Return the size of a picture whose labels are in fractions of it.
 
     Raises:
@@ -146,7 +146,7 @@ def size_of(stem: str, sizes: Sizes, path: Path) -> tuple[int, int]:
     return size
 
 
-def place(annotations: Annotations, log: LogPictures) -> Placed:
+def match_frames(annotations: Annotations, log: LogPictures) -> PictureTimes:
     """Find the frame of each picture: by its time, its file name, or its number.
 
     Raises:
@@ -183,14 +183,14 @@ def _size(size_px: tuple[int, int]) -> str:
     return f"{size_px[0]} x {size_px[1]}"
 
 
-def _by_name(annotations: Annotations, log: LogPictures) -> Placed | None:
+def _by_name(annotations: Annotations, log: LogPictures) -> PictureTimes | None:
     names = [re.split(r"[/\\]", picture.name)[-1] for picture in annotations.pictures]
     if not all(name in log.names for name in names):
         return None
-    return Placed(tuple(log.names[name] for name in names), "by file name")
+    return PictureTimes(tuple(log.names[name] for name in names), "by file name")
 
 
-def _by_time(annotations: Annotations, log: LogPictures) -> Placed | None:
+def _by_time(annotations: Annotations, log: LogPictures) -> PictureTimes | None:
     """Match each picture to the nearest frame, by ``t_ns`` or a file name that is a time."""
     asked = [_time_of(picture) for picture in annotations.pictures]
     if any(t is None for t in asked):
@@ -208,7 +208,7 @@ def _by_time(annotations: Annotations, log: LogPictures) -> Placed | None:
             f"{annotations.where}: {annotations.pictures[worst].name}: no frame of {log.where} "
             f"near {wanted[worst]} ns; the nearest is {found[worst]} ns; it belongs to another log"
         )
-    return Placed(tuple(found.tolist()), f"by time, at most {off.max() * 1e-6:.1f} ms off")
+    return PictureTimes(tuple(found.tolist()), f"by time, at most {off.max() * 1e-6:.1f} ms off")
 
 
 def _time_of(picture: Picture) -> int | None:
@@ -228,7 +228,7 @@ def time_in_name(stem: str) -> int | None:
     return int(stem) if re.fullmatch(r"[0-9]{16,19}", stem) else None
 
 
-def _by_number(annotations: Annotations, log: LogPictures) -> Placed:
+def _by_number(annotations: Annotations, log: LogPictures) -> PictureTimes:
     times: list[int] = []
     for picture in annotations.pictures:
         number = picture.frame
@@ -246,10 +246,10 @@ def _by_number(annotations: Annotations, log: LogPictures) -> Placed:
                 f"{log.where} (the first is 0); it belongs to another log"
             )
         times.append(int(log.t_ns[number]))
-    return Placed(tuple(times), "by frame number, the first being 0")
+    return PictureTimes(tuple(times), "by frame number, the first being 0")
 
 
-def meanings(
+def cues_by_label(
     annotations: Annotations,
     own: Mapping[str, str],
     own_cues: Sequence[str] = (),
@@ -331,7 +331,7 @@ def _box(box: tuple[float, float, float, float]) -> str:
 
 
 def cue_truths(
-    annotations: Annotations, placed: Placed, cues: Mapping[str, str | None]
+    annotations: Annotations, placed: PictureTimes, cues: Mapping[str, str | None]
 ) -> tuple[CueTruth, ...]:
     """Return the truth of each cue that could be labelled, for each annotated picture."""
     meant = {cue for cue in cues.values() if cue is not None}
@@ -358,7 +358,7 @@ def cue_truths(
 
 
 def coco_tree(
-    annotations: Annotations, placed: Placed, cues: Mapping[str, str | None]
+    annotations: Annotations, placed: PictureTimes, cues: Mapping[str, str | None]
 ) -> dict[str, Any]:
     """Return the labelled objects as a COCO tree, with log times of pictures and names of cues."""
     plain = {
@@ -393,7 +393,7 @@ def coco_tree(
     }
 
 
-def _coco_thing(number: int, image: int, category: int, thing: Thing) -> dict[str, Any]:
+def _coco_thing(number: int, image: int, category: int, thing: Annotation) -> dict[str, Any]:
     assert thing.box_px is not None
     x0, y0, x1, y1 = thing.box_px
     found: dict[str, Any] = {

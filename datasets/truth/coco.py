@@ -13,7 +13,7 @@ from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import MIB
 
-from .annotations import Annotations, Picture, Thing
+from .annotations import Annotation, Annotations, Picture
 
 MAX_BYTES: Final = 512 * MIB
 MAX_SIDE: Final = 100_000
@@ -37,7 +37,7 @@ def read_coco(path: Path) -> Annotations:
         raise AnnotationError(f"{path}: expected an object with images, annotations and categories")
     labels = _labels(tree, path)
     pictures = _pictures(tree, path)
-    things: dict[int, list[Thing]] = {number: [] for number in pictures}
+    things: dict[int, list[Annotation]] = {number: [] for number in pictures}
     for place, row in enumerate(_rows(tree, "annotations", path)):
         where = f"annotations.{place}"
         image, label = _key(row.get("image_id")), labels.get(_key(row.get("category_id")))
@@ -103,7 +103,7 @@ def _pictures(tree: Mapping[str, Any], path: Path) -> dict[int, Picture]:
     return pictures
 
 
-def _thing(row: Mapping[str, Any], label: str, where: str, path: Path) -> Thing:
+def _thing(row: Mapping[str, Any], label: str, where: str, path: Path) -> Annotation:
     box = row.get("bbox")
     if not (isinstance(box, list) and len(box) == 4 and all(_is_number(value) for value in box)):
         raise AnnotationError(
@@ -116,7 +116,7 @@ def _thing(row: Mapping[str, Any], label: str, where: str, path: Path) -> Thing:
     range_m = row.get("range_m")
     if range_m is not None and not (_is_number(range_m) and range_m >= 0.0):
         raise AnnotationError(f"{path}: {where}: range_m {range_m!r}: expected metres; correct it")
-    return Thing(
+    return Annotation(
         label=label,
         box_px=(x, y, x + w, y + h),
         is_crowd=bool(row.get("iscrowd")),

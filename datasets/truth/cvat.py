@@ -21,7 +21,7 @@ from crosscue.replay.errors import AnnotationError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import MIB
 
-from .annotations import Annotations, Picture, Thing
+from .annotations import Annotation, Annotations, Picture
 
 MAX_BYTES: Final = 512 * MIB
 MAX_DEPTH: Final = 64
@@ -68,8 +68,8 @@ class _Reader:
     _meta: dict[str, str] = field(default_factory=dict)
     _labels: list[str] = field(default_factory=list)
     _pictures: list[Picture] = field(default_factory=list)
-    _things: list[Thing] = field(default_factory=list)
-    _by_frame: dict[int, list[Thing]] = field(default_factory=dict)
+    _things: list[Annotation] = field(default_factory=list)
+    _by_frame: dict[int, list[Annotation]] = field(default_factory=dict)
     _track: tuple[int, str] | None = None
     _ignored: dict[str, int] = field(default_factory=dict)
 
@@ -150,21 +150,23 @@ class _Reader:
 
     def _thing(
         self, tag: str, found: Mapping[str, str], label: str, track: int | None, place: str
-    ) -> Thing:
+    ) -> Annotation:
         if tag == "tag":
-            return Thing(label, None, track=track, place=place)
+            return Annotation(label, None, track=track, place=place)
         if tag == "box":
             x0, y0, x1, y1 = (self._number(found, name) for name in ("xtl", "ytl", "xbr", "ybr"))
-            return Thing(label, (x0, y0, x1, y1), track=track, place=place)
+            return Annotation(label, (x0, y0, x1, y1), track=track, place=place)
         if tag == "mask":
             left, top, wide, high = (
                 self._whole(found, name) for name in ("left", "top", "width", "height")
             )
-            return Thing(label, (left, top, left + wide, top + high), track=track, place=place)
+            return Annotation(label, (left, top, left + wide, top + high), track=track, place=place)
         points = self._points(found)
         corners = (*points.min(axis=0).tolist(), *points.max(axis=0).tolist())
         box = (corners[0], corners[1], corners[2], corners[3])
-        return Thing(label, box, track=track, place=place, segmentation=[points.ravel().tolist()])
+        return Annotation(
+            label, box, track=track, place=place, segmentation=[points.ravel().tolist()]
+        )
 
     def _points(self, found: Mapping[str, str]) -> np.typing.NDArray[np.float64]:
         text = self._text(found, "points")

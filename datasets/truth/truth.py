@@ -28,21 +28,21 @@ MAX_BYTES: Final = 256 * MIB
 
 # Functions that write the truth of a data set, by format of ``replay.formats.FORMATS``.
 CARRIED: Final[dict[str, str]] = {
-    "comma2k19": "crosscue.datasets.adapters.comma2k19_truth:write",
-    "kitti-raw": "crosscue.datasets.adapters.kitti:write_truth",
-    "kitti-odometry": "crosscue.datasets.adapters.kitti_odometry:write_truth",
-    "nuscenes": "crosscue.datasets.adapters.nuscenes_truth:write",
-    "pandaset": "crosscue.datasets.adapters.pandaset:write_truth",
+    "comma2k19": "crosscue.datasets.adapters.comma2k19_truth:write_comma_truth",
+    "kitti-raw": "crosscue.datasets.adapters.kitti:write_kitti_truth",
+    "kitti-odometry": "crosscue.datasets.adapters.kitti_odometry:write_kitti_odometry_truth",
+    "nuscenes": "crosscue.datasets.adapters.nuscenes_truth:write_nuscenes_truth",
+    "pandaset": "crosscue.datasets.adapters.pandaset:write_pandaset_truth",
 }
 
 
-class Section(BaseModel):
+class TruthSection(BaseModel):
     """Section of a truth file, which refuses unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
 
-class Origin(Section):
+class Origin(TruthSection):
     """Origin of the map frame; x points east, y north, z up."""
 
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
@@ -50,7 +50,7 @@ class Origin(Section):
     altitude_m: float
 
 
-class Mounting(Section):
+class Mounting(TruthSection):
     """Rigid transform from the rear axle, on the ground, to a body; ISO 8855 axes.
 
     The rotations are applied in the order yaw, pitch, roll. Null means unknown: a score then uses
@@ -73,7 +73,7 @@ class Mounting(Section):
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
 
-class Features(Section):
+class Features(TruthSection):
     """Directions in which an intersection can be left; null means unknown and is not scored."""
 
     left: bool | None
@@ -81,7 +81,7 @@ class Features(Section):
     straight: bool | None
 
 
-class Approach(Section):
+class Approach(TruthSection):
     """One approach to one intersection."""
 
     id: int
@@ -105,7 +105,7 @@ def _examples(schema: dict[str, Any]) -> None:
     schema["examples"] = [*CUES]
 
 
-class CueTruth(Section):
+class CueTruth(TruthSection):
     """Presence of the object of a cue, at one time or over a half-open span."""
 
     cue: Annotated[Name, Field(json_schema_extra=_examples)]
@@ -121,7 +121,7 @@ class CueTruth(Section):
     """Visible fraction of the most visible object."""
 
 
-class Truth(Section):
+class Truth(TruthSection):
     """Ground truth of a drive, the content of a truth file."""
 
     version: Literal[1]
@@ -205,7 +205,7 @@ def save(truth: Truth, folder: Path) -> Path:
     return folder / FILE
 
 
-def load(path: Path) -> Truth:
+def read_truth(path: Path) -> Truth:
     """Read and check a truth file, or the ``truth.json`` of a folder.
 
     Raises:

@@ -60,7 +60,7 @@ _MEANINGS: Final = {
 }
 
 
-def meaning_of(name: str) -> str | None:
+def cue_label(name: str) -> str | None:
     """Return the cue label for a class name of another vocabulary; None if unknown."""
     bare = re.sub(r"[^a-z]", "", name.lower())
     by_spelling = {re.sub(r"[^a-z]", "", label): label for label in CUE_LABELS}

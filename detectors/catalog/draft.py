@@ -13,7 +13,7 @@ import tomlkit
 from crosscue.detectors.decoders.base import DEFAULT_SCORE, Guess, Interface, static
 from crosscue.replay.errors import UsageError
 
-from .class_names import COCO_80, COCO_90, meaning_of
+from .class_names import COCO_80, COCO_90, cue_label
 from .recognise import size_in
 from .segmentation import drivable
 
@@ -43,7 +43,7 @@ class Draft:
     assumed: tuple[str, ...]
 
 
-def draft(
+def draft_card_text(
     path: Path,
     model: Interface,
     guess: Guess,
@@ -73,7 +73,7 @@ def draft(
         output = {**guess.settings, "classes": classes, "road": road}
     else:
         output = {**guess.settings, "score": DEFAULT_SCORE, "classes": classes}
-        labels = {name: label for name in classes if (label := meaning_of(name)) and label != name}
+        labels = {name: label for name in classes if (label := cue_label(name)) and label != name}
     lines = [
         f"# Written by crosscue model init for {path.name}.",
         *(f"# Found in the file: {reason}." for reason in certain),

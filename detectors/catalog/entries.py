@@ -7,7 +7,7 @@ from pathlib import Path
 from crosscue.replay.errors import VehicleError
 
 from .card import ModelCard, WeightFile, read_card
-from .places import cache_folder, card_path
+from .places import card_path, model_folder
 
 
 def entry(name: str) -> ModelCard:
@@ -19,9 +19,9 @@ def entry(name: str) -> ModelCard:
     return read_card(card_path(name))
 
 
-def place_of(card: ModelCard, file: WeightFile) -> Path:
+def weights_path(card: ModelCard, file: WeightFile) -> Path:
     """Path of a weights file in the cache, whether or not it exists."""
-    return cache_folder() / card.sha256[:16] / file.name
+    return model_folder() / card.sha256[:16] / file.name
 
 
 def weights_folder(card: ModelCard, path: Path) -> Path:
@@ -32,11 +32,11 @@ def weights_folder(card: ModelCard, path: Path) -> Path:
     """
     if not card.files or (path.parent / card.weights).exists():
         return path.parent
-    missing = [file for file in card.files if not place_of(card, file).exists()]
+    missing = [file for file in card.files if not weights_path(card, file).exists()]
     if missing:
         size = sum(file.size_bytes for file in card.files) / 1e6
         raise VehicleError(
             f"model {path.stem}: not fetched yet ({size:.1f} MB, licence {card.licence}); "
             f"crosscue model fetch {path.stem}"
         )
-    return place_of(card, card.files[0]).parent
+    return weights_path(card, card.files[0]).parent

@@ -16,7 +16,7 @@ from crosscue.replay.errors import UsageError
 from crosscue.replay.files.transfer import Progress, download, is_there, take
 
 from .card import ModelCard, WeightFile
-from .entries import entry, place_of
+from .entries import entry, weights_path
 
 MIRROR: Final = "CROSSCUE_MODEL_MIRROR"
 DATA: Final = "CROSSCUE_DATA"
@@ -24,19 +24,19 @@ OTHERWISE: Final = f"pass it with --from FILE, or name a mirror in {MIRROR}"
 
 
 @dataclass(frozen=True, slots=True)
-class Fetched:
+class FetchedFile:
     """Location of a model's file, and its source."""
 
     path: Path
     came_from: str
 
 
-def fetch(
+def fetch_weights(
     name: str,
     given: Path | None = None,
     on_progress: Progress = lambda name, done, total: None,
     environment: Mapping[str, str] = os.environ,
-) -> list[Fetched]:
+) -> list[FetchedFile]:
     """Fetch all files of a catalog's model into the cache.
 
     Args:
@@ -63,22 +63,22 @@ def _fetched(
     given: Path | None,
     on_progress: Progress,
     environment: Mapping[str, str],
-) -> Fetched:
-    place, owner = place_of(card, file), f"model {name}"
+) -> FetchedFile:
+    place, owner = weights_path(card, file), f"model {name}"
     if is_there(file, place):
-        return Fetched(place, "the cache")
+        return FetchedFile(place, "the cache")
     if given is not None:
         source = given / file.name if given.is_dir() else given
         take(source, file, place, owner)
-        return Fetched(place, str(source))
+        return FetchedFile(place, str(source))
     for source in _local_copies(file, environment):
         if is_there(file, source):
             take(source, file, place, owner)
-            return Fetched(place, str(source))
+            return FetchedFile(place, str(source))
     mirror = environment.get(MIRROR)
     url = f"{mirror.rstrip('/')}/{file.name}" if mirror else file.url
     download(url, file, place, owner, OTHERWISE, on_progress)
-    return Fetched(place, url)
+    return FetchedFile(place, url)
 
 
 def _local_copies(file: WeightFile, environment: Mapping[str, str]) -> Iterator[Path]:

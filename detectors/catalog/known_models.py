@@ -9,8 +9,8 @@ from typing import Annotated
 
 from crosscue.detectors.catalog.card import Evidence, ModelCard, read_card
 from crosscue.detectors.catalog.class_names import CUE_LABELS
-from crosscue.detectors.catalog.entries import entry, place_of
-from crosscue.detectors.catalog.fetch import Fetched, fetch
+from crosscue.detectors.catalog.entries import entry, weights_path
+from crosscue.detectors.catalog.fetch import FetchedFile, fetch_weights
 from crosscue.detectors.catalog.places import card_named, names
 from crosscue.replay.errors import UsageError
 from crosscue.replay.progress import Progress, emit
@@ -38,7 +38,7 @@ class Model(Result):
     @property
     def is_fetched(self) -> bool:
         """True if all published weights are on this machine."""
-        return all(place_of(self.card, file).exists() for file in self.card.files)
+        return all(weights_path(self.card, file).exists() for file in self.card.files)
 
     @property
     def cue_labels(self) -> list[str]:
@@ -123,7 +123,7 @@ class FetchedModel(Result):
     """
 
     name: str
-    files: tuple[Fetched, ...]
+    files: tuple[FetchedFile, ...]
 
     def as_dict(self) -> dict[str, object]:
         """Return the paths of the files, by the model's name."""
@@ -198,7 +198,7 @@ def fetch_model(name: str, weights: Path | str | None = None) -> FetchedModel:
         emit(Progress(file, done / 1e6, of / 1e6, "MB"))
 
     given = None if weights is None else Path(weights)
-    return FetchedModel(name, tuple(fetch(name, given, show)))
+    return FetchedModel(name, tuple(fetch_weights(name, given, show)))
 
 
 def fetch_models(

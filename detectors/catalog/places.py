@@ -20,7 +20,7 @@ FOLDER: Final = Path(__file__).parent / "models"
 VARIABLE: Final = "CROSSCUE_MODELS"
 
 
-def cache_folder(environment: Mapping[str, str] = os.environ) -> Path:
+def model_folder(environment: Mapping[str, str] = os.environ) -> Path:
     """Folder of fetched weights.
 
     Raises:

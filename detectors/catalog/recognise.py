@@ -18,7 +18,7 @@ from crosscue.detectors.decoders.base import (
     Interface,
     Tensor,
     cell_count,
-    kind_of,
+    decoder_name,
     static,
 )
 from crosscue.detectors.decoders.plausible import oddity
@@ -264,7 +264,7 @@ def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
     )
     noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
     classes = tuple(str(i) for i in range(guess.class_count or _MANY_CLASSES))
-    decoder = next(one for one in DECODERS if kind_of(one) == guess.settings["kind"])
+    decoder = next(one for one in DECODERS if decoder_name(one) == guess.settings["kind"])
     output = decoder.model_validate({**guess.settings, "classes": classes, "score": 0.0})
     try:
         found = output.candidates(network(prepared(noise, given)[0]), (width, height))

@@ -9,9 +9,9 @@ from crosscue.detectors.decoders.base import Guess, Interface
 from crosscue.detectors.networks.torchvision_weights import (
     StateDict,
     class_count,
-    difference,
     read_state_dict,
     shapes_of,
+    tensor_difference,
 )
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.bounded import read_at_most
@@ -53,7 +53,8 @@ def recognise_weights(
     counts = {name: class_count(state.tensors, name) for name in _NAMES}
     possible = {name: count for name, count in counts.items() if count is not None}
     differing = {
-        name: difference(shapes_of(name, count), state.tensors) for name, count in possible.items()
+        name: tensor_difference(shapes_of(name, count), state.tensors)
+        for name, count in possible.items()
     }
     fitting = [name for name, (count, _) in differing.items() if not count]
     chosen = [name for name in fitting if kind in (None, name)]

@@ -69,7 +69,7 @@ class Candidates:
             self.max_score = best if self.max_score is None else max(self.max_score, best)
 
 
-def scores_of(boxes: Sequence[Detections], labels: Sequence[str]) -> list[float]:
+def label_scores(boxes: Sequence[Detections], labels: Sequence[str]) -> list[float]:
     """Scores of all detections with one of the labels."""
     return [
         score

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from crosscue.detectors.base import Detections
 from crosscue.replay.vehicle.vehicle import Cars, CueSpec, Vehicle
 
-from .observed import NONE, Judged, Sides, nose_of, of_side
+from .observed import NONE, CarCounts, Sides, nose_of, of_side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +59,7 @@ class Pairs:
     center_px: NDArray[np.float64]
     nose: NDArray[np.int64]
     width_px: int
-    judged: Judged | None = None
+    judged: CarCounts | None = None
 
 
 class Tracker(Protocol):

@@ -10,15 +10,15 @@ from typing import Final
 import numpy as np
 
 from crosscue.detectors.base import Detections, RoadMask
-from crosscue.detectors.cues.tracked.judge import cars_past, judge
+from crosscue.detectors.cues.tracked.judge import cars_past, count_cars
 from crosscue.detectors.cues.tracked.motion import CarMotion
 from crosscue.detectors.cues.tracked.tracks import CarTracks
-from crosscue.detectors.ranging.object_tracks import Motion
+from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
 from .labelled import count_labels
-from .observed import FrameCues, Place, Seen
+from .observed import FrameCues, FrameDetections, Place
 from .road import road_fractions
 from .road_ground import ground_fractions
 from .rules import counts_of
@@ -44,7 +44,7 @@ class CuePass:
     _tracks: CarTracks | None = None
 
     def __call__(
-        self, frame: Seen, ego: Motion | None = None, place: Place | None = None
+        self, frame: FrameDetections, ego: CarStep | None = None, place: Place | None = None
     ) -> FrameCues:
         """Compute the cues of the next frame.
 
@@ -100,7 +100,9 @@ class CuePass:
             {f"crossing and parked cars: {why}": n for why, n in self.not_followed.items()}
         )
 
-    def _explain(self, tally: CueTally, frame: Seen, pairs: Pairs | None, found: FrameCues) -> None:
+    def _explain(
+        self, tally: CueTally, frame: FrameDetections, pairs: Pairs | None, found: FrameCues
+    ) -> None:
         tally.labelled("objects", frame.objects, found.counts)
         tally.labelled("signs", frame.boxes, found.counts)
         tally.own(frame.boxes, found.counts)
@@ -116,7 +118,7 @@ class CuePass:
             tally.road(found.road)
 
     def _cars(
-        self, boxes: Sequence[Detections], ego: Motion | None, place: Place | None
+        self, boxes: Sequence[Detections], ego: CarStep | None, place: Place | None
     ) -> Pairs | None:
         """Cars found in earlier frames and this one; None if they could not be tracked."""
         cars, camera = self.vehicle.cars, self.vehicle.camera
@@ -130,7 +132,7 @@ class CuePass:
         self._tracks = self._tracks or CarTracks(camera, cars)
         found = self._tracks(boxes, ego)
         standing = self._tracks.standing()
-        judged = judge(found, standing, self._tracks.seen, camera, cars, place)
+        judged = count_cars(found, standing, self._tracks.seen, camera, cars, place)
         judged = judged._replace(past=cars_past(self._tracks.longer(), camera, cars, place))
         return Pairs(
             np.array([car.step_px for car in found]).reshape(-1, 2),
@@ -151,7 +153,7 @@ NO_ODOMETRY: Final = "no odometry, so the camera's own motion is unknown"
 NO_FOCAL_LENGTH: Final = "camera.focal_px is not set"
 
 
-def _why_not_followed(ego: Motion | None, vehicle: Vehicle) -> str | None:
+def _why_not_followed(ego: CarStep | None, vehicle: Vehicle) -> str | None:
     """Reason why cars cannot be tracked into this frame; None if they can."""
     if vehicle.camera.focal_px is None:
         return NO_FOCAL_LENGTH

@@ -71,7 +71,7 @@ class Ways(NamedTuple):
     outgoing: int
 
 
-class Judged(NamedTuple):
+class CarCounts(NamedTuple):
     """Counts of cars by behaviour, from tracks over several frames.
 
     Attributes:
@@ -115,7 +115,7 @@ def of_side(sides: Sides, cue: CueSpec) -> int:
     return sides.left if cue.supports == ("left",) else sides.right
 
 
-class Role(StrEnum):
+class DetectorRole(StrEnum):
     """Kind of objects that a detector finds; without a detector of a role, its cues are unknown."""
 
     OBJECTS = "objects"
@@ -124,7 +124,7 @@ class Role(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class FrameDetections:
     """Detectors' results for one frame, by role.
 
     Attributes:
@@ -160,11 +160,11 @@ def all_labels(labels: Iterable[Sequence[str] | None]) -> frozenset[str] | None:
     return frozenset(known)
 
 
-def role_of(found: Found, is_for_signs: bool) -> Role:
+def detector_role(found: Found, is_for_signs: bool) -> DetectorRole:
     """Role of a detector's result."""
     if isinstance(found, RoadMask):
-        return Role.ROAD
-    return Role.SIGNS if is_for_signs else Role.OBJECTS
+        return DetectorRole.ROAD
+    return DetectorRole.SIGNS if is_for_signs else DetectorRole.OBJECTS
 
 
 def seen(
@@ -172,7 +172,7 @@ def seen(
     found: Sequence[Found],
     is_for_signs: Sequence[bool],
     labels: frozenset[str] | None = None,
-) -> Seen:
+) -> FrameDetections:
     """Sort one frame's results by role.
 
     Args:
@@ -188,7 +188,7 @@ def seen(
             boxes[for_signs].append(one)
         elif road is None:
             road = one
-    return Seen(t_ns, tuple(boxes[False]), tuple(boxes[True]), road, labels)
+    return FrameDetections(t_ns, tuple(boxes[False]), tuple(boxes[True]), road, labels)
 
 
 @dataclass(frozen=True, slots=True)

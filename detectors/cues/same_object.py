@@ -24,7 +24,7 @@ MIN_IOU: Final = 0.5
 KEPT: Final = -1
 
 
-def meanings(vehicle: Vehicle) -> dict[str, str]:
+def label_meanings(vehicle: Vehicle) -> dict[str, str]:
     """Map each label to a common meaning: all labels that one cue counts share one."""
     found: dict[str, str] = {}
     for labels in vehicle.cue_labels().values():

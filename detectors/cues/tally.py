@@ -24,11 +24,11 @@ from .candidates import (
     TOO_LITTLE_ROAD,
     Candidates,
     Unit,
-    scores_of,
+    label_scores,
     thresholds_met,
     unsure_of,
 )
-from .observed import Judged, RoadFractions, of_side
+from .observed import CarCounts, RoadFractions, of_side
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class CueTally:
             if labels and cue.name in counts:
                 setting, threshold = self.vehicle.threshold_of(cue)
                 low = 0 if setting is None else unsure_of(boxes, labels, threshold)
-                self._count(cue.name, scores_of(boxes, labels), low, counts, setting)
+                self._count(cue.name, label_scores(boxes, labels), low, counts, setting)
                 if setting is not None:
                     self.by_cue[cue.name].meet(thresholds_met(boxes, labels, threshold))
 
@@ -67,7 +67,7 @@ class CueTally:
         for name, cue in self.vehicle.cues.own.items():
             if name not in counts:
                 continue
-            scores, setting = scores_of(boxes, cue.labels), f"[cues.own.{name}] score"
+            scores, setting = label_scores(boxes, cue.labels), f"[cues.own.{name}] score"
             low = unsure_of(boxes, cue.labels, cue.score)
             self._count(name, scores, low, counts, setting)
             self.by_cue[name].meet([cue.score])
@@ -97,7 +97,7 @@ class CueTally:
                 )
 
     def followed(
-        self, boxes: Sequence[Detections], judged: Judged, counts: Mapping[str, int]
+        self, boxes: Sequence[Detections], judged: CarCounts, counts: Mapping[str, int]
     ) -> None:
         """Account for cues that track cars over several frames.
 
@@ -134,7 +134,7 @@ class CueTally:
             counts: Counts of all cues.
         """
         for name, labels in self.vehicle.cue_labels().items():
-            scores = scores_of(boxes, labels) if name in counts else []
+            scores = label_scores(boxes, labels) if name in counts else []
             if scores and name in self.by_cue:
                 self.by_cue[name].take(scores, {SAME_OBJECT: len(scores)})
 
@@ -170,7 +170,7 @@ class CueTally:
     def _cars(self, boxes: Sequence[Detections]) -> tuple[list[float], int]:
         """Scores of all cars, and the number of scores that are too low."""
         cars = self.vehicle.cars
-        return scores_of(boxes, cars.labels), unsure_of(boxes, cars.labels, cars.score)
+        return label_scores(boxes, cars.labels), unsure_of(boxes, cars.labels, cars.score)
 
     def _of_cars(self, cue: CueSpec, boxes: Sequence[Detections]) -> Candidates:
         cars = self.vehicle.cars
@@ -184,7 +184,7 @@ class CueTally:
         return self.by_cue.setdefault(name, Candidates(unit, setting, threshold))
 
 
-def _judged(judged: Judged, cue: CueSpec) -> tuple[int, int]:
+def _judged(judged: CarCounts, cue: CueSpec) -> tuple[int, int]:
     """Number of cars that count for the cue, and of those that are not at the intersection."""
     if cue.group == "cross_traffic":
         return of_side(judged.crossing, cue), of_side(judged.crossing_elsewhere, cue)

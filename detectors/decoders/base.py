@@ -38,7 +38,7 @@ class Masks(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidates:
+class BoxCandidates:
     """Candidates of a network for one picture, before thresholds, as columns of length N.
 
     Attributes:
@@ -124,7 +124,7 @@ class BoxOutput(Settings):
     """Intersection over union above which only the better of two boxes of one class is kept."""
 
     @abstractmethod
-    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         """Decode the outputs for one picture of ``size_px``, the network's input.
 
         Candidates below ``score`` may be left out.
@@ -139,7 +139,7 @@ class BoxOutput(Settings):
         """Return the settings with which a model file has this layout; None if it cannot."""
 
 
-def kind_of(decoder: type[BoxOutput]) -> str:
+def decoder_name(decoder: type[BoxOutput]) -> str:
     """Name of a layout in model cards."""
     (kind,) = get_args(decoder.model_fields["kind"].annotation)
     return str(kind)
@@ -158,7 +158,7 @@ def named(outputs: Outputs, name: str | None, key: str = "name") -> Array:
     return outputs[name]
 
 
-def rows_of(output: Array, columns: int, what: str) -> Floats:
+def output_rows(output: Array, columns: int, what: str) -> Floats:
     """Convert an output (1, N, columns) to a table (N, columns), float64.
 
     Raises:
@@ -217,7 +217,7 @@ def grid_cells(model: Interface) -> int | None:
 
 
 @lru_cache(maxsize=8)
-def cells(
+def cell_grid(
     size_px: Size, strides: tuple[int, ...], *, round_up: bool = False
 ) -> tuple[Floats, Floats]:
     """Column and row of each cell, shape (N, 2), and its stride in pixels, shape (N, 1)."""

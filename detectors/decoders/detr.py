@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
+    BoxCandidates,
     BoxOutput,
-    Candidates,
     Guess,
     Interface,
     Outputs,
@@ -21,7 +21,7 @@ from .base import (
     from_centers,
     grid_cells,
     named,
-    rows_of,
+    output_rows,
     sigmoid,
     static,
 )
@@ -55,21 +55,21 @@ class DetrOutput(BoxOutput):
     """Column of the first listed class; 1 if column 0 is unused, as in COCO's numbering."""
 
     @override
-    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         if self.is_selected:
-            rows = rows_of(named(outputs, self.boxes, "boxes"), 6, "box, score, class")
+            rows = output_rows(named(outputs, self.boxes, "boxes"), 6, "box, score, class")
             numbers = class_numbers(rows[:, 5] - self.first_class, len(self.classes))
-            return Candidates(_in_pixels(rows[:, :4], size_px), rows[:, 4], numbers)
+            return BoxCandidates(_in_pixels(rows[:, :4], size_px), rows[:, 4], numbers)
         count = self.first_class + len(self.classes) + (self.activation == "softmax")
         if self.boxes == self.logits:
-            both = rows_of(named(outputs, self.boxes, "boxes"), 4 + count, "boxes and classes")
+            both = output_rows(named(outputs, self.boxes, "boxes"), 4 + count, "boxes and classes")
             boxes, logits = both[:, :4], both[:, 4:]
         else:
-            boxes = rows_of(named(outputs, self.boxes, "boxes"), 4, "boxes")
-            logits = rows_of(named(outputs, self.logits, "logits"), count, "classes")
+            boxes = output_rows(named(outputs, self.boxes, "boxes"), 4, "boxes")
+            logits = output_rows(named(outputs, self.logits, "logits"), count, "classes")
         scores = self._scores(logits)[:, self.first_class : self.first_class + len(self.classes)]
         best, classes = best_class(scores)
-        return Candidates(_in_pixels(boxes, size_px), best, classes)
+        return BoxCandidates(_in_pixels(boxes, size_px), best, classes)
 
     def _scores(self, logits: NDArray[np.float64]) -> NDArray[np.float64]:
         if self.activation == "none":

@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
+    BoxCandidates,
     BoxOutput,
-    Candidates,
     Guess,
     Interface,
     Outputs,
     Size,
     class_numbers,
     named,
-    rows_of,
+    output_rows,
     static,
 )
 from .detr import ULTRALYTICS_HEAD
@@ -34,16 +34,18 @@ class EndToEndOutput(BoxOutput):
     """Name of the output with prototype masks, if there are masks."""
 
     @override
-    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         if self.prototypes is None:
-            table = rows_of(named(outputs, self.name), 6, "x0, y0, x1, y1, score, class")
+            table = output_rows(named(outputs, self.name), 6, "x0, y0, x1, y1, score, class")
             return self._of(table, None)
         prototypes = prototypes_of(named(outputs, self.prototypes, "prototypes"))
-        table = rows_of(named(outputs, self.name), 6 + len(prototypes), "boxes and mask weights")
+        table = output_rows(
+            named(outputs, self.name), 6 + len(prototypes), "boxes and mask weights"
+        )
         return self._of(table, PrototypeMasks(table[:, 6:], prototypes))
 
-    def _of(self, table: NDArray[np.float64], masks: PrototypeMasks | None) -> Candidates:
-        return Candidates(
+    def _of(self, table: NDArray[np.float64], masks: PrototypeMasks | None) -> BoxCandidates:
+        return BoxCandidates(
             table[:, :4], table[:, 4], class_numbers(table[:, 5], len(self.classes)), masks
         )
 

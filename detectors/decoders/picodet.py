@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
+    BoxCandidates,
     BoxOutput,
-    Candidates,
     Guess,
     Interface,
     Outputs,
@@ -18,9 +18,9 @@ from .base import (
     Tensor,
     best_class,
     cell_count,
-    cells,
+    cell_grid,
     named,
-    rows_of,
+    output_rows,
     static,
 )
 
@@ -40,20 +40,20 @@ class PicodetOutput(BoxOutput):
     """Number of values of a distribution: distances of 0 to bins - 1 strides."""
 
     @override
-    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         if not len(self.strides) == len(self.scores) == len(self.distances):
             raise ValueError("strides, scores and distances: expected equally many")
         classes = len(self.classes)
         scores = np.vstack(
-            [rows_of(named(outputs, name, "scores"), classes, name) for name in self.scores]
+            [output_rows(named(outputs, name, "scores"), classes, name) for name in self.scores]
         )
         logits = np.vstack(
             [
-                rows_of(named(outputs, name, "distances"), 4 * self.bins, name)
+                output_rows(named(outputs, name, "distances"), 4 * self.bins, name)
                 for name in self.distances
             ]
         )
-        corner, stride = cells(size_px, self.strides, round_up=True)
+        corner, stride = cell_grid(size_px, self.strides, round_up=True)
         if not len(corner) == len(scores) == len(logits):
             raise ValueError(
                 f"expected {len(corner)} cells at {size_px[0]} x {size_px[1]}, got {len(scores)} "
@@ -62,7 +62,9 @@ class PicodetOutput(BoxOutput):
         center = (corner + 0.5) * stride
         sides = _expected(logits.reshape(-1, 4, self.bins)) * stride
         best, numbers = best_class(scores)
-        return Candidates(np.hstack([center - sides[:, :2], center + sides[:, 2:]]), best, numbers)
+        return BoxCandidates(
+            np.hstack([center - sides[:, :2], center + sides[:, 2:]]), best, numbers
+        )
 
     @override
     @classmethod

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from .base import Candidates, Floats, Size
+from .base import BoxCandidates, Floats, Size
 
 # Minimum fraction of boxes with a sensible size if the layout is correct.
 SENSIBLE_FRACTION: Final = 0.99
@@ -22,7 +22,7 @@ _WHOLE: Final = 0.9
 _CORNER_PX: Final = 2.0
 
 
-def oddity(found: Candidates, size_px: Size, score: float) -> str | None:
+def oddity(found: BoxCandidates, size_px: Size, score: float) -> str | None:
     """Return what is wrong with the boxes of one picture, or None if they may be right.
 
     Args:

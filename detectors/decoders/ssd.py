@@ -8,8 +8,8 @@ import numpy as np
 from typing_extensions import override
 
 from .base import (
+    BoxCandidates,
     BoxOutput,
-    Candidates,
     Guess,
     Interface,
     Outputs,
@@ -33,7 +33,7 @@ class TensorflowSsdOutput(BoxOutput):
     """Number of the first listed class; TFLite exports start at 0."""
 
     @override
-    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         boxes = np.asarray(named(outputs, self.boxes, "boxes"), np.float64)
         scores = np.asarray(named(outputs, self.scores, "scores"), np.float64)
         labels = np.asarray(named(outputs, self.labels, "labels"), np.float64)
@@ -47,7 +47,7 @@ class TensorflowSsdOutput(BoxOutput):
         # Rows after the detections are zeros, whose class may not exist.
         kept = scores[0] > 0.0
         numbers = class_numbers(labels[0][kept] - self.first_class, len(self.classes))
-        return Candidates(corners[kept], scores[0][kept], numbers)
+        return BoxCandidates(corners[kept], scores[0][kept], numbers)
 
     @override
     @classmethod
@@ -83,7 +83,7 @@ class DetectionOutput(BoxOutput):
     """Number of the first listed class; 0 is the background."""
 
     @override
-    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         output = named(outputs, self.name)
         if output.ndim != 4 or output.shape[:2] != (1, 1) or output.shape[3] != 7:
             raise ValueError(f"expected (1, 1, N, 7), got {output.shape}")
@@ -92,7 +92,7 @@ class DetectionOutput(BoxOutput):
         end = np.flatnonzero(table[:, 0] < 0)
         table = table[: end[0]] if len(end) else table
         numbers = class_numbers(table[:, 1] - self.first_class, len(self.classes))
-        return Candidates(table[:, 3:7] * np.tile(size_px, 2), table[:, 2], numbers)
+        return BoxCandidates(table[:, 3:7] * np.tile(size_px, 2), table[:, 2], numbers)
 
     @override
     @classmethod

@@ -12,8 +12,8 @@ from typing_extensions import override
 from .base import (
     PICTURE_SIZE_INPUT,
     Array,
+    BoxCandidates,
     BoxOutput,
-    Candidates,
     Guess,
     Interface,
     Outputs,
@@ -41,7 +41,7 @@ class TorchvisionOutput(BoxOutput):
     """Number of the first listed class; torchvision's 0 is the background."""
 
     @override
-    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         boxes = np.asarray(named(outputs, self.boxes, "boxes"), np.float64)
         scores = np.asarray(named(outputs, self.scores, "scores"), np.float64)
         labels = named(outputs, self.labels, "labels")
@@ -57,11 +57,11 @@ class TorchvisionOutput(BoxOutput):
             np.asarray(labels, np.float64) - self.first_class, len(self.classes)
         )
         if self.masks is None:
-            return Candidates(boxes, scores, numbers)
+            return BoxCandidates(boxes, scores, numbers)
         masks = named(outputs, self.masks, "masks")
         if masks.ndim != 4 or masks.shape[:2] != (n, 1):
             raise ValueError(f"masks: expected ({n}, 1, H, W), got {masks.shape}")
-        return Candidates(boxes, scores, numbers, _WholeMasks(masks))
+        return BoxCandidates(boxes, scores, numbers, _WholeMasks(masks))
 
     @override
     @classmethod

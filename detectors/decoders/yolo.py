@@ -11,8 +11,8 @@ from typing_extensions import override
 
 from .base import (
     Array,
+    BoxCandidates,
     BoxOutput,
-    Candidates,
     Guess,
     Interface,
     Outputs,
@@ -21,7 +21,7 @@ from .base import (
     from_centers,
     grid_cells,
     named,
-    rows_of,
+    output_rows,
     sigmoid,
     static,
 )
@@ -39,11 +39,11 @@ class YoloV5Output(BoxOutput):
     """Name of the output; by default the only output."""
 
     @override
-    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         classes = len(self.classes)
-        table = rows_of(named(outputs, self.name), 5 + classes, f"{classes} classes")
+        table = output_rows(named(outputs, self.name), 5 + classes, f"{classes} classes")
         best, numbers = best_class(table[:, 5:])
-        return Candidates(from_centers(table), table[:, 4] * best, numbers)
+        return BoxCandidates(from_centers(table), table[:, 4] * best, numbers)
 
     @override
     @classmethod
@@ -93,10 +93,10 @@ class YoloV8Output(BoxOutput):
     """Name of the output; by default the only output."""
 
     @override
-    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         table = _columns(named(outputs, self.name), 4 + len(self.classes))
         scores, classes = best_class(table[:, 4:])
-        return Candidates(from_centers(table), scores, classes)
+        return BoxCandidates(from_centers(table), scores, classes)
 
     @override
     @classmethod
@@ -129,13 +129,13 @@ class YoloV8SegOutput(BoxOutput):
     """Name of the output with the prototype masks."""
 
     @override
-    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         prototypes = prototypes_of(named(outputs, self.prototypes, "prototypes"))
         classes = len(self.classes)
         table = _columns(named(outputs, self.name), 4 + classes + len(prototypes))
         scores, numbers = best_class(table[:, 4 : 4 + classes])
         masks = PrototypeMasks(table[:, 4 + classes :], prototypes)
-        return Candidates(from_centers(table), scores, numbers, masks)
+        return BoxCandidates(from_centers(table), scores, numbers, masks)
 
     @override
     @classmethod

@@ -7,8 +7,8 @@ from typing import Literal
 from typing_extensions import override
 
 from .base import (
+    BoxCandidates,
     BoxOutput,
-    Candidates,
     Floats,
     Guess,
     Interface,
@@ -17,7 +17,7 @@ from .base import (
     best_class,
     grid_cells,
     named,
-    rows_of,
+    output_rows,
     static,
 )
 from .yolo import PICTURE
@@ -33,13 +33,13 @@ class YoloNasOutput(BoxOutput):
     """Name of the output with the scores, from 0 to 1."""
 
     @override
-    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
-        boxes: Floats = rows_of(named(outputs, self.boxes, "boxes"), 4, "boxes")
-        scores = rows_of(named(outputs, self.scores, "scores"), len(self.classes), "scores")
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
+        boxes: Floats = output_rows(named(outputs, self.boxes, "boxes"), 4, "boxes")
+        scores = output_rows(named(outputs, self.scores, "scores"), len(self.classes), "scores")
         if len(boxes) != len(scores):
             raise ValueError(f"expected as many boxes as scores, got {len(boxes)}, {len(scores)}")
         best, classes = best_class(scores)
-        return Candidates(boxes, best, classes)
+        return BoxCandidates(boxes, best, classes)
 
     @override
     @classmethod

@@ -10,15 +10,15 @@ from typing_extensions import override
 
 from .base import (
     GRID_STRIDES,
+    BoxCandidates,
     BoxOutput,
-    Candidates,
     Guess,
     Interface,
     Outputs,
     Size,
     best_class,
     cell_count,
-    cells,
+    cell_grid,
     named,
     static,
 )
@@ -34,7 +34,7 @@ class YoloxOutput(BoxOutput):
     strides: tuple[int, ...] = GRID_STRIDES
 
     @override
-    def candidates(self, outputs: Outputs, size_px: Size, /) -> Candidates:
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         rows = named(outputs, self.name)
         shape = (1, cell_count(size_px, self.strides), 5 + len(self.classes))
         if rows.shape != shape:
@@ -46,12 +46,12 @@ class YoloxOutput(BoxOutput):
         is_able = ~(np.asarray(rows[0, :, 4], np.float64) < self.score)
         able = rows[0, is_able]
         table: NDArray[np.float64] = np.asarray(able[:, :5], np.float64)
-        corner, stride = (cell[is_able] for cell in cells(size_px, self.strides))
+        corner, stride = (cell[is_able] for cell in cell_grid(size_px, self.strides))
         center = (table[:, :2] + corner) * stride
         # A width of e^20 cells exceeds any picture; more would overflow.
         half = np.exp(np.minimum(table[:, 2:4], 20.0)) * stride / 2.0
         best, classes = best_class(able[:, 5:])
-        return Candidates(np.hstack([center - half, center + half]), table[:, 4] * best, classes)
+        return BoxCandidates(np.hstack([center - half, center + half]), table[:, 4] * best, classes)
 
     @override
     @classmethod

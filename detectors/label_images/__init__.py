@@ -106,7 +106,7 @@ def _objects_of(frame: Frame) -> Detections:
         boxes.append((x0, y0, x1, y1))
         labels.append(CLASSES[kind - 1])
         scores.append(int(frame.pixels[y[0], x[0], 0]) / 255.0)
-        masks.append(rle.encode(mask, (x0, y0), frame.size_px))
+        masks.append(rle.encode_mask(mask, (x0, y0), frame.size_px))
     return Detections(
         frame.t_ns,
         frame.size_px,
@@ -142,7 +142,7 @@ class LabelledRoad:
             RoadMask(
                 frame.t_ns,
                 frame.size_px,
-                rle.encode(frame.pixels[..., 2] >= ROAD_BIT, (0, 0), frame.size_px),
+                rle.encode_mask(frame.pixels[..., 2] >= ROAD_BIT, (0, 0), frame.size_px),
                 frame.size_px,
             )
             for frame in frames

@@ -20,7 +20,7 @@ from crosscue.detectors.decoders.base import PICTURE_SIZE_INPUT
 from crosscue.replay.errors import VehicleError, one_line
 from crosscue.replay.versions import installed
 
-from .free_size import Size, free_size, resized
+from .free_size import Size, free_size, replace_size
 from .onnx_input import input_shape
 from .openvino import import_openvino
 from .weights import Weights
@@ -159,7 +159,7 @@ def _in_openvino(weights: Weights, threads: int, size_px: Size | None) -> Networ
     model = core.read_model(weights.content, weights.second)
     if size_px is not None:
         model.reshape(
-            resized([side.get_length() for side in model.input(0).partial_shape], size_px)
+            replace_size([side.get_length() for side in model.input(0).partial_shape], size_px)
         )
     compiled = core.compile_model(model, "CPU")
     names = [_output_name(out, i) for i, out in enumerate(compiled.outputs)]
@@ -176,7 +176,7 @@ def _in_litert(weights: Weights, threads: int, size_px: Size | None) -> Network:
     net = litert.Interpreter(model_content=weights.content, num_threads=threads)
     if size_px is not None:
         first = net.get_input_details()[0]
-        net.resize_tensor_input(first["index"], resized(first["shape"].tolist(), size_px))
+        net.resize_tensor_input(first["index"], replace_size(first["shape"].tolist(), size_px))
     net.allocate_tensors()
     given, outputs = net.get_input_details()[0], net.get_output_details()
 

@@ -9,15 +9,15 @@ import numpy as np
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Found, Frame, View
-from crosscue.detectors.boxes import best_of
+from crosscue.detectors.boxes import non_maximum_suppression
 from crosscue.detectors.catalog.card import ModelCard
-from crosscue.detectors.decoders.base import Array, BoxOutput, Candidates
+from crosscue.detectors.decoders.base import Array, BoxCandidates, BoxOutput
 from crosscue.replay.columns import Bytes, Floats, Int64s
 from crosscue.replay.errors import VehicleError
 
 from .backends import Network
 from .picture_input import Placement, prepared, view_of
-from .tiles import Corner, corners, is_whole
+from .tiles import Corner, corners, is_uncut
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +127,7 @@ class BoxModel:
         )
         if bad:
             raise ValueError(f"{bad} of {len(some)} candidates are not finite numbers")
-        keep = best_of(
+        keep = non_maximum_suppression(
             some.boxes_px, some.scores, some.classes, self.output.score, self.output.overlap
         )
         boxes = placement.to_picture(some.boxes_px[keep])
@@ -135,14 +135,14 @@ class BoxModel:
             boxes = boxes + np.tile(part.corner, 2)
             height, width = frame.pixels.shape[:2]
             tile = (self.card.input.width_px, self.card.input.height_px)
-            is_kept = is_whole(boxes, part.corner, tile, (width, height))
+            is_kept = is_uncut(boxes, part.corner, tile, (width, height))
             boxes, keep = boxes[is_kept], keep[is_kept]
         masks = self._masks(some, keep, boxes, part, placement, frame)
         return _Found(boxes, some.scores[keep], some.classes[keep], masks)
 
     def _masks(
         self,
-        some: Candidates,
+        some: BoxCandidates,
         keep: Int64s,
         boxes: Floats,
         part: _Part,
@@ -175,7 +175,7 @@ class BoxModel:
         keep = np.arange(len(scores))
         if len(some) > 1:
             overlap = min(self.output.overlap, 0.45) if self.card.tiles else self.output.overlap
-            keep = best_of(boxes, scores, classes, self.output.score, overlap)
+            keep = non_maximum_suppression(boxes, scores, classes, self.output.score, overlap)
         width, height = frame.size_px
         inside = np.clip(boxes * np.tile(frame.scale, 2), 0.0, [width, height, width, height])
         is_seen = (inside[keep, 2:] > inside[keep, :2]).all(axis=1)
@@ -245,4 +245,4 @@ def _mask_text(
         borderMode=cv2.BORDER_REPLICATE,
     )
     mask = part > 0.5
-    return rle.encode(mask, (int(low[0]), int(low[1])), size_px) if mask.any() else b""
+    return rle.encode_mask(mask, (int(low[0]), int(low[1])), size_px) if mask.any() else b""

@@ -28,7 +28,7 @@ def free_size(content: bytes) -> bytes:
     return freed
 
 
-def resized(shape: Sequence[int], size_px: Size) -> list[int]:
+def replace_size(shape: Sequence[int], size_px: Size) -> list[int]:
     """Replace width and height in an input's shape (1, 3, h, w) or (1, h, w, 3)."""
     width, height = size_px
     return [shape[0], 3, height, width] if shape[1] == 3 else [shape[0], height, width, 3]

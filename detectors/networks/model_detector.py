@@ -119,7 +119,7 @@ class RoadModel:
         for frame in frames:
             road = self.road_mask(frame)
             size = (road.shape[1], road.shape[0])
-            text = rle.encode(road, (0, 0), size)
+            text = rle.encode_mask(road, (0, 0), size)
             found.append(RoadMask(frame.t_ns, frame.size_px, text, size))
         return found
 

@@ -38,7 +38,7 @@ def view_of(want: Input) -> View:
     return View(min_width_px=want.width_px)
 
 
-def place(picture: Size, want: Input) -> Placement:
+def picture_placement(picture: Size, want: Input) -> Placement:
     """Compute the placement of a picture of this width and height."""
     width, height = picture
     whole = (want.width_px, want.height_px)
@@ -62,7 +62,7 @@ def place(picture: Size, want: Input) -> Placement:
 def prepared(pixels: NDArray[np.uint8], want: Input) -> tuple[Array, Placement]:
     """Convert a picture (H, W, 3) to a network's input with batch axis, and its placement."""
     height, width = pixels.shape[:2]
-    placement = place((width, height), want)
+    placement = picture_placement((width, height), want)
     if want.fit == "network":
         return _numbers(pixels, want, (0, 0), (width, height))[None], placement
     left, top = (max(int(o), 0) for o in placement.offset)

@@ -31,7 +31,7 @@ def _starts(first: int, last: int, length: int, overlap: float, side: int) -> li
     return [first + round(i * (span - length) / (count - 1)) for i in range(count)]
 
 
-def is_whole(
+def is_uncut(
     boxes_px: NDArray[np.float64], corner: Corner, tile: Size, picture: Size
 ) -> NDArray[np.bool_]:
     """Mark the boxes (N, 4), in the picture's pixels, that no inner edge of the tile cuts off."""

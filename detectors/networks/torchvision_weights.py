@@ -214,7 +214,7 @@ def class_count(tensors: Mapping[str, Tensor], name: ArchitectureName) -> int | 
     return len(head) // shape.per_class
 
 
-def difference(
+def tensor_difference(
     wanted: Mapping[str, tuple[int, ...]], tensors: Mapping[str, Tensor]
 ) -> tuple[int, str]:
     """Number of tensors that differ from a network's, and a description of the first."""
@@ -242,7 +242,7 @@ def _fill(network: Any, tensors: Mapping[str, Tensor], name: str, where: str) ->
     wanted = {
         key: value for key, value in network.state_dict().items() if not key.endswith(_COUNTER)
     }
-    count, first = difference({key: tuple(v.shape) for key, v in wanted.items()}, tensors)
+    count, first = tensor_difference({key: tuple(v.shape) for key, v in wanted.items()}, tensors)
     if count:
         raise VehicleError(
             f"{where}: {count} tensors do not fit {name}: {first}; correct network.architecture, "

@@ -8,7 +8,7 @@ import numpy as np
 
 from crosscue.detectors.base import Detector
 from crosscue.detectors.decoders.plausible import oddity
-from crosscue.detectors.signs.templates import draw
+from crosscue.detectors.signs.templates import draw_sign_template
 from crosscue.replay.columns import Bytes
 
 from .box_model import BoxModel
@@ -39,7 +39,7 @@ def _pictures(detector: BoxModel, picture: Bytes | None) -> Iterator[tuple[str, 
     if picture is not None:
         yield "the picture", picture
     else:
-        yield "the drawing of a sign", np.dstack([draw("no entry", 512).grey] * 3)
+        yield "the drawing of a sign", np.dstack([draw_sign_template("no entry", 512).grey] * 3)
 
 
 def _oddity_on(detector: BoxModel, pixels: Bytes) -> str | None:

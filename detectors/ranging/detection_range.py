@@ -17,7 +17,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .ground_plane import GroundPlane
 from .height_to_range import range_of
-from .standard_sizes import VEHICLES, size_of
+from .standard_sizes import VEHICLES, size_prior
 from .vehicle_range import GroundCamera, OneRange, size_range, vehicle_range
 
 # Distance to the picture's edge within which a box counts as cut, so that its height is unusable.
@@ -73,9 +73,9 @@ def _by_size(
     x0, _, x1, y1 = box_px.tolist()
     if label in cues.traffic_light_labels:
         aspect = height_px / (x1 - x0) if x1 > x0 else None
-        return size_range(height_px, focal_px, size_of("traffic_light", aspect))
+        return size_range(height_px, focal_px, size_prior("traffic_light", aspect))
     if label in cues.stop_sign_labels:
-        return size_range(height_px, focal_px, size_of("stop_sign"))
+        return size_range(height_px, focal_px, size_prior("stop_sign"))
     if label not in VEHICLES:
         return None
     foot = np.array([[0.5 * (x0 + x1), y1]])

@@ -3,8 +3,8 @@
 The position of a standing object is predicted. As the car drives, the object moves away from the
 picture's centre and grows by the ratio of the ranges before and after. As the car turns, it shifts
 sideways. Two adjacent lights therefore remain two tracks, and no range mixes their heights.
-Housings seen from behind or from the side are tracked, too; ``Track.facing`` distinguishes them by
-their lit lenses.
+Housings seen from behind or from the side are tracked, too; ``ObjectTrack.facing`` distinguishes
+them by their lit lenses.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from .lens import HUES
 from .range_from_motion import MotionRange, range_from_motion
-from .standard_sizes import BOX_SPREAD, SizePrior, size_of
+from .standard_sizes import BOX_SPREAD, SizePrior, size_prior
 
 # Maximum distance of a box from a track's predicted box, in heights of the box: the car's pitch
 # shifts a distant object by about its own height, and lights are further apart.
@@ -69,7 +69,7 @@ class Facing(StrEnum):
     UNKNOWN = "unknown"
 
 
-class Motion(NamedTuple):
+class CarStep(NamedTuple):
     """Motion of the car since the previous frame.
 
     Attributes:
@@ -99,7 +99,7 @@ class Lens:
 
 
 @dataclass(slots=True)
-class Track:
+class ObjectTrack:
     """Track of one object.
 
     Attributes:
@@ -191,7 +191,7 @@ class Track:
         mean = (found.log_height - prior.log_mean) / (found.log_height_var * precision)
         return mean, 1.0 / precision + self._stretch() ** 2
 
-    def predict(self, motion: Motion, lens: Lens) -> None:
+    def predict(self, motion: CarStep, lens: Lens) -> None:
         """Predict the track to the next frame."""
         way_m = motion.way_m or 0.0
         scale = self.range_m / max(self.range_m - way_m, 0.1 * self.range_m, 1e-3)
@@ -224,7 +224,7 @@ class Track:
             self._height_px.append(height_px)
             self._merged = 1
             del self._way_m[:-MAX_OBSERVATIONS], self._height_px[:-MAX_OBSERVATIONS]
-        self.size = size_of(cue, self.aspect if self._aspect else None)
+        self.size = size_prior(cue, self.aspect if self._aspect else None)
         self.alone = self.estimate = self._ranged(self.size, lens)
         self.since_m = self._at_m - self._way_m[-1]
         self.box_px, self.height_px = box_px.copy(), height_px
@@ -261,7 +261,7 @@ class ObjectTracks:
         center_px: tuple[float, float],
         way_scale_sd: float = 0.0,
     ) -> None:
-        self.tracks: list[Track] = []
+        self.tracks: list[ObjectTrack] = []
         self.counts: Counter[str] = Counter()
         self._cue = cue
         self._way_scale_sd = way_scale_sd
@@ -269,11 +269,11 @@ class ObjectTracks:
 
     def __call__(
         self,
-        motion: Motion,
+        motion: CarStep,
         boxes_px: NDArray[np.float64],
         heights_px: NDArray[np.float64],
         lenses: Sequence[str] = (),
-    ) -> Sequence[Track]:
+    ) -> Sequence[ObjectTrack]:
         """Update the tracks with the boxes of the next frame.
 
         Args:
@@ -342,10 +342,10 @@ class ObjectTracks:
 
     def _begin(self, box_px: NDArray[np.float64], height_px: float, lens: str) -> None:
         self.counts["objects followed"] += 1
-        size = size_of(self._cue)
+        size = size_prior(self._cue)
         first = range_from_motion(np.zeros(1), np.array([height_px]), self._lens.focal_px, size)
         number = self.counts["objects followed"]
-        track = Track(number, box_px.copy(), height_px, first, first, size)
+        track = ObjectTrack(number, box_px.copy(), height_px, first, first, size)
         track.way_scale_sd = self._way_scale_sd
         track.observe(box_px, height_px, self._cue, self._lens)
         track.add_lens(lens)
@@ -364,7 +364,7 @@ def may_be_one_make(one: tuple[float, float], other: tuple[float, float]) -> boo
     return (one[0] - other[0]) ** 2 < OTHER_MAKE**2 * var
 
 
-def difference_var_m2(one: Track, other: Track) -> float:
+def difference_var_m2(one: ObjectTrack, other: ObjectTrack) -> float:
     """Variance of the difference of two ranges.
 
     For lights of one make, the common part of their sizes is left out. Its error changes both
@@ -385,7 +385,8 @@ def shared_size(size: SizePrior, others: Sequence[tuple[float, float]]) -> SizeP
 
     Args:
         size: Prior from the object's aspect.
-        others: Mean and variance of the log ratio (``Track.size_by_motion``) of each other object.
+        others: Mean and variance of the log ratio (``ObjectTrack.size_by_motion``) of each other
+            object.
     """
     own = min(SAME_MAKE**2, 0.5 * size.log_var)
     common = size.log_var - own
@@ -403,7 +404,7 @@ def iou(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return inside / (both - inside) if both > inside else 0.0
 
 
-def _cost_of(track: Track, box_px: NDArray[np.float64], height_px: float) -> float:
+def _cost_of(track: ObjectTrack, box_px: NDArray[np.float64], height_px: float) -> float:
     """Distance of a box from the predicted box, in heights; infinite if the heights differ."""
     if abs(math.log(height_px / track.height_px)) > math.log(GROWTH):
         return math.inf
@@ -411,6 +412,6 @@ def _cost_of(track: Track, box_px: NDArray[np.float64], height_px: float) -> flo
     return float(np.hypot(*apart)) / max(height_px, track.height_px)
 
 
-def _is_over(track: Track) -> bool:
+def _is_over(track: ObjectTrack) -> bool:
     is_gone = track.unseen_m > GONE_M and track.unseen_s > GONE_S
     return is_gone or track.range_m <= 0.0

@@ -102,7 +102,7 @@ def light_size(aspect: float | None = None) -> SizePrior:
     return SizePrior(mean_m, float(np.hypot(spread, BOX_SPREAD)))
 
 
-def size_of(cue: str, aspect: float | None = None) -> SizePrior:
+def size_prior(cue: str, aspect: float | None = None) -> SizePrior:
     """Size prior of the objects of a cue.
 
     Args:

@@ -19,7 +19,7 @@ from crosscue.detectors.base import Detections, Detector, Found, Frame, View
 from crosscue.detectors.settings import Proportion, Settings, identity_of, settings_of
 
 from .matching import Counts, Words, nearest, window_counts
-from .templates import AMERICAN, LABELS, Drawing, Kind, drawings
+from .templates import AMERICAN, LABELS, Kind, SignTemplate, drawings
 
 VERSION: Final = 1
 # Maximum number of points of a drawing; more than any has.
@@ -117,7 +117,7 @@ def orb_points(grey: NDArray[np.uint8], max_points: int, fast: int = 10) -> Poin
 class _Gallery:
     """Points of all drawings, concatenated."""
 
-    drawn: tuple[Drawing, ...]
+    drawn: tuple[SignTemplate, ...]
     points: Points
     first: NDArray[np.int64]
     to_middle_px: NDArray[np.float64]
@@ -229,7 +229,7 @@ class SignDetector:
         votes: NDArray[np.float64],
         at: NDArray[np.int64],
         shape: tuple[int, ...],
-        drawing: Drawing,
+        drawing: SignTemplate,
         points_drawn: int,
         scale: float,
     ) -> list[tuple[float, Kind, NDArray[np.float64]]]:
@@ -267,7 +267,7 @@ def _apart(
     is. So a window's score is its fraction of the drawing's points, times S / (S + 1), where S is
     the sum of the fractions of all overlapping windows of its kind.
     """
-    from crosscue.detectors.boxes import overlaps
+    from crosscue.detectors.boxes import box_ious
 
     if not candidates:
         return []
@@ -276,13 +276,13 @@ def _apart(
     kinds = np.array([kind for _, kind, _ in candidates])
     sums = np.array(
         [
-            fractions[(overlaps(box, boxes) > _SAME_SIGN) & (kinds == kind)].sum()
+            fractions[(box_ious(box, boxes) > _SAME_SIGN) & (kinds == kind)].sum()
             for _, kind, box in candidates
         ]
     )
     scores = fractions * sums / (sums + 1.0)
     kept: list[int] = []
     for i in np.lexsort((-fractions, -scores)).tolist():
-        if not kept or float(overlaps(boxes[i], boxes[kept]).max()) <= overlap:
+        if not kept or float(box_ious(boxes[i], boxes[kept]).max()) <= overlap:
             kept.append(i)
     return [(float(scores[i]), candidates[i][1], boxes[i]) for i in kept]

@@ -29,7 +29,7 @@ FILES_PX: Final = (48, 64, 512)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawing:
+class SignTemplate:
     """One sign at one size.
 
     Attributes:
@@ -43,12 +43,14 @@ class Drawing:
     size_px: tuple[int, int]
 
 
-def drawings(kinds: Sequence[Kind] = KINDS, heights_px: Sequence[int] = (48, 64)) -> list[Drawing]:
-    """Return the drawing of each kind at each height, where ``size_of`` is the size."""
-    return [draw(kind, height) for kind in kinds for height in heights_px]
+def drawings(
+    kinds: Sequence[Kind] = KINDS, heights_px: Sequence[int] = (48, 64)
+) -> list[SignTemplate]:
+    """Return the drawing of each kind at each height, where ``sign_size`` is the size."""
+    return [draw_sign_template(kind, height) for kind in kinds for height in heights_px]
 
 
-def draw(kind: Kind, height_px: int) -> Drawing:
+def draw_sign_template(kind: Kind, height_px: int) -> SignTemplate:
     """Return the drawing of a sign; for a height without a file, the largest is scaled down.
 
     Raises:
@@ -58,13 +60,13 @@ def draw(kind: Kind, height_px: int) -> Drawing:
         raise ValueError(f"height_px: expected 16 to {FILES_PX[-1]}, got {height_px}")
     import cv2
 
-    size = size_of(kind, height_px)
+    size = sign_size(kind, height_px)
     sign = _stored(kind, height_px if height_px in FILES_PX else FILES_PX[-1])
     if sign.shape[::-1] != size:
         sign = np.asarray(cv2.resize(sign, size, interpolation=cv2.INTER_AREA), np.uint8)
     grey = np.full((size[1] + 2 * MARGIN_PX, size[0] + 2 * MARGIN_PX), _AROUND, np.uint8)
     grey[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX] = sign
-    return Drawing(kind, np.asarray(cv2.GaussianBlur(grey, (3, 3), 0.6), np.uint8), size)
+    return SignTemplate(kind, np.asarray(cv2.GaussianBlur(grey, (3, 3), 0.6), np.uint8), size)
 
 
 def draw_sign(kind: str, height_px: int) -> NDArray[np.uint8]:
@@ -84,12 +86,12 @@ def draw_sign(kind: str, height_px: int) -> NDArray[np.uint8]:
     if known is None:
         raise UsageError(f"kind: expected one of {', '.join(KINDS)}; found {kind!r}")
     try:
-        return draw(known, height_px).grey[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
+        return draw_sign_template(known, height_px).grey[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
     except ValueError as error:
         raise UsageError(f"draw_sign: {error}") from None
 
 
-def size_of(kind: Kind, height_px: int) -> tuple[int, int]:
+def sign_size(kind: Kind, height_px: int) -> tuple[int, int]:
     """Width and height of a sign.
 
     A one-way sign has half of ``height_px`` as its height and is three times as wide as high.
@@ -99,7 +101,7 @@ def size_of(kind: Kind, height_px: int) -> tuple[int, int]:
     return height_px, height_px
 
 
-def file_name(kind: Kind, height_px: int) -> str:
+def template_file(kind: Kind, height_px: int) -> str:
     """File name of a stored drawing."""
     return f"{kind.replace(' ', '_')}_{height_px}.png"
 
@@ -107,6 +109,6 @@ def file_name(kind: Kind, height_px: int) -> str:
 def _stored(kind: Kind, height_px: int) -> NDArray[np.uint8]:
     import cv2
 
-    path = files("crosscue.detectors.signs").joinpath("drawings", file_name(kind, height_px))
+    path = files("crosscue.detectors.signs").joinpath("drawings", template_file(kind, height_px))
     data = np.frombuffer(path.read_bytes(), np.uint8)
     return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)

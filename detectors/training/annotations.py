@@ -35,7 +35,7 @@ Mask: TypeAlias = bytes | tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Labelled:
+class TrainingObject:
     """One annotated object.
 
     Attributes:
@@ -66,7 +66,7 @@ class LabelledPicture:
 
     path: Path
     size_px: tuple[int, int]
-    objects: tuple[Labelled, ...]
+    objects: tuple[TrainingObject, ...]
     decoys_px: tuple[Box, ...] = ()
 
 
@@ -76,7 +76,7 @@ class LabelledSet:
 
     Attributes:
         source: The annotation file.
-        classes: Class names, in the order of ``Labelled.label``.
+        classes: Class names, in the order of ``TrainingObject.label``.
         pictures: Pictures, in the order of the file.
         left_out: Number of annotations and pictures that were left out or repaired, by reason.
     """
@@ -97,7 +97,7 @@ class LabelledSet:
         return sum(one.mask is not None for picture in self.pictures for one in picture.objects)
 
 
-def read_coco(path: Path, folder: Path, classes: Sequence[str]) -> LabelledSet:
+def read_training_coco(path: Path, folder: Path, classes: Sequence[str]) -> LabelledSet:
     """Read a COCO file.
 
     Args:
@@ -125,11 +125,11 @@ def read_coco(path: Path, folder: Path, classes: Sequence[str]) -> LabelledSet:
             f"{path}: none of its pictures is in {folder}; name the folder of its images"
         )
     numbers = {name: i for i, name in enumerate(classes)}
-    objects: dict[Any, list[Labelled]] = {key: [] for key in pictures}
+    objects: dict[Any, list[TrainingObject]] = {key: [] for key in pictures}
     decoys: dict[Any, list[Box]] = {key: [] for key in pictures}
     for row in _rows(tree, "annotations", path):
         found = _labelled(row, pictures, names, numbers, left_out)
-        if isinstance(found, Labelled):
+        if isinstance(found, TrainingObject):
             objects[row["image_id"]].append(found)
         elif found is not None:
             decoys[row["image_id"]].append(found)
@@ -193,7 +193,7 @@ def _labelled(
     names: Mapping[Any, Any],
     numbers: Mapping[str, int],
     left_out: Counter[str],
-) -> Labelled | Box | None:
+) -> TrainingObject | Box | None:
     """Return the object, or only its box if its class is not selected; None if it is unusable."""
     picture, category = row.get("image_id"), row.get("category_id")
     if not isinstance(picture, int | str) or picture not in pictures:
@@ -214,7 +214,7 @@ def _labelled(
     if segmentation and mask is None:
         left_out["annotations without a mask of the picture's size"] += 1
         return None
-    return Labelled(numbers[names[category]], box, mask, bool(row.get("iscrowd", 0)))
+    return TrainingObject(numbers[names[category]], box, mask, bool(row.get("iscrowd", 0)))
 
 
 def _box(given: object, size: tuple[int, int], left_out: Counter[str]) -> Box | None:
@@ -259,10 +259,10 @@ def _from_lengths(lengths: Int64s, size: tuple[int, int]) -> bytes:
     if lengths.min(initial=0) < 0 or int(lengths.sum()) != size[0] * size[1]:
         raise ValueError("run lengths do not fill the picture")
     flat = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
-    return rle.encode(flat.reshape(size).T, (0, 0), size)
+    return rle.encode_mask(flat.reshape(size).T, (0, 0), size)
 
 
-def mask_of(labelled: Labelled, size_px: tuple[int, int]) -> NDArray[np.bool_]:
+def mask_of(labelled: TrainingObject, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     """Rasterise an object's mask, shape (height, width); its box where it has no mask."""
     import cv2
 
@@ -272,7 +272,7 @@ def mask_of(labelled: Labelled, size_px: tuple[int, int]) -> NDArray[np.bool_]:
         inside[y0:y1, x0:x1] = True
         return inside
     if isinstance(labelled.mask, bytes):
-        return rle.decode(labelled.mask, size_px)
+        return rle.decode_mask(labelled.mask, size_px)
     canvas = np.zeros((size_px[1], size_px[0]), np.uint8)
     for polygon in labelled.mask:
         # Integer coordinates are pixel edges in COCO and pixel centres in OpenCV; 4 fraction bits.

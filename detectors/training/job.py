@@ -21,7 +21,7 @@ from crosscue.detectors.networks.mask_rcnn.checkpoint import (
 )
 from crosscue.detectors.networks.mask_rcnn.coco import COCO_NETWORKS
 from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, checkpoint_named
-from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network
+from crosscue.detectors.networks.mask_rcnn.network import NetworkPlan, build_network
 from crosscue.replay.errors import OutputError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree, strict_json
@@ -30,9 +30,9 @@ from crosscue.replay.files.whole_file import write_text
 from .annotations import LabelledSet
 from .loop import Schedule, Training
 from .measure import fitted, judged, rates_by_score, raw_detections
-from .operating_point import Judged
+from .operating_point import Verdicts
 from .reproducible import decides_bits, reproducible
-from .samples import Sampler, Window
+from .samples import Sampler, SampleSettings
 from .scores import average_precisions
 
 COMPACT: Final = "compact"
@@ -40,7 +40,7 @@ Recipe: TypeAlias = dict[str, str | int | float]
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class TrainingJob:
     """A training and its outputs.
 
     Attributes:
@@ -58,9 +58,9 @@ class Job:
     """
 
     start: str
-    plan: Plan
+    plan: NetworkPlan
     schedule: Schedule
-    window: Window
+    window: SampleSettings
     output: Path
     check_every: int
     check_pictures: int
@@ -81,7 +81,7 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class CurvePoint:
     """One point of the training curve.
 
     Attributes:
@@ -98,13 +98,13 @@ class Point:
 
 
 def run_job(
-    job: Job,
+    job: TrainingJob,
     train: LabelledSet,
     held_out: LabelledSet,
     *,
     resume: bool,
     overwrite: bool,
-    report: Callable[[Point], None],
+    report: Callable[[CurvePoint], None],
 ) -> Facts:
     """Train, validate, calibrate and write a checkpoint; return its description.
 
@@ -125,22 +125,22 @@ def run_job(
 
 
 def _run(
-    job: Job,
+    job: TrainingJob,
     train: LabelledSet,
     held_out: LabelledSet,
     device: torch.device,
     *,
     resume: bool,
-    report: Callable[[Point], None],
+    report: Callable[[CurvePoint], None],
 ) -> Facts:
     learns_masks = train.masks > 0
     training = Training(
         lambda: starting_network(job), job.schedule, device, learns_masks=learns_masks
     )
-    points: list[Point] = []
+    points: list[CurvePoint] = []
     if resume and job.state_path.exists():
         said = training.resume(job.state_path, job.made_of)
-        points = [Point(**row) for row in said["points"]]
+        points = [CurvePoint(**row) for row in said["points"]]
     sampler = Sampler(train, job.plan, job.window, job.schedule.seed)
     for point in _learned(job, training, sampler, held_out, points):
         report(point)
@@ -153,7 +153,7 @@ def _run(
     return facts
 
 
-def _check_place(job: Job, overwrite: bool) -> None:
+def _check_place(job: TrainingJob, overwrite: bool) -> None:
     for path in (job.state_path, job.output):
         if path.exists() and not overwrite:
             how = "--resume continues it, " if path == job.state_path else ""
@@ -161,7 +161,7 @@ def _check_place(job: Job, overwrite: bool) -> None:
     job.state_path.unlink(missing_ok=True)
 
 
-def starting_network(job: Job) -> Any:
+def starting_network(job: TrainingJob) -> Any:
     """Build a network with its initial weights; heads for different classes start at random."""
     network = build_network(job.plan)
     if job.start == COMPACT:
@@ -179,7 +179,7 @@ def starting_network(job: Job) -> Any:
     return network
 
 
-def knows_masks(job: Job) -> bool:
+def knows_masks(job: TrainingJob) -> bool:
     """Whether the network to start from was trained on masks of exactly the plan's classes."""
     if job.start == COMPACT:
         return False
@@ -195,8 +195,12 @@ def architecture_of(start: str) -> str:
 
 
 def _learned(
-    job: Job, training: Training, sampler: Sampler, held_out: LabelledSet, points: list[Point]
-) -> Iterator[Point]:
+    job: TrainingJob,
+    training: Training,
+    sampler: Sampler,
+    held_out: LabelledSet,
+    points: list[CurvePoint],
+) -> Iterator[CurvePoint]:
     some = replace(held_out, pictures=_spread(held_out.pictures, job.check_pictures))
     before_s = points[-1].seconds if points else 0.0
     began, checking_s, losses = time.monotonic(), 0.0, list[float]()
@@ -214,7 +218,7 @@ def _learned(
             MaskRcnnSettings(threads=job.threads),
             training.device,
         )
-        point = Point(
+        point = CurvePoint(
             step,
             float(np.mean(losses or [math.nan])),
             round(seconds, 1),
@@ -239,7 +243,7 @@ def _spread(pictures: tuple[Any, ...], max_count: int) -> tuple[Any, ...]:
 
 
 def finished_facts(
-    job: Job, network: Any, held_out: LabelledSet, device: torch.device, *, has_masks: bool
+    job: TrainingJob, network: Any, held_out: LabelledSet, device: torch.device, *, has_masks: bool
 ) -> Facts:
     """Measure average precision and calibrate the scores, for the checkpoint's description.
 
@@ -266,7 +270,7 @@ def finished_facts(
     )
 
 
-def reported_rates(name: str, rows: Judged, by: Calibration) -> dict[str, float | None]:
+def reported_rates(name: str, rows: Verdicts, by: Calibration) -> dict[str, float | None]:
     """Precision and recall of a class at calibrated scores, in percent; None where undefined."""
     reported: dict[str, float | None] = {}
     for aim, at in rates_by_score(rows, by).items():
@@ -277,6 +281,6 @@ def reported_rates(name: str, rows: Judged, by: Calibration) -> dict[str, float 
     return reported
 
 
-def read_curve(path: Path) -> list[Point]:
+def read_curve(path: Path) -> list[CurvePoint]:
     """Read the points of a curve file."""
-    return [Point(**row) for row in json_tree(door.read(path))]
+    return [CurvePoint(**row) for row in json_tree(door.read(path))]

@@ -19,14 +19,14 @@ import torch
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.boxes import overlaps
+from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Calibration, Checkpoint, Facts
 from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, calibrated, detector_of
-from crosscue.detectors.networks.mask_rcnn.network import Plan
+from crosscue.detectors.networks.mask_rcnn.network import NetworkPlan
 from crosscue.detectors.rle import area_px
 
-from .annotations import Labelled, LabelledPicture, LabelledSet
-from .operating_point import Judged, Rates, rates_at
+from .annotations import LabelledPicture, LabelledSet, TrainingObject
+from .operating_point import DetectionCounts, Verdicts, rates_at
 from .platt import fit_platt
 from .scores import MIN_AREA_PX, average_precisions, detections_on
 
@@ -37,7 +37,7 @@ AIMS: Final = (0.5, 0.9, 0.95)
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class NetworkResults:
     """Results of a network on annotated pictures.
 
     Attributes:
@@ -47,13 +47,13 @@ class Measured:
     """
 
     ap: Mapping[str, float | None]
-    rates: Mapping[str, Mapping[float, Rates]]
+    rates: Mapping[str, Mapping[float, DetectionCounts]]
     cpu_s: float
 
 
-def measure(
+def measure_network(
     checkpoint: Checkpoint, labelled: LabelledSet, settings: MaskRcnnSettings, device: torch.device
-) -> Measured:
+) -> NetworkResults:
     """Detect in all pictures and compare with their labels.
 
     Raises:
@@ -68,11 +68,11 @@ def measure(
         name: rates_by_score(rows, facts.calibration.get(name, Calibration()))
         for name, rows in judged(labelled, found).items()
     }
-    return Measured(average_precisions(labelled, found), rates, cpu_s)
+    return NetworkResults(average_precisions(labelled, found), rates, cpu_s)
 
 
 def raw_detections(
-    plan: Plan,
+    plan: NetworkPlan,
     network: Any,
     labelled: LabelledSet,
     settings: MaskRcnnSettings,
@@ -95,10 +95,10 @@ def raw_detections(
     return list(detections_on(labelled, detector_of(bare, low, device)))
 
 
-def rates_by_score(rows: Judged, by: Calibration) -> dict[float, Rates]:
+def rates_by_score(rows: Verdicts, by: Calibration) -> dict[float, DetectionCounts]:
     """Rates at each of ``AIMS``, by calibrated scores."""
     scores = np.array([calibrated(score, by) for score in rows.scores.tolist()])
-    return {aim: rates_at(Judged(scores, rows.is_right, rows.signs), aim) for aim in AIMS}
+    return {aim: rates_at(Verdicts(scores, rows.is_right, rows.signs), aim) for aim in AIMS}
 
 
 OVERLAP: Final = 0.3
@@ -106,9 +106,9 @@ OVERLAP: Final = 0.3
 MIN_ROWS: Final = 20
 
 
-def judged(labelled: LabelledSet, found: Sequence[Detections]) -> Mapping[str, Judged]:
+def judged(labelled: LabelledSet, found: Sequence[Detections]) -> Mapping[str, Verdicts]:
     """Judge every detection as correct or wrong, by class, without those of ignored objects."""
-    table: dict[str, Judged] = {}
+    table: dict[str, Verdicts] = {}
     for label, name in enumerate(labelled.classes):
         scores: list[float] = []
         right: list[bool] = []
@@ -120,11 +120,11 @@ def judged(labelled: LabelledSet, found: Sequence[Detections]) -> Mapping[str, J
             for score, verdict in _verdicts(detections, name, truth, counts):
                 scores.append(score)
                 right.append(verdict)
-        table[name] = Judged(np.array(scores), np.array(right, np.bool_), objects)
+        table[name] = Verdicts(np.array(scores), np.array(right, np.bool_), objects)
     return table
 
 
-def _counts(one: Labelled, picture: LabelledPicture) -> bool:
+def _counts(one: TrainingObject, picture: LabelledPicture) -> bool:
     if one.mask is None:
         x0, y0, x1, y1 = one.box_px
         return not one.is_crowd and (x1 - x0) * (y1 - y0) >= MIN_AREA_PX
@@ -134,7 +134,7 @@ def _counts(one: Labelled, picture: LabelledPicture) -> bool:
 
 
 def _verdicts(
-    detections: Detections, name: str, truth: list[Labelled], counts: NDArray[np.bool_]
+    detections: Detections, name: str, truth: list[TrainingObject], counts: NDArray[np.bool_]
 ) -> list[tuple[float, bool]]:
     rows = [i for i, label in enumerate(detections.labels) if label == name]
     rows.sort(key=lambda i: -detections.scores[i])
@@ -142,7 +142,7 @@ def _verdicts(
     is_free = np.ones(len(truth), np.bool_)
     verdicts = []
     for i in rows:
-        overlap = np.where(is_free, overlaps(detections.boxes_px[i], boxes), 0.0)
+        overlap = np.where(is_free, box_ious(detections.boxes_px[i], boxes), 0.0)
         best = int(overlap.argmax()) if len(truth) else -1
         if best < 0 or overlap[best] < OVERLAP:
             verdicts.append((float(detections.scores[i]), False))
@@ -153,7 +153,7 @@ def _verdicts(
     return verdicts
 
 
-def fitted(rows: Judged) -> Calibration:
+def fitted(rows: Verdicts) -> Calibration:
     """Fit the calibration of one class."""
     right = int(rows.is_right.sum())
     if min(right, len(rows.is_right) - right) < MIN_ROWS:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.boxes import overlaps
+from crosscue.detectors.boxes import box_ious
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
+class Verdicts:
     """Judged detections in annotated frames, as columns of length N.
 
     Attributes:
@@ -26,7 +26,7 @@ class Judged:
 
 
 @dataclass(frozen=True, slots=True)
-class Rates:
+class DetectionCounts:
     """Counts of detections at a threshold.
 
     Attributes:
@@ -50,13 +50,13 @@ class Rates:
         return self.right / self.signs if self.signs else float("nan")
 
 
-def judge(
+def match_signs(
     boxes_px: NDArray[np.float64],
     scores: NDArray[np.float64],
     truth_px: NDArray[np.float64],
     min_overlap: float,
     min_height_px: float = 0.0,
-) -> Judged:
+) -> Verdicts:
     """Match the detections of one frame to true signs, each at most once, best scores first.
 
     Args:
@@ -71,32 +71,32 @@ def judge(
     is_right, counts = np.zeros(len(scores), np.bool_), np.ones(len(scores), np.bool_)
     left = set(range(len(truth_px)))
     for i in order.tolist():
-        fractions = overlaps(boxes_px[i], truth_px) if len(truth_px) else np.empty(0)
+        fractions = box_ious(boxes_px[i], truth_px) if len(truth_px) else np.empty(0)
         fits = [k for k in left if fractions[k] >= min_overlap]
         if fits:
             taken = max(fits, key=lambda k: float(fractions[k]))
             left.remove(taken)
             is_right[i] = True
             counts[i] = heights[taken] >= min_height_px
-    return Judged(scores[counts], is_right[counts], int((heights >= min_height_px).sum()))
+    return Verdicts(scores[counts], is_right[counts], int((heights >= min_height_px).sum()))
 
 
-def together(parts: list[Judged]) -> Judged:
+def concatenate_verdicts(parts: list[Verdicts]) -> Verdicts:
     """Concatenate the judged detections of several frames."""
-    return Judged(
+    return Verdicts(
         np.concatenate([np.empty(0), *(part.scores for part in parts)]),
         np.concatenate([np.empty(0, np.bool_), *(part.is_right for part in parts)]),
         sum(part.signs for part in parts),
     )
 
 
-def rates_at(judged: Judged, score: float) -> Rates:
+def rates_at(judged: Verdicts, score: float) -> DetectionCounts:
     """Count detections at a threshold."""
     keep = judged.scores >= score
-    return Rates(int(keep.sum()), int((keep & judged.is_right).sum()), judged.signs)
+    return DetectionCounts(int(keep.sum()), int((keep & judged.is_right).sum()), judged.signs)
 
 
-def threshold_for(judged: Judged, precision: float) -> float | None:
+def threshold_at_precision(judged: Verdicts, precision: float) -> float | None:
     """Lowest score at which, and above which, the precision is reached; None if none exists.
 
     The condition on all higher scores excludes chance fluctuations.

@@ -14,11 +14,11 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from crosscue.detectors.images import decode, read_file
-from crosscue.detectors.networks.mask_rcnn.network import MEAN, SPREAD, Plan
+from crosscue.detectors.networks.mask_rcnn.network import MEAN, SPREAD, NetworkPlan
 from crosscue.replay.columns import Bytes, Floats
 from crosscue.replay.errors import LogError, SchemaError
 
-from .annotations import Box, Labelled, LabelledPicture, LabelledSet, mask_of
+from .annotations import Box, LabelledPicture, LabelledSet, TrainingObject, mask_of
 
 # Fraction of windows that are placed around an object.
 NEAR_OBJECT: Final = 0.85
@@ -30,7 +30,7 @@ MAX_OBJECTS: Final = 24
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class SampleSettings:
     """Size and augmentation of samples.
 
     Attributes:
@@ -67,7 +67,7 @@ class Sample:
     has_mask: NDArray[np.bool_]
 
 
-def read_picture(picture: LabelledPicture) -> Bytes:
+def read_bgr(picture: LabelledPicture) -> Bytes:
     """Read and decode a picture, shape (H, W, 3), blue, green, red.
 
     Raises:
@@ -102,7 +102,9 @@ def normalised(pixels: Bytes) -> NDArray[np.float32]:
 class Sampler:
     """Draws samples; the same seed and number yield the same sample."""
 
-    def __init__(self, labelled: LabelledSet, plan: Plan, window: Window, seed: int) -> None:
+    def __init__(
+        self, labelled: LabelledSet, plan: NetworkPlan, window: SampleSettings, seed: int
+    ) -> None:
         """Count the objects of each class."""
         self._set, self._plan, self._window, self._seed = labelled, plan, window, seed
         places: list[tuple[int, Box]] = []
@@ -122,8 +124,8 @@ class Sampler:
         """Draw the sample of a number.
 
         Raises:
-            LogError: As ``read_picture``.
-            SchemaError: As ``read_picture``.
+            LogError: As ``read_bgr``.
+            SchemaError: As ``read_bgr``.
         """
         rng = np.random.default_rng([self._seed, number])
         about: Box | None = None
@@ -140,11 +142,11 @@ class Sampler:
         if rng.random() < self._window.mirror:
             warp[0] = -warp[0]
             warp[0, 2] += self._window.width_px
-        pixels = recoloured(_warped(read_picture(picture), warp, self._window), rng)
+        pixels = recoloured(_warped(read_bgr(picture), warp, self._window), rng)
         return _sample(pixels, picture, warp, self._window)
 
 
-def _is_big_enough(box: Box, picture: LabelledPicture, plan: Plan) -> bool:
+def _is_big_enough(box: Box, picture: LabelledPicture, plan: NetworkPlan) -> bool:
     scale = plan.width_px / picture.size_px[0]
     x0, y0, x1, y1 = box
     return min(x1 - x0, y1 - y0) * scale >= MIN_SIDE_PX
@@ -154,8 +156,8 @@ def _corner(
     size_px: tuple[int, int],
     about: Box | None,
     scale: float,
-    window: Window,
-    plan: Plan,
+    window: SampleSettings,
+    plan: NetworkPlan,
     rng: Generator,
 ) -> Floats:
     """Top left of the window in the picture; the window may exceed a smaller picture."""
@@ -172,7 +174,7 @@ def _corner(
     return np.asarray(np.clip(corner, low, high))
 
 
-def _warped(pixels: Bytes, warp: Floats, window: Window) -> Bytes:
+def _warped(pixels: Bytes, warp: Floats, window: SampleSettings) -> Bytes:
     import cv2
 
     return np.asarray(
@@ -218,7 +220,9 @@ def recoloured(pixels: Bytes, rng: Generator) -> Bytes:
     return changed
 
 
-def _sample(pixels: Bytes, picture: LabelledPicture, warp: Floats, window: Window) -> Sample:
+def _sample(
+    pixels: Bytes, picture: LabelledPicture, warp: Floats, window: SampleSettings
+) -> Sample:
     boxes, labels, masks, has_mask = [], [], [], []
     for one in picture.objects:
         if one.is_crowd or not _may_be_inside(one, warp, window):
@@ -251,7 +255,7 @@ def _sample(pixels: Bytes, picture: LabelledPicture, warp: Floats, window: Windo
     )
 
 
-def _may_be_inside(one: Labelled, warp: Floats, window: Window) -> bool:
+def _may_be_inside(one: TrainingObject, warp: Floats, window: SampleSettings) -> bool:
     x0, y0, x1, y1 = one.box_px
     across = np.sort(warp[0, 0] * np.array([x0, x1]) + warp[0, 2])
     down = warp[1, 1] * np.array([y0, y1]) + warp[1, 2]
@@ -260,7 +264,7 @@ def _may_be_inside(one: Labelled, warp: Floats, window: Window) -> bool:
     )
 
 
-def _warped_mask(mask: NDArray[np.bool_], warp: Floats, window: Window) -> Bytes:
+def _warped_mask(mask: NDArray[np.bool_], warp: Floats, window: SampleSettings) -> Bytes:
     import cv2
 
     grey = cv2.warpAffine(

@@ -10,13 +10,13 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.detectors.base import Detections, Frame
-from crosscue.detectors.boxes import overlaps
-from crosscue.detectors.rle import area_px, encode
+from crosscue.detectors.boxes import box_ious
+from crosscue.detectors.rle import area_px, encode_mask
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import UsageError
 
 from .annotations import LabelledPicture, LabelledSet, mask_of
-from .samples import read_picture
+from .samples import read_bgr
 
 # Area below which true objects are ignored: found or not, they do not count.
 MIN_AREA_PX: Final = 24
@@ -34,7 +34,7 @@ def detections_on(
         LogError: A picture cannot be read.
     """
     for number, picture in enumerate(labelled.pictures):
-        frame = Frame(number, "", read_picture(picture), picture.size_px)
+        frame = Frame(number, "", read_bgr(picture), picture.size_px)
         (found,) = detect([frame])
         yield found
 
@@ -132,7 +132,7 @@ def _truth(labelled: LabelledSet, *, of_masks: bool) -> dict[str, Any]:
 def _runs(mask: Any, picture: LabelledPicture, one: Any) -> bytes:
     if isinstance(mask, bytes):
         return mask
-    return encode(mask_of(one, picture.size_px), (0, 0), picture.size_px)
+    return encode_mask(mask_of(one, picture.size_px), (0, 0), picture.size_px)
 
 
 def _answers(
@@ -159,4 +159,4 @@ def _answers(
 def _is_unmasked(picture: LabelledPicture, label: int, box_px: Floats) -> bool:
     """Whether a detection is on an object of its class without an annotated mask."""
     bare = [one.box_px for one in picture.objects if one.label == label and one.mask is None]
-    return bool(bare) and bool((overlaps(box_px, np.array(bare)) >= HALF).any())
+    return bool(bare) and bool((box_ious(box_px, np.array(bare)) >= HALF).any())

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from .measure import Measured
-    from .operating_point import Rates
+    from .measure import NetworkResults
+    from .operating_point import DetectionCounts
 
 # Suffix of a kind's name, and heading of its column.
 COLUMNS: Final = (
@@ -19,7 +19,7 @@ COLUMNS: Final = (
 )
 
 
-def measured_text(network: str, pictures: int, proposals: int, reached: Measured) -> str:
+def measured_text(network: str, pictures: int, proposals: int, reached: NetworkResults) -> str:
     """Format a table of average precision and one of precision and recall."""
     heads = " ".join(f"{head:>6}" for _, head in COLUMNS)
     lines = [
@@ -46,7 +46,7 @@ def _key(kind: str, name: str, column: str) -> str:
     return f"{kind} {name}".rstrip() + column
 
 
-def _rates_line(name: str, score: float, at: Rates) -> str:
+def _rates_line(name: str, score: float, at: DetectionCounts) -> str:
     precision, recall = _fraction(at.right, at.found), _fraction(at.right, at.signs)
     return f"{name:14} score from {score:<4}  precision {precision}  recall {recall}"
 
@@ -55,7 +55,7 @@ def _fraction(right: int, of: int) -> str:
     return f"{100.0 * right / of:5.1f} % ({right} of {of})" if of else "none (0 of 0)"
 
 
-def measured_tree(proposals: int, reached: Measured) -> dict[str, object]:
+def measured_tree(proposals: int, reached: NetworkResults) -> dict[str, object]:
     """Return the same results as a tree for JSON."""
     rates: Sequence[dict[str, object]] = [
         {"label": name, "score": score, "found": at.found, "right": at.right, "objects": at.signs}

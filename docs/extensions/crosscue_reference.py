@@ -198,10 +198,10 @@ def _schemas() -> dict[str, pa.Schema]:
     from crosscue.eval.runs.tables import measurements, pose_tables, skipped
 
     return {
-        **detect.schemas(),
-        **scene.schemas(gives_reasons=True),
+        **detect.detect_schemas(),
+        **scene.scene_schemas(gives_reasons=True),
         "pose": pose_tables.pose_schema(),
-        measurements.TABLE: measurements.schema(),
+        measurements.TABLE: measurements.measurement_schema(),
         "skipped": skipped.skipped_schema(),
     }
 

@@ -28,7 +28,7 @@ from typing import Final
 from crosscue.eval.runs.folder import MANIFEST
 from crosscue.replay.errors import LogError, UnknownFormatError, UsageError
 from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.identity import identity_of, identity_of_all
+from crosscue.replay.files.identity import identity_of_all, log_identity
 from crosscue.replay.files.log_identity import SHORT
 from crosscue.replay.formats import format_of, known_formats
 from crosscue.replay.limits import MIB
@@ -367,7 +367,7 @@ def _identity(logs: tuple[str, ...]) -> str:
     A log that cannot be read is identified by its path, so that its failure has a stable name.
     """
     try:
-        return identity_of_all([identity_of(log) for log in logs]).short
+        return identity_of_all([log_identity(log) for log in logs]).short
     except LogError:
         places = [log if is_remote(log) else str(Path(log).absolute()) for log in logs]
         text = "\0".join(places).encode(errors="surrogateescape")

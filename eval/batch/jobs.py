@@ -32,7 +32,7 @@ from crosscue.eval.runs.folder import (
 )
 from crosscue.replay.errors import CrosscueError, RunError, UsageError, one_line, without_secrets
 from crosscue.replay.files import door
-from crosscue.replay.files.identity import identity_of, identity_of_all
+from crosscue.replay.files.identity import identity_of_all, log_identity
 from crosscue.replay.files.log_identity import as_row
 from crosscue.replay.files.tree_text import spelled, strict_json
 from crosscue.replay.files.whole_file import write_text
@@ -45,7 +45,7 @@ from .journal import STALE_S, beating, error_of, read_entry, silent_s, write_ent
 MAX_LOCK_BYTES: Final = 4096
 
 
-class Result(Protocol):
+class JobResult(Protocol):
     """Result of processing a drive; it must be picklable."""
 
     @property
@@ -54,7 +54,7 @@ class Result(Protocol):
         ...
 
 
-R = TypeVar("R", bound=Result)
+R = TypeVar("R", bound=JobResult)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Done(Generic[R]):
+class JobOutcome(Generic[R]):
     """The outcome of a job.
 
     Attributes:
@@ -107,7 +107,7 @@ class Done(Generic[R]):
         return self.attempts == 0 and self.error is None
 
 
-Events: TypeAlias = Generator[Done[R] | None, None, None]
+Events: TypeAlias = Generator[JobOutcome[R] | None, None, None]
 
 
 class Engine(Protocol):
@@ -121,7 +121,7 @@ class Engine(Protocol):
         ...
 
 
-class State(StrEnum):
+class JobState(StrEnum):
     """Content of a job's run folder."""
 
     MISSING = "nothing there"
@@ -137,7 +137,7 @@ def run_many(
     *,
     overwrite: bool = False,
     doing: str = "replaying",
-) -> tuple[Done[R], ...]:
+) -> tuple[JobOutcome[R], ...]:
     """Process every drive that is not done yet, and report the progress about once a second.
 
     Args:
@@ -155,10 +155,10 @@ def run_many(
         UsageError: Two jobs have the same name or the same run folder.
     """
     _check_unique(jobs)
-    found: dict[str, Done[R]] = {}
+    found: dict[str, JobOutcome[R]] = {}
     missing: list[Job] = []
     for job in jobs:
-        earlier: Done[R] | None = _earlier(job, overwrite)
+        earlier: JobOutcome[R] | None = _earlier(job, overwrite)
         if earlier is None:
             missing.append(job)
         else:
@@ -209,7 +209,7 @@ def in_turn(jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
         yield attempt(work, job)
 
 
-def exit_status_of(results: Iterable[Done[R]]) -> int:
+def exit_status_of(results: Iterable[JobOutcome[R]]) -> int:
     """Return one exit status for many drives.
 
     0 when all are complete; 3 when rows were dropped or some drives failed; when all failed, their
@@ -231,7 +231,7 @@ def fingerprint_of(*settings: object) -> str:
     return hashlib.sha256(strict_json(settings).encode()).hexdigest()
 
 
-def attempt(work: Callable[[Job], R], job: Job) -> Done[R]:
+def attempt(work: Callable[[Job], R], job: Job) -> JobOutcome[R]:
     """Process one drive in this process and keep its journal; engines call this in workers."""
     began = time.monotonic()
     with losses_heard() as losses:
@@ -239,12 +239,12 @@ def attempt(work: Callable[[Job], R], job: Job) -> Done[R]:
     return replace(done, losses=tuple(losses), seconds=time.monotonic() - began)
 
 
-def _attempted(work: Callable[[Job], R], job: Job, losses: Sequence[str]) -> Done[R]:
+def _attempted(work: Callable[[Job], R], job: Job, losses: Sequence[str]) -> JobOutcome[R]:
     try:
         _check_free(job)
     except (CrosscueError, OSError) as error:
         # Another process works on the drive and owns its entry.
-        return Done(job, *reported_error(error))
+        return JobOutcome(job, *reported_error(error))
     inputs: dict[str, object] | None = None
     try:
         inputs = _inputs(job)
@@ -255,10 +255,10 @@ def _attempted(work: Callable[[Job], R], job: Job, losses: Sequence[str]) -> Don
         status = result.exit_status or (3 if losses else 0)
         write_entry(job.run, {"inputs": inputs, "manifest": manifest, "exit_status": status})
     except Exception as error:
-        failed: Done[R] = Done(job, *reported_error(error))
+        failed: JobOutcome[R] = JobOutcome(job, *reported_error(error))
         record_failure(failed, inputs, traceback.format_exc())
         return failed
-    return Done(job, status, None, result)
+    return JobOutcome(job, status, None, result)
 
 
 def _check_free(job: Job) -> None:
@@ -283,7 +283,7 @@ def _check_free(job: Job) -> None:
         lock.unlink()
 
 
-def record_failure(failed: Done[R], inputs: dict[str, object] | None, details: str) -> None:
+def record_failure(failed: JobOutcome[R], inputs: dict[str, object] | None, details: str) -> None:
     """Record a failure in the drive's journal entry and, if possible, in its run folder.
 
     Args:
@@ -323,7 +323,7 @@ def reported_error(error: Exception) -> tuple[int, str]:
     return 1, f"{text}; a bug in crosscue: replay this drive alone with -v and report it"
 
 
-def state_of(job: Job) -> State:
+def state_of(job: Job) -> JobState:
     """Return the state of the job's run folder.
 
     Raises:
@@ -331,24 +331,24 @@ def state_of(job: Job) -> State:
     """
     entry = read_entry(job.run)
     if not _holds_anything(job.run):
-        return State.MISSING
+        return JobState.MISSING
     if not job.run.joinpath(MANIFEST).exists():
-        return State.CUT_SHORT
+        return JobState.CUT_SHORT
     if entry is None:
-        return State.OTHER
+        return JobState.OTHER
     if "manifest" not in entry:
-        return State.CUT_SHORT
+        return JobState.CUT_SHORT
     is_same = (
         entry["inputs"] == _inputs(job)
         and entry["manifest"] == _manifest_hash(job)
         and isinstance(entry.get("exit_status"), int)
     )
-    return State.DONE if is_same else State.OTHER
+    return JobState.DONE if is_same else JobState.OTHER
 
 
 def is_done(job: Job) -> bool:
     """Return whether a complete run of the same, unchanged logs and settings exists."""
-    return state_of(job) is State.DONE
+    return state_of(job) is JobState.DONE
 
 
 def _check_unique(jobs: Sequence[Job]) -> None:
@@ -360,30 +360,30 @@ def _check_unique(jobs: Sequence[Job]) -> None:
             seen.add(of(job))
 
 
-def _earlier(job: Job, overwrite: bool) -> Done[R] | None:
+def _earlier(job: Job, overwrite: bool) -> JobOutcome[R] | None:
     """Return the outcome of an earlier start, or None if the job must be processed."""
     try:
         door.inside(job.run.parent, job.run.name)
         state = state_of(job)
-        if state is State.DONE:
+        if state is JobState.DONE:
             entry = read_entry(job.run)
-            return Done(job, 0 if entry is None else int(entry["exit_status"]), attempts=0)
-        if state is State.OTHER and not overwrite:
+            return JobOutcome(job, 0 if entry is None else int(entry["exit_status"]), attempts=0)
+        if state is JobState.OTHER and not overwrite:
             raise RunError(
                 f"{job.run}: holds a run of other logs, settings or versions; "
                 "give another folder or --overwrite"
             )
-        if state is not State.MISSING:
+        if state is not JobState.MISSING:
             refuse_files_of_user(job.run)
     except (CrosscueError, OSError) as error:
         status, line = reported_error(error)
-        return Done(job, status, line, attempts=0)
+        return JobOutcome(job, status, line, attempts=0)
     return None
 
 
 def _inputs(job: Job) -> dict[str, object]:
     """Return what determines the result: the identity of the logs and the settings."""
-    identity = identity_of_all([identity_of(log) for log in job.logs])
+    identity = identity_of_all([log_identity(log) for log in job.logs])
     return {"fingerprint": job.fingerprint, "identity": as_row(identity)}
 
 
@@ -396,7 +396,7 @@ def _holds_anything(folder: Path) -> bool:
     return folder.is_dir() and any(entry.name != FAILURE for entry in folder.iterdir())
 
 
-def worker_crashed(done: Done[R], attempts: int, how: str) -> Done[R]:
+def worker_crashed(done: JobOutcome[R], attempts: int, how: str) -> JobOutcome[R]:
     """Return the failure of a job whose worker died in every allowed attempt, and record it."""
     line = f"{done.job.name}: its worker {how}, {attempts} times; replay this drive alone"
     failed = replace(done, error=line, attempts=attempts)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from crosscue.eval.runs.account import summed
+from crosscue.eval.runs.account import sum_accounts
 from crosscue.eval.runs.folder import (
     MANIFEST,
     RunFolder,
@@ -177,7 +177,7 @@ def _manifest(
             for one in drives
         ),
         failures={spelled(name): why for name, why in sorted(failures.items())},
-        account=summed(one.manifest.account for one in drives),
+        account=sum_accounts(one.manifest.account for one in drives),
         notices=dict(Counter(text for one in drives for text in _notices(one)).most_common()),
         versions=_versions(drives),
     )

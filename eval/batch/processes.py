@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from crosscue.replay.processes import Worker, stop
 
-from .jobs import Done, Events, Job, R, attempt, reported_error, worker_crashed
+from .jobs import Events, Job, JobOutcome, R, attempt, reported_error, worker_crashed
 
 TICK_S: Final = 1.0
 THREAD_VARIABLES: Final = (
@@ -71,13 +71,13 @@ class Processes:
                 for worker in [one for one in busy if one.pipe in ready]:
                     busy.remove(worker)
                     done = worker.take()
-                    if isinstance(done, Done):
+                    if isinstance(done, JobOutcome):
                         idle.append(worker)
                         yield done
                     elif worker.number < self.attempts:
                         waiting.appendleft((worker.job, worker.number + 1))
                     else:
-                        yield worker_crashed(Done(worker.job, 1), worker.number, done)
+                        yield worker_crashed(JobOutcome(worker.job, 1), worker.number, done)
                 if not ready:
                     yield None
         finally:
@@ -105,14 +105,14 @@ class _Worker(Worker):
             # The process is already dead; ``take`` reports that.
             return
 
-    def take(self) -> Done[Any] | str:
+    def take(self) -> JobOutcome[Any] | str:
         """Return the job's outcome, or how the process died."""
         try:
             done = self.pipe.recv()
         except (EOFError, OSError):
             self.pipe.close()
             return self.end()
-        return replace(done, attempts=self.number) if isinstance(done, Done) else str(done)
+        return replace(done, attempts=self.number) if isinstance(done, JobOutcome) else str(done)
 
 
 def _serve(pipe: Connection, threads: int) -> None:
@@ -126,4 +126,4 @@ def _serve(pipe: Connection, threads: int) -> None:
         try:
             pipe.send(done)
         except (PicklingError, AttributeError, TypeError) as error:
-            pipe.send(Done(job, *reported_error(error)))
+            pipe.send(JobOutcome(job, *reported_error(error)))

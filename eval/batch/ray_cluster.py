@@ -25,7 +25,7 @@ STORE_BYTES: Final = 96 << 20
 
 
 @contextmanager
-def joined(address: str, workers: int | None = None) -> Iterator[Any]:
+def connect_ray(address: str, workers: int | None = None) -> Iterator[Any]:
     """Yield the module ``ray``, connected; disconnect at the end unless it was connected before.
 
     Args:

@@ -20,9 +20,9 @@ from typing import Any, Final
 from crosscue.eval.runs.folder import LOCK
 from crosscue.replay.processes import GRACE_S
 
-from .jobs import Done, Events, Job, R, attempt, reported_error, worker_crashed
+from .jobs import Events, Job, JobOutcome, R, attempt, reported_error, worker_crashed
 from .processes import THREAD_VARIABLES, TICK_S
-from .ray_cluster import GIB, LOCAL, check_fits, joined
+from .ray_cluster import GIB, LOCAL, check_fits, connect_ray
 
 # Memory of a drive with a camera and a neural network, on one core.
 MEMORY_BYTES: Final = 2 * GIB
@@ -53,7 +53,7 @@ class OnRay:
             UsageError: Ray is not installed.
             CrosscueError: The cluster cannot be reached or started.
         """
-        with joined(self.address, self.workers) as ray:
+        with connect_ray(self.address, self.workers) as ray:
             yield from self._on(ray, jobs, work)
 
     def _on(self, ray: Any, jobs: Sequence[Job], work: Callable[[Job], R]) -> Events[R]:
@@ -76,7 +76,7 @@ class OnRay:
                 for reference in ready:
                     job, number = running.pop(reference)
                     done = _result_of(ray, reference, job)
-                    if isinstance(done, Done):
+                    if isinstance(done, JobOutcome):
                         yield replace(done, attempts=number)
                     elif number < self.attempts:
                         # The dead worker may have been on another machine, whose processes are
@@ -84,7 +84,7 @@ class OnRay:
                         job.run.joinpath(LOCK).unlink(missing_ok=True)
                         waiting.appendleft((job, number + 1))
                     else:
-                        yield worker_crashed(Done(job, 1), number, done)
+                        yield worker_crashed(JobOutcome(job, 1), number, done)
                 if not ready:
                     yield None
         finally:
@@ -96,13 +96,15 @@ class OnRay:
         return found | ({"PYTHONPATH": os.pathsep.join(sys.path)} if self.address == LOCAL else {})
 
 
-def _result_of(ray: Any, reference: Any, job: Job) -> Done[Any] | str:
+def _result_of(ray: Any, reference: Any, job: Job) -> JobOutcome[Any] | str:
     """Return the outcome of a task, or how its worker died."""
     try:
-        done: Done[Any] = ray.get(reference)
+        done: JobOutcome[Any] = ray.get(reference)
     except ray.exceptions.RayTaskError as error:
         # ``attempt`` handles the drive's own errors; this is an error of Ray's transport.
-        return Done(job, *reported_error(RuntimeError(str(error.cause).strip().splitlines()[-1])))
+        return JobOutcome(
+            job, *reported_error(RuntimeError(str(error.cause).strip().splitlines()[-1]))
+        )
     except ray.exceptions.OutOfMemoryError:
         return "was killed by Ray, since its machine ran out of memory"
     except ray.exceptions.RayError as error:

@@ -238,7 +238,7 @@ def compare_runs(
     scores = [_metrics_of(run) for run in (first, second)]
     same = len(names) - len(tables)
     is_whole = is_whole_run(first) and is_whole_run(second)
-    parts = [parts_of(run) for run in (first, second)]
+    parts = [run_contributions(run) for run in (first, second)]
     before, after = parts
     if None in scores or before is None or after is None:
         bare = [
@@ -262,7 +262,7 @@ def allowed_by(path: str, before: float, tolerances: Sequence[Tolerance]) -> flo
     return next(fitting, NONE).allowed(before)
 
 
-def parts_of(run: RunFolder) -> list[DriveMetric] | None:
+def run_contributions(run: RunFolder) -> list[DriveMetric] | None:
     """Return each drive's contribution to the metrics; None if the run was not scored."""
     folder = run if _is_pooled(run.path) else RunFolder(run.file(FOLDER))
     if not folder.file(f"{BY_DRIVE}.parquet").exists():

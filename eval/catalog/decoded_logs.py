@@ -24,11 +24,11 @@ from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.log_summary import rows_declared, rows_read
-from crosscue.replay.logs.topic_part import columns_of
+from crosscue.replay.logs.topic_part import topic_columns
 from crosscue.replay.mobileye.can.admit import all_ids
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.ros.reader import RosMobileye
-from crosscue.replay.mobileye.samples import settings_of
+from crosscue.replay.mobileye.samples import mobileye_settings
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text
 from crosscue.replay.vehicle.roles import Role, role_of
@@ -75,7 +75,7 @@ class _Table:
         """Write the buffered rows."""
         if not self.held:
             return
-        columns = _labelled(columns_of(self.held), self.timeline, self.clock)
+        columns = _labelled(topic_columns(self.held), self.timeline, self.clock)
         if self.sink is None:
             sink = TableSink(self.run, self.name, _schema_of(columns))
             self.sink = self.stack.enter_context(sink)
@@ -185,7 +185,7 @@ def decode_tables(
                 for block in _decoded(TimedLog(log, clock), vehicle, ledger, selection):
                     if block.topic not in tables:
                         taken = {RESERVED, *(t.name.lower() for t in tables.values())}
-                        name = file_name(block.topic, taken)
+                        name = table_file(block.topic, taken)
                         tables[block.topic] = _Table(new, name, stack, timeline, clock)
                     tables[block.topic].add(block)
                     emit(Progress("decoding", sum(map(rows_read, ledgers)), declared, "rows"))
@@ -253,7 +253,9 @@ def _ros_mobileye(log: Log, vehicle: Vehicle, ledger: Ledger) -> RosMobileye | N
     types = {t.name: t.type_name for t in log.topics if role_of(t) is Role.MOBILEYE}
     if not types:
         return None
-    return RosMobileye("ros", types, ledger, settings_of(vehicle.mobileye, is_shared_bus=False))
+    return RosMobileye(
+        "ros", types, ledger, mobileye_settings(vehicle.mobileye, is_shared_bus=False)
+    )
 
 
 def _decoder(topic: Topic, ledger: Ledger) -> Decoder | None:
@@ -275,7 +277,7 @@ def _bus_decoders(
     decoders: list[_BlockDecoder] = []
     mobileyes: list[MobileyeDecoder] = []
     has_dbc = bool(vehicle.can.dbc) and vehicle.can.bus in (None, bus)
-    settings = settings_of(vehicle.mobileye, is_shared_bus=has_dbc)
+    settings = mobileye_settings(vehicle.mobileye, is_shared_bus=has_dbc)
     has_mobileye = vehicle.mobileye.bus == bus
     if has_dbc:
         from crosscue.replay.can.database import CanDatabase
@@ -292,7 +294,7 @@ def _bus_decoders(
     return decoders, mobileyes
 
 
-def file_name(topic: str, taken: Collection[str]) -> str:
+def table_file(topic: str, taken: Collection[str]) -> str:
     """Return a file name without folders for a topic, different from the names already taken."""
     plain = "".join(c if c.isascii() and (c.isalnum() or c in "-.") else "_" for c in topic)
     plain = plain.strip("_.")[:100] or "topic"

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 BY: Final[Mapping[str, str]] = {"commit": "crosscue_commit", "version": "crosscue"}
 
 
-class Queryable(Protocol):
+class RunCatalog(Protocol):
     """A catalog of runs."""
 
     def query(self, sql: str) -> pa.Table:
@@ -41,7 +41,7 @@ class Queryable(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class VersionPoint:
     """A metric under one version.
 
     Attributes:
@@ -70,7 +70,7 @@ class MetricHistory:
 
     path: str
     better: str
-    points: tuple[Point, ...]
+    points: tuple[VersionPoint, ...]
     changes: tuple[ChangePoint, ...]
 
     def is_better(self, change: ChangePoint) -> bool:
@@ -123,7 +123,7 @@ def _lines(found: History) -> Iterator[str]:
     )
 
 
-def history_of(catalog: Queryable, by: str, patterns: Sequence[str] = ()) -> History:
+def history_of(catalog: RunCatalog, by: str, patterns: Sequence[str] = ()) -> History:
     """Return the history of every judged metric.
 
     Args:
@@ -173,7 +173,7 @@ def limits() -> dict[str, object]:
     }
 
 
-def _runs(catalog: Queryable, by: str) -> list[dict[str, Any]]:
+def _runs(catalog: RunCatalog, by: str) -> list[dict[str, Any]]:
     column = BY.get(by, "tags['{}']".format(by.replace("'", "''")))
     # The name is quoted, and a query can only read the catalog's tables.
     sql = (
@@ -185,7 +185,7 @@ def _runs(catalog: Queryable, by: str) -> list[dict[str, Any]]:
 
 
 def _parts(
-    catalog: Queryable, place: Mapping[str, int], patterns: Sequence[str]
+    catalog: RunCatalog, place: Mapping[str, int], patterns: Sequence[str]
 ) -> dict[str, list[tuple[int, DriveMetric]]]:
     """Return each drive's contribution with the index of its version, by metric."""
     found: dict[str, list[tuple[int, DriveMetric]]] = {}
@@ -231,6 +231,6 @@ def _results(kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64]) 
     return Results(total if kind == "sum" else values, weights)
 
 
-def _point(kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64]) -> Point:
+def _point(kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64]) -> VersionPoint:
     value, half, drives = pooled(kind, total, rows)
-    return Point(value, value - half, value + half, drives)
+    return VersionPoint(value, value - half, value + half, drives)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 from crosscue.eval.scoring.by_drive import DriveMetric, no_longer_scored
 from crosscue.replay.errors import RunError, UnreadableRunError, UsageError
 
-from .compare import Comparison, Tolerance, allowed_by, is_whole_run, open_scored, parts_of
+from .compare import Comparison, Tolerance, allowed_by, is_whole_run, open_scored, run_contributions
 from .paired import compare_drives
 
 if TYPE_CHECKING:
@@ -53,10 +53,10 @@ def read_scored(path: Path | str) -> Scored:
         RunError: The folder is not a run, or is damaged.
     """
     run = open_scored(Path(path))
-    return parts_of(run), is_whole_run(run)
+    return run_contributions(run), is_whole_run(run)
 
 
-def scores_of(catalog: Queryable) -> Callable[[Path | str], Scored]:
+def score_reader(catalog: Queryable) -> Callable[[Path | str], Scored]:
     """Return a function from a run's name in a catalog, local or on a store, to its score."""
     outcomes = catalog.query("select run, outcome from runs").to_pydict()
     is_whole = {run: outcome == "whole" for run, outcome in zip(*outcomes.values(), strict=True)}

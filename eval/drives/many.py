@@ -9,7 +9,14 @@ from typing import Annotated, ClassVar
 
 from crosscue.eval.batch.drive_list import DriveInput, DriveList, drives_of
 from crosscue.eval.batch.engine import engine_of
-from crosscue.eval.batch.jobs import Done, Job, exit_status_of, fingerprint_of, planned, run_many
+from crosscue.eval.batch.jobs import (
+    Job,
+    JobOutcome,
+    exit_status_of,
+    fingerprint_of,
+    planned,
+    run_many,
+)
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
 from crosscue.eval.logs.log import UnopenedLog
 from crosscue.eval.pipeline.outcome import Outcome
@@ -39,7 +46,7 @@ class ReplayedDrives(Result):
         shard: Part of the drives, such as ``2/4 of 100 drives``; None for all drives.
     """
 
-    drives: tuple[Done[Outcome], ...] = field(metadata=HIDDEN)
+    drives: tuple[JobOutcome[Outcome], ...] = field(metadata=HIDDEN)
     merged: Path | None
     not_merged: str | None
     shard: str | None = None
@@ -291,7 +298,7 @@ def _several(drives: Sequence[Path | str] | Path | str) -> Sequence[Path | str]:
     return [drives] if isinstance(drives, Path | str) else drives
 
 
-def _merge(done: Sequence[Done[Outcome]], output: Path) -> None:
+def _merge(done: Sequence[JobOutcome[Outcome]], output: Path) -> None:
     """Merge the tables of all runs in the folder, including those of earlier batches."""
     runs, failures = gathered([output])
     ended = {one.job.name: one.error for one in done}

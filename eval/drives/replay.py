@@ -18,7 +18,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.verb import HIDDEN, Option, keywords
 
 if TYPE_CHECKING:
-    from crosscue.detectors.base import Choice
+    from crosscue.detectors.base import DetectorChoice
 
 
 def cache_file(*, cache: Path | None = None, no_cache: bool = False) -> Path | None:
@@ -287,7 +287,9 @@ def check_inputs(settings: ReplaySettings) -> None:
         LandmarkDatabase(Path(settings.landmarks)).close()
 
 
-def choices_for(vehicle: Vehicle, detectors: str | Sequence[object] | None) -> tuple[Choice, ...]:
+def choices_for(
+    vehicle: Vehicle, detectors: str | Sequence[object] | None
+) -> tuple[DetectorChoice, ...]:
     """Return the requested detectors, or else those of the vehicle file, which may be none.
 
     Raises:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from crosscue.eval.pipeline.run import Run, run_given
 from crosscue.eval.report.page import write_report
-from crosscue.eval.report.summary import headline, pose_summary, summary
+from crosscue.eval.report.summary import headline, pose_summary, scores_text
 from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.folder import locked, open_run
-from crosscue.eval.scoring.drives import Definition, Scores, ScoreSettings
+from crosscue.eval.scoring.drives import Definition, PooledScores, ScoreSettings
 from crosscue.eval.scoring.files import FOLDER, curve_table, write_scores
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.pose.score import load_truth
@@ -22,7 +22,7 @@ from crosscue.eval.scoring.runs import (
     find_truth,
     judge_run,
     metrics_of,
-    scores_of,
+    pooled_scores,
     smoothed_ranges,
 )
 from crosscue.replay.errors import CrosscueError, UsageError
@@ -100,7 +100,7 @@ class ScoreWork:
         truth_path = find_truth(folder, self.truth)
         with locked(folder):
             one = judge_run(folder, truth_path, self.settings, self.rpe_m, any_log=self.any_log)
-            scores = scores_of([one], self.settings)
+            scores = pooled_scores([one], self.settings)
             metrics = metrics_of([one], scores)
             smoothed = None
             if self.has_smoother:
@@ -122,7 +122,7 @@ class ScoreWork:
 def write_files(
     place: Path,
     ones: Sequence[RunScored],
-    scores: Scores,
+    scores: PooledScores,
     metrics: Mapping[str, Any],
     *,
     has_figures: bool,
@@ -176,7 +176,7 @@ class ScoredRun(Result):
         import pyarrow as pa
 
         rows = []
-        for name, cue in scores_of([self.scored.one]).cues.items():
+        for name, cue in pooled_scores([self.scored.one]).cues.items():
             row: dict[str, object] = {"cue": name}
             for what, fraction in (("precision", cue.precision), ("recall", cue.recall)):
                 row |= {
@@ -209,7 +209,7 @@ class ScoredRun(Result):
     def lines(self) -> Iterator[str]:
         """Yield the scores of cues, approaches and ranges, and of the pose."""
         one = self.scored.one
-        yield summary(scores_of([one]), one.why_no_pose)
+        yield scores_text(pooled_scores([one]), one.why_no_pose)
         if one.pose is not None:
             yield ""
             yield pose_summary(one.pose)

@@ -16,19 +16,19 @@ from crosscue.eval.report.summary import (
     pose_summary,
     poses_summary,
     reported_line,
-    summary,
+    scores_text,
 )
 from crosscue.eval.runs.account import account_lines
 from crosscue.eval.runs.folder import locked
-from crosscue.eval.scoring.drives import Definition, Scores, ScoreSettings
+from crosscue.eval.scoring.drives import Definition, PooledScores, ScoreSettings
 from crosscue.eval.scoring.files import FOLDER
 from crosscue.eval.scoring.gates import GateResult, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.pose.smoother import smoother_text
-from crosscue.eval.scoring.runs import RunScored, account_of_scores, metrics_of, scores_of
+from crosscue.eval.scoring.runs import RunScored, account_of_scores, metrics_of, pooled_scores
 from crosscue.eval.studies.attribution import (
+    AttributedDrive,
     Attribution,
-    Drive,
     attribute,
     attribution_lines,
     attribution_tree,
@@ -62,7 +62,7 @@ class ScoredRuns(Result):
     runs: tuple[ScoredRun, ...] = field(metadata=HIDDEN)
     failed: Mapping[Path, CrosscueError] = field(metadata=HIDDEN)
     metrics: Mapping[str, Any]
-    scores: Scores = field(metadata=HIDDEN)
+    scores: PooledScores = field(metadata=HIDDEN)
     gates: tuple[GateResult, ...] = field(metadata=HIDDEN)
     attribution: Mapping[str, Attribution] = field(metadata=HIDDEN)
     report: Path | None = field(metadata=HIDDEN)
@@ -157,7 +157,7 @@ def _account(found: ScoredRuns) -> list[str]:
 
 
 def _scores(found: ScoredRuns, why_no_pose: str) -> list[str]:
-    lines = [summary(found.scores, why_no_pose)]
+    lines = [scores_text(found.scores, why_no_pose)]
     if found.attribution:
         lines += ["", *attribution_lines(found.attribution)]
     return lines
@@ -324,7 +324,7 @@ def _one(
     """Return the scores of one run, with the attribution added to its files."""
     (run,) = runs
     one, metrics, report = run.scored.one, run.scored.metrics, run.report
-    scores = scores_of([one], settings)
+    scores = pooled_scores([one], settings)
     worth = _attribution([one], metrics, settings) if has_attribution else {}
     if worth:
         with locked(one.run):
@@ -344,7 +344,7 @@ def _pool(
 ) -> ScoredRuns:
     """Return the scores of all runs together, written to ``output`` if it is not None."""
     ones = [run.scored.one for run in runs]
-    scores = scores_of(ones, settings)
+    scores = pooled_scores(ones, settings)
     tree = metrics_of(ones, scores)
     tree["coverage"]["failed"] = {str(path): str(error) for path, error in failed.items()}
     worth = _attribution(ones, tree, settings) if has_attribution else {}
@@ -358,7 +358,7 @@ def _attribution(
     ones: Sequence[RunScored], tree: dict[str, Any], settings: ScoreSettings
 ) -> dict[str, Attribution]:
     """Return the effect of each cue on the scores, and add it to the metrics."""
-    drives = [Drive(one.judged, one.truth, estimate_of(one.run)) for one in ones]
+    drives = [AttributedDrive(one.judged, one.truth, estimate_of(one.run)) for one in ones]
     found = attribute(drives, settings=settings)
     tree["attribution"] = attribution_tree(found)
     return found

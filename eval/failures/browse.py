@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Final
 
 from crosscue.eval.failures.order import ranked
 from crosscue.eval.failures.record import Failure, read_failures
-from crosscue.eval.failures.site import MARKER, RunWork, by_run, entries_of, write_lists
+from crosscue.eval.failures.site import MARKER, RunWork, by_run, site_entries, write_lists
 from crosscue.eval.pipeline.run import moved_to, open_run
 from crosscue.eval.recording.view import save_recording
 from crosscue.eval.runs import owned
@@ -128,7 +128,7 @@ def browse(
     chosen, found = _given(runs, settings)
     if not chosen:
         raise EmptyResultError(f"{folder}: no failure to show; nothing was written")
-    entries = entries_of(chosen)
+    entries = site_entries(chosen)
     made = folder.with_name(f".{folder.name}.partial")
     try:
         shutil.rmtree(made, ignore_errors=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.report.svg_plot import Drawing, Panel
+from crosscue.eval.report.svg_plot import Panel, SvgChart
 
 from .record import Failure
 
@@ -30,14 +30,14 @@ NOT_FEATURES: Final = frozenset(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RunRows:
+class ChartTables:
     """Tables of a run's belief and cues for its charts; None where missing."""
 
     belief: pa.Table | None
     cues: pa.Table | None
 
 
-def belief_around(rows: RunRows, failure: Failure) -> Markup | None:
+def belief_around(rows: ChartTables, failure: Failure) -> Markup | None:
     """Draw the probabilities within 6 s of a failure; return None for a run without belief."""
     if rows.belief is None:
         return None
@@ -47,7 +47,7 @@ def belief_around(rows: RunRows, failure: Failure) -> Markup | None:
         return None
     lanes = _lanes(rows.cues, failure)
     panel = Panel(130, 30, WIDTH - 150, 150, (-AROUND_S, AROUND_S), (0.0, 1.0))
-    drawing = Drawing(
+    drawing = SvgChart(
         WIDTH,
         panel.bottom + 44 + 15.0 * len(lanes),
         f"Belief around {failure.at_s:g} s",

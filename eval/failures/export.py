@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.datasets.truth.annotations import Picture, Thing
+from crosscue.datasets.truth.annotations import Annotation, Picture
 from crosscue.detectors.images import Encoded, check, decode
 from crosscue.eval.runs.folder import RunFolder, open_run
-from crosscue.eval.runs.stored_images import camera_of, pictures_at
+from crosscue.eval.runs.stored_images import pictures_at, run_camera
 from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.replay.files.tree_text import spelled
 from crosscue.replay.files.whole_file import write_bytes
@@ -90,7 +90,7 @@ def export_run(
     }
     wanted = {label: known.get(label, "") for label in classes or known}
     found = ExportedRun(path.resolve().name, labels=wanted)
-    camera = camera_of(run)
+    camera = run_camera(run)
     if camera is None:
         found.left_out[NO_PICTURE] = len(times)
         return found
@@ -115,10 +115,10 @@ def export_run(
 
 def _things(
     run: RunFolder, times: frozenset[int], found: ExportedRun
-) -> Mapping[int, tuple[Thing, ...]]:
+) -> Mapping[int, tuple[Annotation, ...]]:
     """Return the detections above their detector's threshold, by time."""
     detected = run.drive_manifest().detected
-    things: dict[int, tuple[Thing, ...]] = {}
+    things: dict[int, tuple[Annotation, ...]] = {}
     for frame in stored_frames(run, detected.detectors) if detected is not None else ():
         seen = frame.seen
         if seen.t_ns not in times:
@@ -131,7 +131,7 @@ def _things(
                     continue
                 x0, y0, x1, y1 = _inside(box.tolist(), frame.size_px)
                 if x0 < x1 and y0 < y1:
-                    kept.append(Thing(label, (x0, y0, x1, y1), score=round(float(score), 4)))
+                    kept.append(Annotation(label, (x0, y0, x1, y1), score=round(float(score), 4)))
         things[seen.t_ns] = tuple(kept)
     return things
 

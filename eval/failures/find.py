@@ -10,7 +10,7 @@ import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.moments import seconds_into, span_ns
-from crosscue.eval.scoring.runs import SceneJudged, tables_of
+from crosscue.eval.scoring.runs import SceneJudged, read_run_tables
 from crosscue.replay.vehicle.vehicle import CUES
 
 from .approach_level import flips_without_truth, of_approaches
@@ -45,7 +45,7 @@ def failures_without_truth(run: RunFolder, threshold: float) -> tuple[Failure, .
     Raises:
         RunError: A table is missing or damaged.
     """
-    tables = tables_of(run)
+    tables = read_run_tables(run)
     if tables.belief is None:
         return ()
     positives = {}

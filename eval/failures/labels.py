@@ -12,8 +12,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal
 
-from crosscue.datasets.labels.table import LABEL_FORMATS, read_labels
-from crosscue.datasets.truth.annotations import Annotations, Picture, meanings
+from crosscue.datasets.labels.table import LABEL_FORMATS, read_tool_labels
+from crosscue.datasets.truth.annotations import Annotations, Picture, cues_by_label
 from crosscue.datasets.truth.coco import WRITTEN, write_coco
 from crosscue.eval.failures.export import ExportedRun, export_run
 from crosscue.eval.failures.record import Failure, read_failures
@@ -261,7 +261,7 @@ def import_labels(
         Path(name).stem: (name, row) for one in drives for name, row in one["pictures"].items()
     }
     sizes = {stem: (row["width"], row["height"]) for stem, (_, row) in known.items()}
-    read = read_labels(source, sizes, kind)
+    read = read_tool_labels(source, sizes, kind)
     placed = tuple(_placed(one, known, read.where) for one in read.pictures)
     for name, count in Counter(one.name for one in placed).items():
         if count > 1:
@@ -269,7 +269,7 @@ def import_labels(
     settings = vehicle_given(vehicle)
     exported_as = {label: cue for one in drives for label, cue in one["labels"].items()}
     meant = {label: cue for label, cue in exported_as.items() if label in read.labels}
-    cues = meanings(read, meant | dict(labels), tuple(settings.cues.own), any_thing=True)
+    cues = cues_by_label(read, meant | dict(labels), tuple(settings.cues.own), any_thing=True)
     wanted = {name for one in drives for name in one["pictures"]}
     there = {one["drive"]: target / one["drive"] / FILE for one in drives}
     for path in (target / "coco.json", target / WRITTEN, *there.values()):

@@ -15,7 +15,7 @@ from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.images import Encoded
 from crosscue.detectors.overlay import draw_frame
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.stored_images import camera_of, pictures_at
+from crosscue.eval.runs.stored_images import pictures_at, run_camera
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
 from crosscue.replay.errors import CrosscueError
 
@@ -41,7 +41,7 @@ def draw_pictures(run: RunFolder, times: Iterable[int], keep: Keep) -> str:
     """
     wanted = frozenset(times)
     try:
-        camera = camera_of(run)
+        camera = run_camera(run)
         if camera is None:
             return "the run has no camera, or several"
         found = _found(run, wanted)

@@ -24,7 +24,7 @@ from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.replay.files.whole_file import write_bytes, write_text
 from crosscue.replay.limits import Limits
 
-from .chart import RunRows, belief_around
+from .chart import ChartTables, belief_around
 from .pictures import draw_pictures
 from .record import Failure, distance_bin
 
@@ -117,7 +117,7 @@ class RunWork:
         return frozenset(written), why
 
 
-def entries_of(failures: Sequence[Failure]) -> tuple[Entry, ...]:
+def site_entries(failures: Sequence[Failure]) -> tuple[Entry, ...]:
     """Return failures with their ranks and picture names; failures of one frame share a picture."""
     runs = {run: number for number, run in enumerate(dict.fromkeys(f.run for f in failures), 1)}
     return tuple(
@@ -214,11 +214,11 @@ def _rows_json(entries: Sequence[Entry], pictures: frozenset[str]) -> str:
     return json.dumps(rows, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
-def _rows(run: RunFolder) -> RunRows:
+def _rows(run: RunFolder) -> ChartTables:
     def table(name: str) -> pa.Table | None:
         return run.table(name).sort_by("t_ns") if run.file(f"{name}.parquet").exists() else None
 
-    return RunRows(table("belief"), table("cues"))
+    return ChartTables(table("belief"), table("cues"))
 
 
 def _number(value: float | None, digits: int = 1) -> str:

@@ -94,7 +94,7 @@ def graph_of_runs(runs: Sequence[RunFolder]) -> tuple[FactorGraph, Vehicle]:
     return graphs[0], vehicles[0]
 
 
-def annotate(run: RunFolder, truth: Truth, vehicle: Vehicle, into: AnnotatedRuns) -> None:
+def add_approaches(run: RunFolder, truth: Truth, vehicle: Vehicle, into: AnnotatedRuns) -> None:
     """Add the approaches of one run.
 
     Raises:

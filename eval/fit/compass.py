@@ -24,7 +24,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option
 
-from .log_signals import plan_of, read_signals
+from .log_signals import read_signals, signal_plan
 from .vehicle_output import check_output, write_fit
 
 
@@ -56,7 +56,7 @@ class FittedCompass(Result):
     @property
     def section(self) -> dict[str, object]:
         """The vehicle file's section ``[compass]``."""
-        return section_of(self.fitted)
+        return compass_section(self.fitted)
 
     @property
     def not_observable(self) -> dict[str, str]:
@@ -119,12 +119,12 @@ def fit_compass(
     check_output(vehicle, output, overwrite=overwrite)
     settings = vehicle_given(vehicle)
     with opened(log) as drive:
-        fitted = fit(drive.logs, settings, drive.selection)
-    path = write_fit(vehicle, output, lambda text: with_section(text, fitted))
+        fitted = fit_log_compass(drive.logs, settings, drive.selection)
+    path = write_fit(vehicle, output, lambda text: with_compass(text, fitted))
     return FittedCompass(fitted, path)
 
 
-def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassFit:
+def fit_log_compass(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassFit:
     """Fit hard iron, soft iron and mounting, where the drive determines them.
 
     Raises:
@@ -134,7 +134,7 @@ def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassF
     if vehicle.compass.use is None:
         section = vehicle.compass.model_copy(update={"use": True})
         vehicle = vehicle.model_copy(update={"compass": section})
-    planned = plan_of(logs, vehicle)
+    planned = signal_plan(logs, vehicle)
     magnetometer = planned.source_of(Signal.MAGNETIC_FIELD)
     if magnetometer is None:
         raise EmptyResultError(f"no magnetometer: {planned.missing[Signal.MAGNETIC_FIELD]}")
@@ -149,7 +149,7 @@ def fit(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassF
     return fit_readings(readings.t_ns, readings.values, reference, compass_settings(vehicle))
 
 
-def section_of(fitted: CompassFit) -> dict[str, object]:
+def compass_section(fitted: CompassFit) -> dict[str, object]:
     """Return the fit as a vehicle file's [compass] section."""
     compass = fitted.settings
     section: dict[str, object] = {
@@ -166,10 +166,10 @@ def section_of(fitted: CompassFit) -> dict[str, object]:
     return section
 
 
-def with_section(text: str, fitted: CompassFit) -> str:
+def with_compass(text: str, fitted: CompassFit) -> str:
     """Return a vehicle file's text with its [compass] values replaced and comments kept."""
     document = toml_document(text)
     section = document.setdefault("compass", tomlkit.table())
-    for key, value in section_of(fitted).items():
+    for key, value in compass_section(fitted).items():
         section[key] = value
     return tomlkit.dumps(document)

@@ -22,8 +22,8 @@ from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.vehicle.pose import GnssUse, Start
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .log_signals import plan_of, read_signals
-from .reference import GeodeticOrigin, Reference, of_gnss, of_truth
+from .log_signals import read_signals, signal_plan
+from .reference import GeodeticOrigin, ReferencePositions, of_gnss, of_truth
 from .turns import turn_samples, wheel_speeds
 
 # Time read from the start of a drive, seconds; receivers and buses start at different times.
@@ -143,7 +143,7 @@ def _aligned(
     logs: Sequence[Log], vehicle: Vehicle, selection: Selection, truth: Path | None
 ) -> dict[str, object] | None:
     """Return the pose that aligns the first seconds' odometry with known positions, or None."""
-    planned = plan_of(logs, vehicle)
+    planned = signal_plan(logs, vehicle)
     gnss = planned.source_of(Signal.POSITION)
     wheels = planned.source_of(Signal.WHEEL_SPEEDS)
     if wheels is None or (truth is None and gnss is None):
@@ -179,7 +179,9 @@ def _aligned(
     return _first(drive, vehicle, reference)
 
 
-def _first(drive: KnownDrive, vehicle: Vehicle, reference: Reference) -> dict[str, object] | None:
+def _first(
+    drive: KnownDrive, vehicle: Vehicle, reference: ReferencePositions
+) -> dict[str, object] | None:
     """Return the pose at the first wheel speeds, where a run begins."""
     if len(drive.fixes) < 2:
         return None

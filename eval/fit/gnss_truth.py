@@ -21,7 +21,7 @@ from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.vehicle.pose import Gnss
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 
-from .log_signals import plan_of, read_signals
+from .log_signals import read_signals, signal_plan
 
 POSE_FILE: Final = "gnss.tum"
 # Max time for which a stationary vehicle keeps its last heading, seconds.
@@ -67,7 +67,7 @@ def write_gnss_truth(
         EmptyResultError: No GNSS position exists, or none has a heading.
         OutputError: A file cannot be written.
     """
-    planned = plan_of(logs, vehicle)
+    planned = signal_plan(logs, vehicle)
     source = planned.source_of(Signal.POSITION)
     if source is None:
         raise EmptyResultError(f"no GNSS in the log: {planned.missing[Signal.POSITION]}")

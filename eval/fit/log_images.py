@@ -18,7 +18,7 @@ from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.logs.opening import open_log, unless_damaged
 from crosscue.replay.readers.images.folder import picture_names
 from crosscue.replay.signals.extractor import pictures_of
-from crosscue.replay.signals.plan import camera_of
+from crosscue.replay.signals.plan import chosen_camera
 from crosscue.replay.time.stamp_watch import StampWatch
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -35,7 +35,7 @@ def log_pictures(path: Path, vehicle: Vehicle, limits: Limits = DEFAULT_LIMITS) 
         VehicleError: The log has no camera, or several.
     """
     with open_log(path, limits) as log, unless_damaged([log]):
-        camera = camera_of([(0, topic) for topic in log.topics], vehicle)
+        camera = chosen_camera([(0, topic) for topic in log.topics], vehicle)
         if camera is None:
             raise MissingTopicError(f"{path}: no camera in the log; annotations need its pictures")
         topic = camera[1]

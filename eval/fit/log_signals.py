@@ -8,14 +8,14 @@ import numpy as np
 
 from crosscue.replay.base import Log, Selection, name_of
 from crosscue.replay.ledger import Ledger, warn_of
-from crosscue.replay.signals.extractor import Extractor, probe_clocks
-from crosscue.replay.signals.kinds import Plan, Samples, Signal
+from crosscue.replay.signals.extractor import SampleExtractor, probe_clocks
+from crosscue.replay.signals.kinds import Samples, Signal, SignalPlan
 from crosscue.replay.signals.plan import plan
 from crosscue.replay.signals.windows import windows
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 
-def plan_of(logs: Sequence[Log], vehicle: Vehicle) -> Plan:
+def signal_plan(logs: Sequence[Log], vehicle: Vehicle) -> SignalPlan:
     """Return the plan that assigns topics of a drive's logs to signals.
 
     Raises:
@@ -26,7 +26,7 @@ def plan_of(logs: Sequence[Log], vehicle: Vehicle) -> Plan:
 
 def read_signals(
     logs: Sequence[Log],
-    planned: Plan,
+    planned: SignalPlan,
     vehicle: Vehicle,
     selection: Selection,
     wanted: Collection[Signal],
@@ -41,7 +41,7 @@ def read_signals(
     topics = frozenset(source.topic.name for source in sources)
     narrowed = Selection(topics, selection.start_ns, selection.end_ns)
     extractors = [
-        Extractor(
+        SampleExtractor(
             planned,
             vehicle,
             i,

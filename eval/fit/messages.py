@@ -11,8 +11,13 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from crosscue.datasets.truth.truth import load
-from crosscue.eval.fit.annotated_runs import AnnotatedRuns, annotate, check_arguments, graph_of_runs
+from crosscue.datasets.truth.truth import read_truth
+from crosscue.eval.fit.annotated_runs import (
+    AnnotatedRuns,
+    add_approaches,
+    check_arguments,
+    graph_of_runs,
+)
 from crosscue.eval.pipeline.run import Run, run_given
 from crosscue.eval.scoring.intervals import TOO_FEW, Interval, mean_by_cluster, wilson
 from crosscue.fusion.fit.fade_fit import FadeFit
@@ -244,7 +249,7 @@ def fit_messages(
     graph, vehicle = graph_of_runs(folders)
     found = AnnotatedRuns([], Counter())
     for done, (folder, known) in enumerate(zip(folders, truth, strict=True), 1):
-        annotate(folder, load(Path(known)), vehicle, found)
+        add_approaches(folder, read_truth(Path(known)), vehicle, found)
         emit(Progress("reading", done, len(folders), "runs"))
     if not found.approaches:
         raise EmptyResultError(

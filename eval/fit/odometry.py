@@ -30,8 +30,8 @@ from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option
 
-from .log_signals import plan_of, read_signals
-from .reference import Reference, of_gnss, of_truth
+from .log_signals import read_signals, signal_plan
+from .reference import ReferencePositions, of_gnss, of_truth
 from .turns import turn_samples, wheel_speeds
 from .vehicle_output import check_output, write_fit
 
@@ -57,7 +57,7 @@ OF_ONE_TURN: Final = {
 
 
 @dataclass(frozen=True, slots=True)
-class Errors:
+class OdometryErrors:
     """Errors of odometry alone against known positions, from the fitted start.
 
     Attributes:
@@ -94,8 +94,8 @@ class SourceFit:
     """
 
     fit: OdometryFit
-    before: Errors
-    after: Errors
+    before: OdometryErrors
+    after: OdometryErrors
     camera_yaw_rad: float | None = None
     camera_yaw_sd_rad: float = math.nan
 
@@ -157,7 +157,7 @@ class FittedOdometry(Result):
     @property
     def section(self) -> dict[str, object]:
         """The vehicle file's section ``[odometry]``."""
-        return section_of(self.fitted)
+        return odometry_section(self.fitted)
 
     @property
     def camera_yaw_rad(self) -> float | None:
@@ -267,13 +267,16 @@ def fit_odometry(
     settings = vehicle_given(vehicle)
     known = None if truth is None else of_truth(Path(truth), settings)
     with opened(log) as drive:
-        found = fit(drive.logs, settings, drive.selection, known)
-    path = write_fit(vehicle, output, lambda text: with_section(text, found))
+        found = fit_log_odometry(drive.logs, settings, drive.selection, known)
+    path = write_fit(vehicle, output, lambda text: with_odometry(text, found))
     return FittedOdometry(found, path)
 
 
-def fit(
-    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, known: Reference | None = None
+def fit_log_odometry(
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    selection: Selection,
+    known: ReferencePositions | None = None,
 ) -> DriveFit:
     """Fit to the first half of the drive and test on the second.
 
@@ -287,7 +290,7 @@ def fit(
         EmptyResultError: The drive has no wheel speeds, or no positions.
         VehicleError: The drive is too short.
     """
-    planned = plan_of(logs, vehicle)
+    planned = signal_plan(logs, vehicle)
     gnss = planned.source_of(Signal.POSITION)
     if known is None and gnss is None:
         raise EmptyResultError(
@@ -340,7 +343,7 @@ def fit(
     )
 
 
-def _gnss_track(samples: Samples | None, topic: str | None, vehicle: Vehicle) -> Reference:
+def _gnss_track(samples: Samples | None, topic: str | None, vehicle: Vehicle) -> ReferencePositions:
     if samples is None or topic is None:
         raise EmptyResultError(f"{topic}: not one GNSS position in this part of the log")
     return of_gnss(topic, samples, vehicle)
@@ -355,7 +358,7 @@ def _middle_ns(drive: KnownDrive) -> int:
     return (int(t_ns[0]) + int(t_ns[-1])) // 2
 
 
-def _fitted(drive: KnownDrive, given: OdometrySettings, reference: Reference) -> SourceFit:
+def _fitted(drive: KnownDrive, given: OdometrySettings, reference: ReferencePositions) -> SourceFit:
     whole_s = float(drive.seconds[-1]) if len(drive.seconds) else None
     half = drive.until(_middle_ns(drive)) if len(drive.fixes) else drive
     fit = fit_parameters(half, given, whole_s)
@@ -366,7 +369,7 @@ def _fitted(drive: KnownDrive, given: OdometrySettings, reference: Reference) ->
     return SourceFit(fit, before, after, yaw_rad, sd_rad)
 
 
-def _errors(drive: KnownDrive, settings: OdometrySettings, fit: OdometryFit) -> Errors:
+def _errors(drive: KnownDrive, settings: OdometrySettings, fit: OdometryFit) -> OdometryErrors:
     steps = drive.steps(settings, delay_s=fit.value(FIX_DELAY))
     found = drive.follow(fit.start, steps)
     fixes = drive.fixes
@@ -374,7 +377,7 @@ def _errors(drive: KnownDrive, settings: OdometrySettings, fit: OdometryFit) -> 
     cov = np.tile(np.eye(2) * fit.fix_sd_m**2, (len(fixes), 1, 1))
     nees = np.sum(whitened(found, fixes.xy_m, cov)[0] ** 2, axis=1)
     first = fixes.t_ns < _middle_ns(drive)
-    return Errors(
+    return OdometryErrors(
         fitted_m=_rms(apart[first]),
         held_out_m=_rms(apart[~first]),
         all_m=_rms(apart),
@@ -389,7 +392,7 @@ def _rms(values: Floats) -> float:
     return math.sqrt(float(np.mean(values**2)))
 
 
-def _yaw(half: KnownDrive, fit: OdometryFit, reference: Reference) -> tuple[float, float]:
+def _yaw(half: KnownDrive, fit: OdometryFit, reference: ReferencePositions) -> tuple[float, float]:
     """Return the mean yaw of the reference relative to the vehicle in the fitted half, and s.d."""
     assert reference.heading_rad is not None
     fixes = half.fixes
@@ -413,7 +416,7 @@ def _together(given: OdometrySettings, sources: Sequence[SourceFit]) -> Odometry
     return replace(given, **values)
 
 
-def section_of(found: DriveFit) -> dict[str, object]:
+def odometry_section(found: DriveFit) -> dict[str, object]:
     """Return the fit as a vehicle file's [odometry] section, with its provenance."""
     names = [*SHARED, *(name for one in found.sources for name in OF_ONE_TURN[one.fit.source])]
     values = {
@@ -456,11 +459,11 @@ def camera_yaw_of(found: DriveFit) -> float | None:
     return None if yaw_rad is None or not found.is_of_camera else round(yaw_rad, 5)
 
 
-def with_section(text: str, found: DriveFit) -> str:
+def with_odometry(text: str, found: DriveFit) -> str:
     """Return a vehicle file's text with its [odometry] values replaced and comments kept."""
     document = toml_document(text)
     section = document.setdefault("odometry", tomlkit.table())
-    for key, value in section_of(found).items():
+    for key, value in odometry_section(found).items():
         section[key] = value
     if (yaw_rad := camera_yaw_of(found)) is not None:
         document.setdefault("camera", tomlkit.table())["yaw_rad"] = yaw_rad

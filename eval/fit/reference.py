@@ -10,7 +10,7 @@ import numpy as np
 
 from crosscue.datasets.geodesy import geodetic_to_enu
 from crosscue.datasets.truth.tum import heading_rad
-from crosscue.eval.scoring.pose.score import load_truth, mounting_of
+from crosscue.eval.scoring.pose.score import load_truth, track_mounting
 from crosscue.localization.fixes import Fixes
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import EmptyResultError
@@ -26,7 +26,7 @@ TRUTH_SD_M: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reference:
+class ReferencePositions:
     """Positions of a point of the vehicle, in a plane local frame.
 
     Attributes:
@@ -48,7 +48,7 @@ class Reference:
     origin: GeodeticOrigin | None = None
 
 
-def of_gnss(name: str, samples: Samples, vehicle: Vehicle) -> Reference:
+def of_gnss(name: str, samples: Samples, vehicle: Vehicle) -> ReferencePositions:
     """Return the receiver's positions in a frame centred on the first one.
 
     Args:
@@ -65,10 +65,10 @@ def of_gnss(name: str, samples: Samples, vehicle: Vehicle) -> Reference:
     rows = spaced(t_ns)
     var = np.where(np.isfinite(sd), sd, gnss.position_sd_m)[rows] ** 2
     fixes = Fixes(t_ns[rows], xyz[rows, :2], var[:, None, None] * np.eye(2))
-    return Reference(f"GNSS ({name})", fixes, (gnss.x_m, gnss.y_m), origin=origin)
+    return ReferencePositions(f"GNSS ({name})", fixes, (gnss.x_m, gnss.y_m), origin=origin)
 
 
-def of_truth(path: Path, vehicle: Vehicle, spacing_ns: int = SPACING_NS) -> Reference:
+def of_truth(path: Path, vehicle: Vehicle, spacing_ns: int = SPACING_NS) -> ReferencePositions:
     """Return the track of a truth file.
 
     Args:
@@ -87,9 +87,9 @@ def of_truth(path: Path, vehicle: Vehicle, spacing_ns: int = SPACING_NS) -> Refe
     cov = np.tile(var * np.eye(2), (len(rows), 1, 1))
     fixes = Fixes(track.t_ns[rows], track.xyz_m[rows, :2], cov)
     is_of_camera = truth.pose_point == "camera"
-    mounting = mounting_of(truth, vehicle)
+    mounting = track_mounting(truth, vehicle)
     lever_m = (mounting.x_m, mounting.y_m)
-    return Reference(
+    return ReferencePositions(
         truth.source or path.name,
         fixes,
         lever_m,

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 
 from crosscue.eval.fit.annotated_runs import annotated_drives, check_arguments, graph_of_runs
 from crosscue.eval.pipeline.run import Run, run_given
-from crosscue.eval.scoring.truth import load
+from crosscue.eval.scoring.truth import read_scored_truth
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit
 from crosscue.fusion.fit.temporal_fit import fit_temporal as fit_drives
 from crosscue.replay.errors import EmptyResultError
@@ -141,7 +141,9 @@ def fit_temporal(
     graph, vehicle = graph_of_runs(folders)
     drives: list[AnnotatedDrive] = []
     for done, (folder, known) in enumerate(zip(folders, truth, strict=True), 1):
-        drives += annotated_drives(folder, load(Path(known), str(folder.path)), vehicle)
+        drives += annotated_drives(
+            folder, read_scored_truth(Path(known), str(folder.path)), vehicle
+        )
         emit(Progress("reading", done, len(folders), "runs"))
     try:
         fitted = fit_drives(drives, graph)

@@ -10,17 +10,17 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from crosscue.datasets.labels.table import read_labels
+from crosscue.datasets.labels.table import read_tool_labels
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.annotations import (
     Annotations,
     LogPictures,
-    Placed,
+    PictureTimes,
     check_boxes,
     coco_tree,
     cue_truths,
-    meanings,
-    place,
+    cues_by_label,
+    match_frames,
 )
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.objects import OBJECTS_FILE
@@ -146,7 +146,7 @@ def check_truth(
         LogError: The log or the track cannot be read.
     """
     path, log_path, settings = Path(truth), Path(log), vehicle_given(vehicle)
-    drive = score_truth.load(path, str(log_path))
+    drive = score_truth.read_scored_truth(path, str(log_path))
     known = drive.truth
     folder = path if path.is_dir() else path.parent
     has_hash = bool(known.log_sha256)
@@ -230,8 +230,8 @@ def _check_overlap(what: str, t_ns: np.typing.NDArray[np.int64], truth: Truth, p
 
 def _check_objects(path: Path, pictures: LogPictures, own_cues: Sequence[str]) -> int:
     annotations = read_coco(path)
-    meanings(annotations, {}, own_cues, any_thing=True)
-    place(annotations, pictures)
+    cues_by_label(annotations, {}, own_cues, any_thing=True)
+    match_frames(annotations, pictures)
     check_boxes(annotations)
     return sum(len(picture.things) for picture in annotations.pictures)
 
@@ -273,8 +273,8 @@ def import_truth(
         raise OutputError(f"{target}: exists; --add to it, --overwrite it, or give another name")
     settings = vehicle_given(vehicle)
     pictures = log_pictures(log_path, settings, limits)
-    read = read_labels(source, {"*": pictures.size_px}, kind)
-    cues = meanings(read, labels, tuple(settings.cues.own))
+    read = read_tool_labels(source, {"*": pictures.size_px}, kind)
+    cues = cues_by_label(read, labels, tuple(settings.cues.own))
     return write_imported(read, cues, pictures, log_path, target, add=add)
 
 
@@ -332,10 +332,10 @@ def write_imported(
         OutputError: The files cannot be written.
     """
     check_boxes(annotations)
-    placed = place(annotations, pictures)
+    placed = match_frames(annotations, pictures)
     truth = _truth(annotations, placed, cues, pictures, log_path, Path(annotations.where))
     if add:
-        before = truth_file.load(output)
+        before = truth_file.read_truth(output)
         kept = {
             "start_ns": min(before.start_ns, truth.start_ns),
             "end_ns": max(before.end_ns, truth.end_ns),
@@ -364,7 +364,7 @@ def write_imported(
 
 def _truth(
     annotations: Annotations,
-    placed: Placed,
+    placed: PictureTimes,
     cues: Mapping[str, str | None],
     pictures: LogPictures,
     log_path: Path,

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from crosscue.localization.odometry import TurnKind, TurnSignal, WheelSpeeds
+from crosscue.localization.odometry import TurnKind, TurnSignal, WheelSamples
 from crosscue.replay.signals.kinds import Samples, Signal
 
 
-def wheel_speeds(samples: Samples) -> WheelSpeeds:
+def wheel_speeds(samples: Samples) -> WheelSamples:
     """Return the speeds of all four wheels, or of the rear two if the front ones are unknown."""
     speeds = samples.values
     has_front = not np.isnan(speeds[:, :2]).all()
-    return WheelSpeeds(samples.t_ns, speeds if has_front else speeds[:, 2:])
+    return WheelSamples(samples.t_ns, speeds if has_front else speeds[:, 2:])
 
 
 def turn_samples(signal: Signal | None, found: Mapping[Signal, Samples]) -> TurnSignal | None:

@@ -73,7 +73,7 @@ def compare_many(
         if not (isinstance(runs, str) and isinstance(against, str)):
             raise UsageError(f"{folder}: runs on a store; expected two queries")
         there = (found.named(against), found.named(runs))
-        judged = many_runs.compare_many(*there, allowed, many_runs.scores_of(found))
+        judged = many_runs.compare_many(*there, allowed, many_runs.score_reader(found))
     else:
         here = (_selected(against, folder), _selected(runs, folder))
         judged = many_runs.compare_many(*here, allowed)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from crosscue.eval.catalog.history import History, MetricHistory, history_of, limits
 from crosscue.eval.catalog.query.catalog import catalog
-from crosscue.eval.report.history_page import Chart, Mark, write_history_page
+from crosscue.eval.report.history_page import ChangeMark, Chart, write_history_page
 from crosscue.replay.errors import OutputError
 from crosscue.verb import Option
 
@@ -73,7 +73,7 @@ def _chart(one: MetricHistory) -> Chart:
         [point.high for point in points],
         [point.drives for point in points],
         [
-            Mark(
+            ChangeMark(
                 change.at,
                 "better" if one.is_better(change) else "worse",
                 points[change.at - 1].value,

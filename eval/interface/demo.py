@@ -104,13 +104,13 @@ def fetch_drive(
     """
     from crosscue.datasets.real import recordings
     from crosscue.detectors.catalog.entries import entry
-    from crosscue.detectors.catalog.fetch import fetch
+    from crosscue.detectors.catalog.fetch import fetch_weights
 
     known, card = recordings.recording(REAL), entry(MODEL)
     given = None if source is None else Path(source)
     try:
-        log = recordings.fetch(known, given, on_fetch)
-        fetch(MODEL, None if given is None else _below(given, card.weights), on_fetch)
+        log = recordings.fetch_recording(known, given, on_fetch)
+        fetch_weights(MODEL, None if given is None else _below(given, card.weights), on_fetch)
     except UsageError:
         raise
     except CrosscueError as error:

@@ -23,10 +23,10 @@ from crosscue.replay.errors import LossWarning, MissingTopicError, SchemaError, 
 from crosscue.replay.files.closing import Closing
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger, TopicAccount, warn_of
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits, LimitsGiven
-from crosscue.replay.logs.log_part import LogPart, part_of
+from crosscue.replay.logs.log_part import LogPart, select_part
 from crosscue.replay.logs.opening import open_log as open_one
 from crosscue.replay.logs.opening import unless_damaged
-from crosscue.replay.logs.topic_part import columns_of
+from crosscue.replay.logs.topic_part import topic_columns
 from crosscue.results import listing
 from crosscue.verb import Option
 
@@ -147,7 +147,7 @@ class Log(Closing):
             MissingTopicError: The drive has no such topic.
         """
         with unless_damaged(self.logs):
-            return replace(self, selection=part_of(self.logs, start_s, end_s, topics))
+            return replace(self, selection=select_part(self.logs, start_s, end_s, topics))
 
     def signals(
         self, *databases: Path | str, bus: str | None = None, messages: Sequence[str] | None = None
@@ -360,7 +360,7 @@ class LogTopic:
                 yield CameraFrame(t_ns, self.name, content, picture.coding, picture.layout)
 
     def _selected(self, start_s: float | None, end_s: float | None) -> Selection:
-        of_log, wanted = self.log.selection, part_of(self.log.logs, start_s, end_s)
+        of_log, wanted = self.log.selection, select_part(self.log.logs, start_s, end_s)
         starts = [ns for ns in (of_log.start_ns, wanted.start_ns) if ns is not None]
         ends = [ns for ns in (of_log.end_ns, wanted.end_ns) if ns is not None]
         return Selection(frozenset({self.name}), max(starts, default=None), min(ends, default=None))
@@ -515,7 +515,7 @@ def _table_of(blocks: Sequence[Block], reported: Mapping[str, object]) -> pa.Tab
     if not blocks:
         return pa.table({"log_t_ns": pa.array([], pa.int64())}, metadata=_metadata(reported))
     units = blocks[0].rows.units if isinstance(blocks[0].rows, Table) else {}
-    arrays = {name: pa.array(values) for name, values in columns_of(blocks).items()}
+    arrays = {name: pa.array(values) for name, values in topic_columns(blocks).items()}
     if isinstance(blocks[0].rows, CanFrames):
         arrays["data"] = pa.chunked_array([_payloads(block.rows) for block in blocks])
     fields = [

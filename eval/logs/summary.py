@@ -14,11 +14,11 @@ from crosscue.replay.logs.log_summary import (
     LogSummary,
     Together,
     TopicSummary,
+    common_span,
     quick_summary,
     rows_of_clocks,
     span_sentence,
-    summarise,
-    together,
+    summarise_log,
 )
 from crosscue.replay.safe_text import table, terminal_width, wrapped
 from crosscue.replay.time.scan import LogWatch, timeline_from
@@ -122,10 +122,10 @@ def summary_of(
     planned, wheels = plan_for_time(logs, vehicle, selection)
     watches = [LogWatch(i, planned, vehicle, wheels[i]) for i in range(len(logs))]
     found = tuple(
-        summarise(log, selection, watch.add) for log, watch in zip(logs, watches, strict=True)
+        summarise_log(log, selection, watch.add) for log, watch in zip(logs, watches, strict=True)
     )
     timeline = timeline_from(watches, planned, vehicle)
-    return DriveSummary(found, together(found) if len(found) > 1 else None, timeline)
+    return DriveSummary(found, common_span(found) if len(found) > 1 else None, timeline)
 
 
 def lines_of(summary: LogSummary, width: int) -> Iterator[str]:

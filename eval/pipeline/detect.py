@@ -14,8 +14,8 @@ import numpy as np
 
 from crosscue.detectors.base import (
     MIN_SCORE,
-    Choice,
     Detections,
+    DetectorChoice,
     Found,
     RoadMask,
     calibrated_labels,
@@ -24,14 +24,20 @@ from crosscue.detectors.base import (
     reportable,
 )
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import FrameCues, Role, all_labels, role_of, seen
+from crosscue.detectors.cues.observed import (
+    DetectorRole,
+    FrameCues,
+    all_labels,
+    detector_role,
+    seen,
+)
 from crosscue.detectors.cues.road import road_fractions
-from crosscue.detectors.cues.same_object import KEPT, meanings, same_objects
+from crosscue.detectors.cues.same_object import KEPT, label_meanings, same_objects
 from crosscue.detectors.overlay import Drawer
 from crosscue.detectors.ranging.detection_range import detection_range
 from crosscue.detectors.registry import is_plugin, knows_simulated_only, make
 from crosscue.detectors.result_cache import ResultCache
-from crosscue.detectors.runner import Counts, FrameResult, Named, Runner
+from crosscue.detectors.runner import FrameCounts, FrameResult, Named, Runner
 from crosscue.eval.pipeline.outcome import DetectOutcome
 from crosscue.eval.runs.account import Account, account, detecting_of, reading_of
 from crosscue.eval.runs.folder import (
@@ -49,7 +55,7 @@ from crosscue.eval.runs.manifest import (
     DetectorRow,
     DetectTimings,
     Timings,
-    part_of,
+    selection_record,
 )
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.skipped import write_skipped
@@ -60,8 +66,8 @@ from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.progress import Progress, emit
-from crosscue.replay.signals.extractor import Extractor, probe_clocks
-from crosscue.replay.signals.plan import camera_of, pictures_only
+from crosscue.replay.signals.extractor import SampleExtractor, probe_clocks
+from crosscue.replay.signals.plan import chosen_camera, pictures_only
 from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.versions import versions_and_commit
@@ -74,10 +80,10 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-def choices_of(vehicle: Vehicle) -> dict[str, Choice]:
+def choices_of(vehicle: Vehicle) -> dict[str, DetectorChoice]:
     """Return the detectors that the vehicle file defines, by name."""
     return {
-        name: Choice(
+        name: DetectorChoice(
             name,
             section.kind,
             section.settings | ({} if section.card is None else {"card": section.card}),
@@ -91,7 +97,7 @@ def detect_drive(
     vehicle: Vehicle,
     run: RunFolder,
     selection: Selection,
-    choices: Sequence[Choice],
+    choices: Sequence[DetectorChoice],
     cache: Path | None = None,
     draw: int = 0,
 ) -> DetectOutcome:
@@ -110,7 +116,7 @@ def detect_into(
     vehicle: Vehicle,
     run: RunFolder,
     selection: Selection,
-    choices: Sequence[Choice],
+    choices: Sequence[DetectorChoice],
     cache: Path | None = None,
     draw: int = 0,
     timeline: Timeline | None = None,
@@ -192,7 +198,9 @@ def only_camera(logs: Sequence[Log], vehicle: Vehicle) -> tuple[int, Topic]:
         EmptyResultError: It has none.
         LogError: It has none, and a log is damaged.
     """
-    camera = camera_of([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+    camera = chosen_camera(
+        [(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle
+    )
     with unless_damaged(logs, EmptyResultError):
         if camera is None:
             raise EmptyResultError(
@@ -226,7 +234,7 @@ class _Reading:
         clocks = probe_clocks(self._log, planned, vehicle, self.number, self._narrowed)
         self.timeline = timeline or camera_timeline(logs, vehicle, selection, camera)
         self.clock = self.timeline.clock(self.number)
-        self.extractor = Extractor(
+        self.extractor = SampleExtractor(
             planned,
             vehicle,
             self.number,
@@ -266,8 +274,8 @@ def _run_detectors(reading: _Reading, runner: Runner, tables: _Tables) -> None:
 
 def _manifest(
     reading: _Reading,
-    choices: Sequence[Choice],
-    counts: Counts,
+    choices: Sequence[DetectorChoice],
+    counts: FrameCounts,
     tables: _Tables,
     made: Account,
 ) -> DetectManifest:
@@ -276,7 +284,7 @@ def _manifest(
     return DetectManifest(
         versions=versions_and_commit(),
         logs=log_rows(reading.logs, tables.run),
-        selection=part_of(reading.selection),
+        selection=selection_record(reading.selection),
         settings=vehicle,
         camera=reading.topic.name,
         camera_log=reading.number,
@@ -299,7 +307,7 @@ def _manifest(
     )
 
 
-def _timings(seconds: float, counts: Counts) -> Timings:
+def _timings(seconds: float, counts: FrameCounts) -> Timings:
     """Return the wall time of the detect stage and how much of its work the cache has saved."""
     detect = DetectTimings(
         seconds=seconds, decoded=counts.decoded, ran=counts.ran, from_cache=counts.from_cache
@@ -320,7 +328,7 @@ def _no_frames(topic: Topic, ledger: Ledger) -> str:
 
 
 def _detector_rows(
-    named: Sequence[Named], choices: Sequence[Choice], tables: _Tables
+    named: Sequence[Named], choices: Sequence[DetectorChoice], tables: _Tables
 ) -> tuple[DetectorRow, ...]:
     """Return the manifest's rows of the detectors, in order."""
     return tuple(
@@ -340,7 +348,7 @@ def _detector_rows(
     )
 
 
-def _simulated_only(choices: Sequence[Choice], logs: Sequence[Log]) -> list[str]:
+def _simulated_only(choices: Sequence[DetectorChoice], logs: Sequence[Log]) -> list[str]:
     """Return warnings about embedded networks on a log that was not simulated."""
     if all(map(is_simulated, logs)):
         return []
@@ -353,7 +361,9 @@ def _simulated_only(choices: Sequence[Choice], logs: Sequence[Log]) -> list[str]
     ]
 
 
-def _uncounted(named: Sequence[Named], choices: Sequence[Choice], vehicle: Vehicle) -> list[str]:
+def _uncounted(
+    named: Sequence[Named], choices: Sequence[DetectorChoice], vehicle: Vehicle
+) -> list[str]:
     """Return notices about plug-ins whose labels no cue counts; a network is refused.
 
     A network's card is then likely wrong, or lacks ``[labels]``. A plug-in states its labels
@@ -459,7 +469,7 @@ class _Tables:
     cue_frames: dict[str, int] = field(default_factory=dict)
     _sinks: dict[str, LabelledSink] = field(default_factory=dict)
     _open: ExitStack = field(default_factory=ExitStack)
-    roles: dict[str, Role] = field(default_factory=dict)
+    roles: dict[str, DetectorRole] = field(default_factory=dict)
     _held: dict[str, list[dict[str, object]]] = field(default_factory=dict)
     _size: tuple[int, int] | None = None
     _frame: int = -1
@@ -475,7 +485,7 @@ class _Tables:
 
     def __enter__(self) -> _Tables:
         with ExitStack() as stack:
-            for name, schema in schemas().items():
+            for name, schema in detect_schemas().items():
                 sink = LabelledSink(self.run, name, schema, self.timeline, self.clock)
                 self._sinks[name] = stack.enter_context(sink)
                 self._held[name] = []
@@ -501,7 +511,7 @@ class _Tables:
         self._frame += 1
         if self._frame == 0:
             self.vehicle.camera.check_size(result.size_px)
-            self._meanings = meanings(self.vehicle)
+            self._meanings = label_meanings(self.vehicle)
             self._min_scores = [min_scores_of(one.detector) for one in self.detectors]
             self._labels = all_labels(
                 reportable(named.detector)
@@ -523,7 +533,7 @@ class _Tables:
         for number, (named, found, for_signs) in enumerate(
             zip(self.detectors, result.found, self.is_for_signs, strict=True)
         ):
-            self.roles[named.name] = role_of(found, for_signs)
+            self.roles[named.name] = detector_role(found, for_signs)
             if isinstance(found, Detections):
                 self._held["detections"] += self._detection_rows(named.name, found, again[number])
         road = sorted_by_role.road
@@ -631,7 +641,7 @@ def _height_px(found: Detections, i: int) -> float:
     return float(rows[-1] - rows[0] + 1) if len(rows) else 0.0
 
 
-def schemas() -> dict[str, pa.Schema]:
+def detect_schemas() -> dict[str, pa.Schema]:
     """Return the schemas of the tables that this stage writes."""
     import pyarrow as pa
 

@@ -11,8 +11,8 @@ from crosscue.eval.runs.manifest import TimeSegments
 from crosscue.replay.base import Log, Selection
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import UsageError, VehicleError
-from crosscue.replay.signals.extractor import Extractor, probe_clocks, wheels_only
-from crosscue.replay.signals.kinds import Plan, Signal
+from crosscue.replay.signals.extractor import SampleExtractor, probe_clocks, wheels_only
+from crosscue.replay.signals.kinds import Signal, SignalPlan
 from crosscue.replay.signals.plan import pictures_only, plan, with_pictures
 from crosscue.replay.time.scan import scan
 from crosscue.replay.time.segments import Timeline, gaps_text
@@ -95,7 +95,7 @@ def whole_timeline(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) 
 
 def plan_for_time(
     logs: Sequence[Log], vehicle: Vehicle, selection: Selection
-) -> tuple[Plan, list[Extractor]]:
+) -> tuple[SignalPlan, list[SampleExtractor]]:
     """Return the plan for the wheel speeds, and an extractor for each log.
 
     Without wheel speeds nothing is planned; clock set-backs are still found.
@@ -104,10 +104,10 @@ def plan_for_time(
     try:
         planned = plan(topics, vehicle)
     except VehicleError:
-        planned = Plan((), {})
+        planned = SignalPlan((), {})
         return planned, _no_wheels(planned, vehicle, len(logs))
     wheels = planned.source_of(Signal.WHEEL_SPEEDS)
-    planned = Plan(() if wheels is None else (wheels,), {})
+    planned = SignalPlan(() if wheels is None else (wheels,), {})
     selections = selections_of(logs, planned, selection)
     clocks = [
         probe_clocks(log, planned, vehicle, i, selections[i]) if selections[i].topics else {}
@@ -116,11 +116,13 @@ def plan_for_time(
     return planned, [wheels_only(planned, vehicle, i, used) for i, used in enumerate(clocks)]
 
 
-def _no_wheels(planned: Plan, vehicle: Vehicle, logs: int) -> list[Extractor]:
+def _no_wheels(planned: SignalPlan, vehicle: Vehicle, logs: int) -> list[SampleExtractor]:
     return [wheels_only(planned, vehicle, i, {}) for i in range(logs)]
 
 
-def selections_of(logs: Sequence[Log], planned: Plan, selection: Selection) -> list[Selection]:
+def selections_of(
+    logs: Sequence[Log], planned: SignalPlan, selection: Selection
+) -> list[Selection]:
     """Return the selection of each log, narrowed to the topics that are used."""
     return [_narrowed(selection, planned.topics_of(i)) for i in range(len(logs))]
 

@@ -17,7 +17,7 @@ from crosscue.replay.errors import (
     VehicleError,
 )
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.signals.kinds import Plan, Signal
+from crosscue.replay.signals.kinds import Signal, SignalPlan
 
 TOPICS_SHOWN: Final = 12
 ROLES: Final[Mapping[Signal, str]] = {
@@ -79,7 +79,7 @@ def _or(time_ns: int | None, word: str) -> str:
     return word if time_ns is None else f"{time_ns}ns"
 
 
-def silent_roles(planned: Plan, received: Mapping[Signal, int]) -> dict[Signal, str]:
+def silent_roles(planned: SignalPlan, received: Mapping[Signal, int]) -> dict[Signal, str]:
     """Return a sentence for each role whose planned topic had no row."""
     found = {}
     for signal, name in ROLES.items():

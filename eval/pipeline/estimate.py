@@ -14,7 +14,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
 from crosscue.eval.pipeline.scene.outcome import SceneOutcome
-from crosscue.eval.pipeline.scene.stage import estimate_scene, features_of, gives_reasons, schemas
+from crosscue.eval.pipeline.scene.stage import (
+    estimate_scene,
+    features_of,
+    gives_reasons,
+    scene_schemas,
+)
 from crosscue.eval.runs.account import UNATTRIBUTED, Account, account, joined_accounts, reading_of
 from crosscue.eval.runs.candidates import candidate_rows
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, write_manifest, write_timings
@@ -29,7 +34,7 @@ from crosscue.eval.runs.manifest import (
     PoseSummary,
     SceneSummary,
     Timings,
-    part_of,
+    selection_record,
 )
 from crosscue.eval.runs.tables import measurements
 from crosscue.eval.runs.tables.labelled import LabelledSink
@@ -41,9 +46,9 @@ from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.base import Log, Selection
 from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.signals.extractor import Extractor, probe_clocks
-from crosscue.replay.signals.kinds import Plan, Signal
-from crosscue.replay.signals.plan import camera_of, plan, with_pictures
+from crosscue.replay.signals.extractor import SampleExtractor, probe_clocks
+from crosscue.replay.signals.kinds import Signal, SignalPlan
+from crosscue.replay.signals.plan import chosen_camera, plan, with_pictures
 from crosscue.replay.signals.windows import windows
 from crosscue.replay.time.segments import (
     LogClock,
@@ -218,7 +223,7 @@ def _manifest(
     return EstimateManifest(
         versions=versions_and_commit(),
         logs=rows,
-        selection=part_of(reading.selection),
+        selection=selection_record(reading.selection),
         settings=reading.vehicle,
         sources=_sources(reading.planned, reading.logs),
         clocks=tuple(clock_rows(each.clocks, each.watch.reports()) for each in reading.extractors),
@@ -294,7 +299,7 @@ class _Reading:
         self.found = found
         self.has_camera = any(role_of(topic) is Role.CAMERA for _, topic in topics)
         self.planned = plan(topics, vehicle)
-        self.camera = None if landmarks is None else camera_of(topics, vehicle)
+        self.camera = None if landmarks is None else chosen_camera(topics, vehicle)
         if self.camera is not None:
             self.planned = with_pictures(self.planned, self.camera)
         self.ledgers = tuple(Ledger(name) for name in log_names(logs))
@@ -308,7 +313,9 @@ class _Reading:
             for i, log in enumerate(logs)
         ]
         self.extractors = [
-            Extractor(self.planned, vehicle, i, ledger, clocks[i], shift_at=shift_of(timeline, i))
+            SampleExtractor(
+                self.planned, vehicle, i, ledger, clocks[i], shift_at=shift_of(timeline, i)
+            )
             for i, ledger in enumerate(self.ledgers)
         ]
 
@@ -328,7 +335,9 @@ def _pose(reading: _Reading, stage: PoseStage, run: RunFolder) -> PoseTally:
     timeline, clock = reading.timeline, reading.clock_of(Signal.WHEEL_SPEEDS)
     with (
         LabelledSink(run, "pose", pose_schema(), timeline, clock) as sink,
-        LabelledSink(run, measurements.TABLE, measurements.schema(), timeline, clock) as measured,
+        LabelledSink(
+            run, measurements.TABLE, measurements.measurement_schema(), timeline, clock
+        ) as measured,
         MobileyeSink(run, timeline, reading.clock_of(Signal.MOBILEYE_OBSTACLES)) as mobileye,
     ):
         for window in windows(
@@ -360,7 +369,7 @@ def _scene(
     with ExitStack() as stack:
         sinks = {
             name: stack.enter_context(LabelledSink(run, name, schema, timeline, clock))
-            for name, schema in schemas(
+            for name, schema in scene_schemas(
                 features_of(vehicle), gives_reasons=gives_reasons(vehicle)
             ).items()
         }
@@ -399,7 +408,7 @@ def _camera_skips(run: RunFolder, camera: str) -> pa.Table:
     return table.filter(ours)
 
 
-def _sources(planned: Plan, logs: Sequence[Log]) -> dict[str, str | None]:
+def _sources(planned: SignalPlan, logs: Sequence[Log]) -> dict[str, str | None]:
     """Return the log and topic of each signal."""
     names = log_names(logs)
     found = {signal: planned.source_of(signal) for signal in Signal}
@@ -409,7 +418,7 @@ def _sources(planned: Plan, logs: Sequence[Log]) -> dict[str, str | None]:
     }
 
 
-def _missing(planned: Plan) -> list[str]:
+def _missing(planned: SignalPlan) -> list[str]:
     """Return notices about missing signals."""
     names = {
         Signal.WHEEL_SPEEDS: "no wheel speeds, so no pose",
@@ -423,7 +432,7 @@ def _missing(planned: Plan) -> list[str]:
     ]
 
 
-def _no_mobileye(found: DetectManifest | None, planned: Plan) -> list[str]:
+def _no_mobileye(found: DetectManifest | None, planned: SignalPlan) -> list[str]:
     reason = planned.missing.get(Signal.MOBILEYE_OBSTACLES)
     if found is None or reason is None:
         return []

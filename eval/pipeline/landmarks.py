@@ -11,8 +11,13 @@ from pathlib import Path
 from crosscue.detectors.images import Encoded, lose
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmarks.database import LandmarkDatabase
-from crosscue.localization.landmarks.features import CameraGeometry, Features, Matcher, make_matcher
-from crosscue.localization.landmarks.images import grey_of, picture_of
+from crosscue.localization.landmarks.features import (
+    CameraGeometry,
+    Keypoints,
+    Matcher,
+    make_matcher,
+)
+from crosscue.localization.landmarks.images import copy_picture, grey_of
 from crosscue.localization.landmarks.sighting import Sighting
 from crosscue.localization.landmarks.update import LandmarkSearch, LandmarkSettings
 from crosscue.localization.pose_track import ACCEPTED
@@ -98,7 +103,7 @@ class LandmarkStage:
                 self.search.counts.thinned += 1
                 continue
             self._kept_ns = t_ns
-            insort(self._frames, _Frame(t_ns, block.topic, picture_of(block.rows, row)))
+            insort(self._frames, _Frame(t_ns, block.topic, copy_picture(block.rows, row)))
 
     def times_ns(self) -> Sequence[int]:
         """Times of the waiting frames."""
@@ -137,7 +142,7 @@ class LandmarkStage:
         """Return the numbers of frames by outcome, for the manifest."""
         return self.search.counts.as_dict()
 
-    def _describe(self, frame: _Frame) -> Features | None:
+    def _describe(self, frame: _Frame) -> Keypoints | None:
         try:
             return self.search.matcher.describe(grey_of(frame.picture))
         except LogError as error:

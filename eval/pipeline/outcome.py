@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from crosscue.detectors.runner import Counts
+from crosscue.detectors.runner import FrameCounts
 from crosscue.eval.pipeline.scene.outcome import ApproachSummary, SceneOutcome
 from crosscue.eval.runs.account import Account, account_lines, details_of
 from crosscue.eval.runs.candidates import candidate_lines, candidate_rows, not_looked_lines
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.safe_text import terminal_width, visible, wrapped
-from crosscue.replay.time.segments import ONE_SEGMENT, Segment
+from crosscue.replay.time.segments import ONE_SEGMENT, TimeSegment
 from crosscue.results import HIDDEN, Result, json_key
 
 
@@ -35,7 +35,7 @@ class DetectOutcome(Result):
 
     run: RunFolder = field(metadata=HIDDEN)
     ledger: Ledger = field(metadata=HIDDEN)
-    counts: Counts = field(metadata=HIDDEN)
+    counts: FrameCounts = field(metadata=HIDDEN)
     objects: dict[str, int]
     cues: dict[str, int]
     notices: tuple[str, ...]
@@ -101,7 +101,7 @@ class Outcome(Result):
     account: Account
     detected: DetectOutcome | None = field(default=None, metadata=HIDDEN)
     scene: SceneOutcome | None = None
-    segments: tuple[Segment, ...] = field(default=ONE_SEGMENT.segments, metadata=HIDDEN)
+    segments: tuple[TimeSegment, ...] = field(default=ONE_SEGMENT.segments, metadata=HIDDEN)
 
     also: ClassVar = {"run": "run.path", "pose": "pose", "detected": "detection_counts"}
 

@@ -24,7 +24,7 @@ from crosscue.localization import compass, odometry, pose_track
 from crosscue.localization.fixes import NO_FIXES, Fixes
 from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.landmarks.sighting import Sighting
-from crosscue.localization.odometry import OdometrySettings, Pending, TurnSignal, WheelSpeeds
+from crosscue.localization.odometry import OdometrySettings, Pending, TurnSignal, WheelSamples
 from crosscue.localization.pose_track import (
     NO_HEADINGS,
     BothSources,
@@ -39,9 +39,9 @@ from crosscue.localization.pose_track import (
 from crosscue.localization.position_updates import PositionUpdates
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import VehicleError
-from crosscue.replay.signals.kinds import Plan, Samples, Signal
-from crosscue.replay.signals.windows import Window
-from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Segment, Timeline
+from crosscue.replay.signals.kinds import Samples, Signal, SignalPlan
+from crosscue.replay.signals.windows import SampleWindow
+from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Timeline, TimeSegment
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 # Max plausible fraction of rejected readings; a consistent filter rejects one in a thousand.
@@ -53,7 +53,7 @@ FOREVER_NS: Final = int(np.iinfo(np.int64).max)
 OWN_FRAME_SD_RAD: Final = 1e-3
 
 
-def turn_signal_of(planned: Plan, vehicle: Vehicle) -> Signal | None:
+def turn_signal_of(planned: SignalPlan, vehicle: Vehicle) -> Signal | None:
     """Return the signal for the turns of the pose; None for the difference of wheel speeds."""
     wish = vehicle.odometry.heading_from
     offers = {"yaw_rate": Signal.YAW_RATE, "steering": Signal.STEERING}
@@ -181,10 +181,10 @@ class PoseStage:
     _state: TrackState | None = None
     _last_ns: int | None = None
     _measured: list[dict[str, object]] = field(default_factory=list)
-    _gap: Segment | None = None
+    _gap: TimeSegment | None = None
     _segment: int = 0
 
-    def __call__(self, window: Window) -> Iterator[PoseColumns]:
+    def __call__(self, window: SampleWindow) -> Iterator[PoseColumns]:
         """Yield the rows that a window completes."""
         self.received.update({signal: len(of.t_ns) for signal, of in window.samples.items()})
         while (following := self._following(window.end_ns)) is not None:
@@ -195,7 +195,7 @@ class PoseStage:
                 yield from self._end_segment(following)
         yield from self._advance(window, window.end_ns)
 
-    def _following(self, until_ns: int) -> Segment | None:
+    def _following(self, until_ns: int) -> TimeSegment | None:
         """Return the next segment if it begins before ``until_ns``."""
         segments = self.timeline.segments
         if self._segment + 1 >= len(segments):
@@ -219,16 +219,16 @@ class PoseStage:
     def _close(self) -> Iterator[PoseColumns]:
         """Yield the waiting rows at the end of a segment, where no more odometry follows."""
         if self._state is not None and self._last_ns is not None:
-            yield from self._advance(Window(self._last_ns, self._last_ns, {}), None)
+            yield from self._advance(SampleWindow(self._last_ns, self._last_ns, {}), None)
 
-    def _end_segment(self, following: Segment) -> Iterator[PoseColumns]:
+    def _end_segment(self, following: TimeSegment) -> Iterator[PoseColumns]:
         """Close a segment; the following one is processed like a new drive with a known start."""
         yield from self._close()
         self._pending = Pending()
         if self._state is not None:
             self._gap = following
 
-    def _cross(self, segment: Segment, until_ns: int) -> None:
+    def _cross(self, segment: TimeSegment, until_ns: int) -> None:
         """Predict the belief across the gap before ``segment``, to its first wheel speed."""
         assert self._state is not None
         restarts = segment.cause is Cause.SET_BACK
@@ -274,7 +274,7 @@ class PoseStage:
         """Number of headings waiting for wheel speeds."""
         return 0 if self._state is None else len(self._state.waiting)
 
-    def _advance(self, window: Window, until_ns: int | None) -> Iterator[PoseColumns]:
+    def _advance(self, window: SampleWindow, until_ns: int | None) -> Iterator[PoseColumns]:
         wheels = window.samples.get(Signal.WHEEL_SPEEDS)
         headings = self._headings(window)
         if self.positions is not None:
@@ -307,7 +307,7 @@ class PoseStage:
         )
         self._pending = step.pending
         self.odometry_counts += step.counts
-        made = pose_track.advance(
+        made = pose_track.advance_pose(
             self._state,
             step.increments,
             track_settings(self.vehicle),
@@ -362,7 +362,7 @@ class PoseStage:
     def _missed(self, headings: Headings) -> None:
         self.track_counts += TrackCounts(headings=len(headings), headings_late=len(headings))
 
-    def _turn(self, window: Window) -> TurnSignal | None:
+    def _turn(self, window: SampleWindow) -> TurnSignal | None:
         if self.turn is None:
             return None
         kind: odometry.TurnKind = "yaw rate" if self.turn is Signal.YAW_RATE else "steering"
@@ -371,7 +371,7 @@ class PoseStage:
             return TurnSignal(np.empty(0, np.int64), np.empty(0), kind)
         return TurnSignal(found.t_ns, found.values, kind)
 
-    def _fixes(self, window: Window) -> Fixes:
+    def _fixes(self, window: SampleWindow) -> Fixes:
         """Return a window's GNSS positions in the map frame."""
         found, origin = window.samples.get(Signal.POSITION), self.vehicle.start.map_origin
         if found is None or origin is None:
@@ -381,7 +381,7 @@ class PoseStage:
         var = np.where(np.isfinite(sd), sd, self.vehicle.gnss.position_sd_m) ** 2
         return Fixes(found.t_ns, xyz[:, :2], var[:, None, None] * np.eye(2))
 
-    def _headings(self, window: Window) -> Headings:
+    def _headings(self, window: SampleWindow) -> Headings:
         variance = self.vehicle.compass.heading_sd_rad**2
         found = window.samples.get(Signal.HEADING)
         if found is not None:
@@ -393,7 +393,7 @@ class PoseStage:
         return Headings(found.t_ns, heading_rad, np.full(len(found.t_ns), variance))
 
 
-def _split(window: Window, at_ns: int) -> tuple[Window, Window]:
+def _split(window: SampleWindow, at_ns: int) -> tuple[SampleWindow, SampleWindow]:
     """Split a window at a time."""
     before: dict[Signal, Samples] = {}
     after: dict[Signal, Samples] = {}
@@ -403,7 +403,7 @@ def _split(window: Window, at_ns: int) -> tuple[Window, Window]:
             before[signal] = samples.take(is_before)
         if not is_before.all():
             after[signal] = samples.take(~is_before)
-    return Window(window.start_ns, at_ns, before), Window(at_ns, window.end_ns, after)
+    return SampleWindow(window.start_ns, at_ns, before), SampleWindow(at_ns, window.end_ns, after)
 
 
 def compass_settings(vehicle: Vehicle) -> compass.CompassSettings:
@@ -418,13 +418,13 @@ def compass_settings(vehicle: Vehicle) -> compass.CompassSettings:
     )
 
 
-def _wheels(found: Samples | None) -> WheelSpeeds:
+def _wheels(found: Samples | None) -> WheelSamples:
     if found is None:
-        return WheelSpeeds(np.empty(0, np.int64), np.empty((0, 4)))
+        return WheelSamples(np.empty(0, np.int64), np.empty((0, 4)))
     speeds: Floats = found.values
     if np.isnan(speeds[:, :2]).all():
         speeds = speeds[:, 2:]
-    return WheelSpeeds(found.t_ns, speeds)
+    return WheelSamples(found.t_ns, speeds)
 
 
 def estimating_of(stage: PoseStage, frames: tuple[int, int] | None) -> dict[str, Line]:

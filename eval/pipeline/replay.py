@@ -8,24 +8,30 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from crosscue.detectors.base import Choice
+from crosscue.detectors.base import DetectorChoice
 from crosscue.detectors.registry import make
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, clear, locked, staged, write_input
-from crosscue.eval.runs.logs import input_of, log_rows, refuse_another, reopened, settings_changed
+from crosscue.eval.runs.logs import (
+    input_of,
+    log_rows,
+    refuse_other_input,
+    reopened,
+    settings_changed,
+)
 from crosscue.eval.runs.manifest import (
     DetectManifest,
     DriveManifest,
     EstimateManifest,
     LogRow,
-    part_of,
+    selection_record,
 )
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.base import Log, Selection
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.files.whole_file import sha256_of
-from crosscue.replay.signals.plan import camera_of
+from crosscue.replay.signals.plan import chosen_camera
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -50,7 +56,7 @@ class Detecting:
         is_required: The user named the detectors, so a drive without a camera is an error.
     """
 
-    choices: tuple[Choice, ...]
+    choices: tuple[DetectorChoice, ...]
     cache: Path | None = None
     draw: int = 0
     resume: bool = False
@@ -99,7 +105,7 @@ def replay_drive(
     )
     with locked(run):
         if detecting.resume and not overwrite:
-            refuse_another(run, mine)
+            refuse_other_input(run, mine)
         timeline = drive_timeline(
             logs, vehicle, selection, _camera(logs, vehicle, detecting, landmarks)
         )
@@ -132,7 +138,9 @@ def _camera(
         return None
     if detecting.is_required or landmarks is not None:
         return only_camera(logs, vehicle)
-    return camera_of([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
+    return chosen_camera(
+        [(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle
+    )
 
 
 def _detect(
@@ -144,7 +152,7 @@ def _detect(
     timeline: Timeline,
 ) -> DetectOutcome | None:
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
-    if not detecting.choices or camera_of(topics, vehicle) is None:
+    if not detecting.choices or chosen_camera(topics, vehicle) is None:
         return None
     return detect_into(
         logs,
@@ -171,12 +179,12 @@ def _kept(
     except RunError:
         return None
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
-    camera = camera_of(topics, vehicle)
+    camera = chosen_camera(topics, vehicle)
     if earlier is None or camera is None or not all(run.file(name).exists() for name in TABLES):
         return None
     wanted = (
         log_rows(logs, run),
-        part_of(selection),
+        selection_record(selection),
         camera[1].name,
         [make(choice).identity for choice in detecting.choices],
         vehicle.camera.depth_bits,

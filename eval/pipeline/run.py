@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.folder import open_run as open_folder
-from crosscue.eval.runs.manifest import Manifest, json_schema
+from crosscue.eval.runs.manifest import Manifest, manifest_json_schema
 from crosscue.replay.errors import LogError, RunError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.safe_text import visible
@@ -179,7 +179,7 @@ PicturedRun: TypeAlias = Annotated[Run | Path | str, Option(made_by=open_run)]
 
 def run_schema() -> dict[str, Any]:
     """Return the JSON Schema of a run's ``manifest.json``, for editors and other tools."""
-    return json_schema()
+    return manifest_json_schema()
 
 
 def run_given(run: Run | Path | str) -> Run:

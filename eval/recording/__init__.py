@@ -1,7 +1,7 @@
 """Rerun recordings of runs, with a ready-made layout.
 
 Everything is on one timeline, the drive time. Columns are sent in bulk, and pictures are passed
-through as stored. ``save`` is the only entry point.
+through as stored. ``save_rrd`` is the only entry point.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy as np
 from crosscue.detectors.images import Encoded
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DriveManifest
-from crosscue.eval.runs.moments import part_of
-from crosscue.eval.runs.stored_images import StoredCamera, camera_of, read_pictures
+from crosscue.eval.runs.moments import run_between
+from crosscue.eval.runs.stored_images import StoredCamera, read_pictures, run_camera
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.columns import Floats
@@ -27,22 +27,22 @@ from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import spelled
 from crosscue.replay.files.whole_file import write_whole
 
-from .part import WHOLE, Part
+from .part import WHOLE, RecordingSpan
 
 if TYPE_CHECKING:
     import rerun as rr
 
     from .columns import DriveTime
 
-__all__ = ["save"]
+__all__ = ["save_rrd"]
 
 
-def save(
+def save_rrd(
     run: RunFolder,
     path: Path,
     truth: TruthTrack | None = None,
     true_ranges: TrueRanges | None = None,
-    part: Part = WHOLE,
+    part: RecordingSpan = WHOLE,
 ) -> None:
     """Write the recording of a run atomically; views without data are left out.
 
@@ -61,18 +61,18 @@ def save(
     import rerun as rr
 
     from .columns import time_of
-    from .layout import Shown, blueprint
+    from .layout import ViewData, blueprint
     from .scene_rows import longest_m, scene_rows
 
     if not part.is_whole:
-        run = part_of(run, part.start_ns, part.end_ns)
+        run = run_between(run, part.start_ns, part.end_ns)
     truth, true_ranges = _within(part, truth, true_ranges)
     pose = _pose(run)
     scene = scene_rows(run)
-    camera = camera_of(run) if part.shows("cameras") else None
+    camera = run_camera(run) if part.shows("cameras") else None
     has_scene = any(part is not None for part in (scene.cues, scene.ranges, scene.belief))
     topic = None if camera is None else camera.topic.name
-    shown = Shown(topic, pose, truth is not None, has_scene, longest_m(scene), part)
+    shown = ViewData(topic, pose, truth is not None, has_scene, longest_m(scene), part)
     layout = blueprint(shown)
     first_ns = int(scene.frames_ns[0]) if len(scene.frames_ns) else 0
     time = time_of(first_ns if pose is None else int(pose["t_ns"][0]))
@@ -97,7 +97,7 @@ def _log_all(
     truth: TruthTrack | None,
     true_ranges: TrueRanges | None,
     stored: StoredCamera | None,
-    part: Part,
+    part: RecordingSpan,
 ) -> None:
     from . import ahead, camera, plan, series
     from .notes import notes
@@ -128,14 +128,14 @@ def _log_all(
             _log_marks(recording, time, run, manifest)
     if stored is not None:
         pictures = partial(_read_part, stored, part)
-        left_out = camera.log_pictures(recording, pictures, time)
+        left_out = camera.send_pictures(recording, pictures, time)
         if left_out:
             more.append(f"{stored.topic.name}: {left_out} pictures that cannot be decoded")
     recording.log("notes", notes(run, more), static=True)
 
 
 def _within(
-    part: Part, truth: TruthTrack | None, ranges: TrueRanges | None
+    part: RecordingSpan, truth: TruthTrack | None, ranges: TrueRanges | None
 ) -> tuple[TruthTrack | None, TrueRanges | None]:
     """Return the truth in the part's time span."""
     if part.is_whole:
@@ -155,7 +155,9 @@ def _within(
     return truth, ranges
 
 
-def _read_part(stored: StoredCamera, part: Part, on_picture: Callable[[int, Encoded], None]) -> int:
+def _read_part(
+    stored: StoredCamera, part: RecordingSpan, on_picture: Callable[[int, Encoded], None]
+) -> int:
     """Read every picture in the part's time span; return the number of unusable ones."""
 
     def inside(t_ns: int, picture: Encoded) -> None:
@@ -172,13 +174,13 @@ def _log_marks(
     from crosscue.eval.runs.tables.stored_frames import stored_frames
 
     from .anchored import Anchored
-    from .marks import FRAMES_HELD, Marks, log_styles
+    from .marks import FRAMES_HELD, Overlays, log_styles
 
     detected = manifest.detected
     if detected is None:
         return
     log_styles(recording)
-    marks = Marks(manifest.settings)
+    marks = Overlays(manifest.settings)
     has_odometry = run.file("measurements.parquet").exists()
     anchored = Anchored(run, manifest, marks) if has_odometry else None
     frames = stored_frames(run, detected.detectors, with_road_masks=True)

@@ -21,7 +21,7 @@ from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .colours import END, ESTIMATE, FAINT, LANE, QUIET, START, TRUTH, VEHICLE
-from .columns import DriveTime, Shapes, boxes, labelled_strips, points, strips
+from .columns import DriveTime, Shapes, boxes, labelled_strips, point_columns, strips
 from .layout import ASIDE_M, BEHIND_M, FAR_M
 from .scene_rows import SceneRows
 
@@ -126,7 +126,7 @@ def _log_truth(recording: rr.RecordingStream, time: DriveTime, truth: TrueRanges
 def _log_mobileye(
     recording: rr.RecordingStream, time: DriveTime, stored: StoredMobileye, scene: SceneRows
 ) -> None:
-    vehicles = Shapes("ahead/mobileye_objects", points)
+    vehicles = Shapes("ahead/mobileye_objects", point_columns)
     lanes = Shapes("ahead/mobileye_lanes", strips)
     for number, t_ns in enumerate(scene.frames_ns.tolist()):
         state = stored.at(t_ns)

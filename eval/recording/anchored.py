@@ -18,7 +18,7 @@ from crosscue.detectors.cues.observed import Place
 from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.cues.tracked.judge import along, crossing, is_past, parked
 from crosscue.detectors.cues.tracked.motion import CarMotion
-from crosscue.eval.pipeline.scene.stage import EgoMotion, Restarts, place_of
+from crosscue.eval.pipeline.scene.stage import EgoMotion, Restarts, intersection_place
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DriveManifest
 from crosscue.eval.runs.tables.stored_frames import StoredFrame
@@ -28,7 +28,7 @@ from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.vehicle import Camera
 
 from .columns import Colour
-from .marks import CROSSING, PARKED, REGION, REGION_WITH_ROAD, SIDES, Marks
+from .marks import CROSSING, PARKED, REGION, REGION_WITH_ROAD, SIDES, Overlays
 
 ALONG: Final = (235, 235, 235)
 PAST: Final = (60, 190, 70)
@@ -50,7 +50,7 @@ class Anchored:
 
     run: RunFolder
     manifest: DriveManifest
-    marks: Marks
+    marks: Overlays
     _cues: CuePass = field(init=False)
     _ego: EgoMotion = field(init=False)
     _restarts: Restarts = field(init=False)
@@ -75,7 +75,7 @@ class Anchored:
         _, ego = self._ego(seen.t_ns)
         place = None
         if ego.way_m is not None:
-            place = place_of(self._before, ego.way_m, vehicle.fusion.length_m)
+            place = intersection_place(self._before, ego.way_m, vehicle.fusion.length_m)
         self._before = self._ranges.get(seen.t_ns, [])
         found = self._cues(seen, ego, place)
         if vehicle.regions.kind == "ground" and isinstance(seen.road, RoadMask):

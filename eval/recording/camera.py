@@ -20,7 +20,7 @@ BATCH_BYTES: Final = 4 << 20
 QUALITY: Final = 90
 
 
-def log_pictures(
+def send_pictures(
     recording: rr.RecordingStream,
     read_pictures: Callable[[Callable[[int, Encoded], None]], int],
     time: DriveTime,

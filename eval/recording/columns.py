@@ -66,7 +66,7 @@ def boxes(
     return rr.Boxes2D.columns(
         centers=(corners[:, :2] + corners[:, 2:]) / 2,
         half_sizes=(corners[:, 2:] - corners[:, :2]) / 2,
-        colors=packed(colours),
+        colors=pack_colours(colours),
         labels=labels,
     )
 
@@ -76,7 +76,7 @@ def strips(
 ) -> rr.ComponentColumnList:
     """Return the columns of line strips; geometry: shape (N, 2)."""
     lines = [np.asarray(line, np.float32) for line in geometry]
-    return rr.LineStrips2D.columns(strips=lines, colors=packed(colours))
+    return rr.LineStrips2D.columns(strips=lines, colors=pack_colours(colours))
 
 
 def labelled_strips(
@@ -84,7 +84,7 @@ def labelled_strips(
 ) -> rr.ComponentColumnList:
     """Return the columns of line strips with labels; geometry: shape (N, 2)."""
     lines = [np.asarray(line, np.float32) for line in geometry]
-    return rr.LineStrips2D.columns(strips=lines, colors=packed(colours), labels=labels)
+    return rr.LineStrips2D.columns(strips=lines, colors=pack_colours(colours), labels=labels)
 
 
 def strips_above(
@@ -92,7 +92,7 @@ def strips_above(
 ) -> rr.ComponentColumnList:
     """Return the columns of line strips in space; geometry: shape (N, 3)."""
     lines = [np.asarray(line, np.float32) for line in geometry]
-    return rr.LineStrips3D.columns(strips=lines, colors=packed(colours))
+    return rr.LineStrips3D.columns(strips=lines, colors=pack_colours(colours))
 
 
 def arrows(
@@ -101,19 +101,19 @@ def arrows(
     """Return the columns of arrows; geometry: x, y of the tail, then of the vector to the tip."""
     both = np.asarray(geometry, np.float32).reshape(-1, 4)
     return rr.Arrows2D.columns(
-        origins=both[:, :2], vectors=both[:, 2:], colors=packed(colours), labels=labels
+        origins=both[:, :2], vectors=both[:, 2:], colors=pack_colours(colours), labels=labels
     )
 
 
-def points(
+def point_columns(
     geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
 ) -> rr.ComponentColumnList:
     """Return the columns of points; geometry: x, y."""
     places = np.asarray(geometry, np.float32).reshape(-1, 2)
-    return rr.Points2D.columns(positions=places, colors=packed(colours), labels=labels)
+    return rr.Points2D.columns(positions=places, colors=pack_colours(colours), labels=labels)
 
 
-def packed(colours: Sequence[Colour]) -> NDArray[np.uint32]:
+def pack_colours(colours: Sequence[Colour]) -> NDArray[np.uint32]:
     """Return colours as Rerun's packed RGBA, opaque."""
     rgb = np.asarray(colours, np.uint32).reshape(-1, 3)
     return (rgb @ np.array([1 << 24, 1 << 16, 1 << 8], np.uint32) + 0xFF).astype(np.uint32)

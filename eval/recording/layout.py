@@ -14,7 +14,7 @@ from rerun.blueprint.components import AbsoluteTimeRange
 from crosscue.replay.errors import UsageError
 
 from .columns import TIMELINE
-from .part import VIEWS, WHOLE, Part
+from .part import VIEWS, WHOLE, RecordingSpan
 from .series import BELIEF, CUES, POSE, RANGE
 
 FAR_M: Final = 110.0
@@ -25,7 +25,7 @@ MARKED_NS: Final = 100_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shown:
+class ViewData:
     """Data available to the views.
 
     Attributes:
@@ -42,10 +42,10 @@ class Shown:
     has_truth: bool
     has_scene: bool
     longest_m: float = FAR_M
-    part: Part = WHOLE
+    part: RecordingSpan = WHOLE
 
 
-def blueprint(shown: Shown) -> rrb.Blueprint:
+def blueprint(shown: ViewData) -> rrb.Blueprint:
     """Return the layout: for a scene, for a pose alone, or of the requested views.
 
     Raises:
@@ -74,7 +74,7 @@ def _time_panel(moment_ns: int | None) -> rrb.TimePanel:
     )
 
 
-def _only(shown: Shown) -> rrb.Container:
+def _only(shown: ViewData) -> rrb.Container:
     """Return the requested views for which the run has data, side by side."""
     there: dict[str, rrb.View | rrb.Container] = {"notes": _notes()}
     if shown.camera is not None:
@@ -134,7 +134,7 @@ def _ranges(longest_m: float) -> rrb.View:
     )
 
 
-def _scene(shown: Shown) -> rrb.Container:
+def _scene(shown: ViewData) -> rrb.Container:
     left: list[rrb.View] = [_cues()]
     if shown.camera is not None:
         left.insert(0, _camera(shown.camera))
@@ -149,7 +149,7 @@ def _scene(shown: Shown) -> rrb.Container:
     )
 
 
-def _pose_alone(shown: Shown) -> rrb.Container:
+def _pose_alone(shown: ViewData) -> rrb.Container:
     left: list[rrb.View] = [_notes()]
     if shown.pose is not None:
         left.insert(0, _plan(shown, shown.pose))
@@ -184,7 +184,7 @@ def _whole() -> rrb.TimeRange:
     return rrb.TimeRange(rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
 
 
-def _plan(shown: Shown, pose: Mapping[str, NDArray[np.float64]]) -> rrb.View:
+def _plan(shown: ViewData, pose: Mapping[str, NDArray[np.float64]]) -> rrb.View:
     return rrb.Spatial3DView(
         origin="plan",
         name="Map, truth in green" if shown.has_truth else "Map",

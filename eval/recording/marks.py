@@ -52,7 +52,7 @@ SIDES: Final = ("left", "straight", "right")
 
 
 @dataclass(slots=True)
-class Marks:
+class Overlays:
     """Overlays of successive frames; keeps the cars of the previous frame.
 
     Attributes:

@@ -12,7 +12,7 @@ LAST_NS: Final = 2**63 - 1
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class RecordingSpan:
     """The part to record.
 
     Attributes:
@@ -47,4 +47,4 @@ class Part:
         return not self.only or view in self.only
 
 
-WHOLE: Final = Part()
+WHOLE: Final = RecordingSpan()

@@ -19,7 +19,7 @@ from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option
 
 if TYPE_CHECKING:
-    from crosscue.eval.recording.part import Part
+    from crosscue.eval.recording.part import RecordingSpan
 
 
 BEFORE_NS: Final = 2_000_000_000
@@ -56,9 +56,9 @@ def save_recording(
             view.
         RunError: The log with the pictures is missing.
     """
-    from crosscue.eval.recording import save
+    from crosscue.eval.recording import save_rrd
     from crosscue.eval.scoring.pose.score import truth_track
-    from crosscue.eval.scoring.truth import load as load_truth
+    from crosscue.eval.scoring.truth import read_scored_truth as load_truth
 
     folder = run_given(run).folder
     path = folder.file("drive.rrd") if output is None else Path(output)
@@ -71,29 +71,29 @@ def save_recording(
         ranges = known.ranges
         if known.truth.pose is not None and folder.file("pose.parquet").exists():
             track = truth_track(Path(truth), folder)
-    save(folder, path, track, ranges, part)
+    save_rrd(folder, path, track, ranges, part)
     return path
 
 
 def _part(
     run: TableFolder, at: float | str | None, approach: int | None, only: Sequence[str]
-) -> Part:
+) -> RecordingSpan:
     """Return the part of the run to record."""
-    from crosscue.eval.recording.part import Part
+    from crosscue.eval.recording.part import RecordingSpan
 
     views = frozenset(only)
     if at is not None and approach is not None:
         raise UsageError("at, approach: expected one of them")
     if at is not None:
         t_ns = moment_ns(run, at if isinstance(at, str) else repr(float(at)))
-        return Part(t_ns - BEFORE_NS, t_ns + BEHIND_NS, t_ns, views)
+        return RecordingSpan(t_ns - BEFORE_NS, t_ns + BEHIND_NS, t_ns, views)
     if approach is not None:
         spans = approach_spans(run)
         if approach not in spans:
             there = ", ".join(map(str, spans)) or "none"
             raise UsageError(f"approach: {approach}, not in {run.path}; it has: {there}")
-        return Part(*spans[approach], None, views)
-    return Part(only=views)
+        return RecordingSpan(*spans[approach], None, views)
+    return RecordingSpan(only=views)
 
 
 @dataclass(frozen=True, slots=True, repr=False)

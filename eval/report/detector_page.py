@@ -34,12 +34,12 @@ def write_detector_page(
     Raises:
         OutputError: The file cannot be written.
     """
-    figure = draw_reliability(calibration) if has_figures else None
+    figure = reliability_png(calibration) if has_figures else None
     values = {**content, "figure": figure, "calibration": calibration}
     write_page(path, TEMPLATE, values, {"number": _number, "ends": _ends})
 
 
-def draw_reliability(calibration: Sequence[Reliability]) -> str | None:
+def reliability_png(calibration: Sequence[Reliability]) -> str | None:
     """Return the reliability diagram as PNG in base64; None without any detection."""
     some = [one for one in calibration if one.detections]
     if not some:

@@ -11,7 +11,7 @@ from typing import Final
 from markupsafe import Markup
 
 from .html import write_page
-from .svg_plot import Drawing, Panel, ticks
+from .svg_plot import Panel, SvgChart, ticks
 
 TEMPLATE: Final = "history.html.j2"
 WIDTH: Final = 460.0
@@ -21,7 +21,7 @@ LABEL_PX: Final = 52.0
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class ChangeMark:
     """A change point in a chart.
 
     Attributes:
@@ -59,7 +59,7 @@ class Chart:
     low: Sequence[float]
     high: Sequence[float]
     drives: Sequence[int]
-    marks: Sequence[Mark]
+    marks: Sequence[ChangeMark]
 
 
 def write_history_page(
@@ -91,7 +91,7 @@ def draw_chart(one: Chart, versions: Sequence[str]) -> Markup:
         52, 14, WIDTH - 66, HEIGHT - 48, (-0.4, last + 0.4), (low - margin, high + margin)
     )
     what = ", ".join(f"{mark.verdict} from {versions[mark.at]} on" for mark in one.marks)
-    drawing = Drawing(WIDTH, HEIGHT, one.title, f"{len(versions)} versions; {what or 'no change'}")
+    drawing = SvgChart(WIDTH, HEIGHT, one.title, f"{len(versions)} versions; {what or 'no change'}")
     _draw_axis(drawing, panel, one, versions)
     for mark in one.marks:
         x = panel.x(mark.at - 0.5)
@@ -109,7 +109,7 @@ def draw_chart(one: Chart, versions: Sequence[str]) -> Markup:
     return drawing.svg()
 
 
-def _draw_axis(drawing: Drawing, panel: Panel, one: Chart, versions: Sequence[str]) -> None:
+def _draw_axis(drawing: SvgChart, panel: Panel, one: Chart, versions: Sequence[str]) -> None:
     for value in ticks(*panel.y_range, 4):
         drawing.rule(panel.left, panel.y(value), panel.right, panel.y(value), "grid")
         drawing.text(panel.left - 6, panel.y(value) + 4, f"{value:g}", anchor="end")

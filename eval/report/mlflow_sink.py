@@ -72,9 +72,9 @@ class Experiment:
         """
         from mlflow.entities import Metric, RunTag
 
-        tags = [RunTag(fit(name), value[:MAX_VALUE]) for name, value in one.tags.items()]
+        tags = [RunTag(mlflow_name(name), value[:MAX_VALUE]) for name, value in one.tags.items()]
         metrics = [
-            Metric(fit(name), value, 0, 0)
+            Metric(mlflow_name(name), value, 0, 0)
             for name, value in one.metrics.items()
             if math.isfinite(value)
         ]
@@ -131,6 +131,6 @@ def _reported(uri: str) -> Iterator[None]:
         ) from None
 
 
-def fit(name: str) -> str:
+def mlflow_name(name: str) -> str:
     """Return a name without the characters that MLflow forbids."""
     return _STRANGE.sub("_", name)

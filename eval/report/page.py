@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from crosscue.eval.runs.candidates import CandidateRow, candidate_lines, not_looked_lines
 from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest
 from crosscue.eval.runs.tables.log_time import gaps_of
-from crosscue.eval.scoring.drives import Scores
+from crosscue.eval.scoring.drives import PooledScores
 from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.files import door
@@ -86,7 +86,7 @@ NO_FIGURES: Final = _Figures(None, (), 0, None, None, False)
 def write_report(
     folder: Path,
     scored: Sequence[RunScored],
-    scores: Scores,
+    scores: PooledScores,
     metrics: Mapping[str, Any],
     worst: Sequence[WorstFrame],
     *,
@@ -222,7 +222,7 @@ def reported_time(t_ns: int) -> str:
     return f"{at:%Y-%m-%d %H:%M:%S}.{t_ns // 1_000_000 % 1000:03d} UTC"
 
 
-def _figures(scored: Sequence[RunScored], scores: Scores) -> _Figures:
+def _figures(scored: Sequence[RunScored], scores: PooledScores) -> _Figures:
     from . import scene_figures
 
     threshold = scores.settings.threshold

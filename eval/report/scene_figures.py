@@ -11,13 +11,13 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from crosscue.eval.runs.tables.log_time import Gap, broken_at
+from crosscue.eval.runs.tables.log_time import ClockGap, broken_at
 from crosscue.eval.scoring.scene.approaches import THRESHOLD, ApproachResult, Curve
 from crosscue.eval.scoring.scene.belief import BeliefScore
 from crosscue.eval.scoring.scene.cues import CueFrames, is_wrong
 from crosscue.eval.scoring.scene.ranges import RangeJudged, RangeScore
 
-from .svg_plot import Drawing, Panel
+from .svg_plot import Panel, SvgChart
 
 STYLES: Final[Mapping[str, str]] = {
     "intersection": "s0", "left": "s1", "right": "s2", "straight": "s3",
@@ -45,7 +45,7 @@ def draw_distances(results: Sequence[ApproachResult]) -> Markup:
     names = sorted({one.intersection for one in results})
     known = _known([v for one in results for v in (one.detected_m, one.full_m)])
     panel = Panel(66, 34, WIDTH - 82, 30.0 * len(names), (0.0, max([40.0, *known]) * 1.05), (0, 1))
-    drawing = Drawing(
+    drawing = SvgChart(
         WIDTH,
         panel.bottom + 56,
         "Distance at detection",
@@ -78,7 +78,7 @@ def draw_distances(results: Sequence[ApproachResult]) -> Markup:
 
 
 def _dots(
-    drawing: Drawing,
+    drawing: SvgChart,
     panel: Panel,
     y: float,
     found: Sequence[tuple[ApproachResult, float | None]],
@@ -103,7 +103,7 @@ def draw_belief(
     curve: Curve,
     cues: Sequence[CueFrames],
     threshold: float = THRESHOLD,
-    gaps: Sequence[Gap] = (),
+    gaps: Sequence[ClockGap] = (),
 ) -> Markup:
     """Draw probability against true distance over one approach, with the cues found.
 
@@ -127,7 +127,7 @@ def draw_belief(
     far = max([1.0, *_known(np.concatenate([curve.distance_m, *seen_m]).tolist())])
     panel = Panel(112, 30, WIDTH - 96, 170, (far, 0.0), (0.0, 1.0))
     lanes = Panel(112, panel.bottom + 38, WIDTH - 96, 14.0 * len(shown), panel.x_range, (0, 1))
-    drawing = Drawing(
+    drawing = SvgChart(
         WIDTH + 24,
         lanes.bottom + 8,
         f"Probability against {kind}: {curve.intersection}",
@@ -173,12 +173,12 @@ def _way(curve: Curve, cues: Sequence[CueFrames]) -> tuple[NDArray[np.int64], ND
     return t_ns[known], distance_m[first][known]
 
 
-def _between_rows(gaps: Sequence[Gap], t_ns: NDArray[np.int64]) -> list[tuple[Gap, int]]:
+def _between_rows(gaps: Sequence[ClockGap], t_ns: NDArray[np.int64]) -> list[tuple[ClockGap, int]]:
     """Return the gaps between two rows, each with the index of the row after it."""
     return [(one, int(row)) for one in gaps for row in broken_at([one], t_ns)]
 
 
-def _shade(drawing: Drawing, panel: Panel, ends: NDArray[np.float64], text: str) -> None:
+def _shade(drawing: SvgChart, panel: Panel, ends: NDArray[np.float64], text: str) -> None:
     """Shade a gap between two values of x and label it with its length."""
     left, right = sorted(panel.x(value) for value in ends.tolist())
     drawing.rect(left, panel.top, max(right - left, 2.0), panel.height, "gap")
@@ -193,12 +193,12 @@ def _report_text(name: str, curve: Curve, threshold: float, unit: str) -> str:
 
 
 def _lane(
-    drawing: Drawing,
+    drawing: SvgChart,
     panel: Panel,
     y: float,
     cue: CueFrames,
     found: NDArray[np.bool_],
-    gaps: Sequence[Gap],
+    gaps: Sequence[ClockGap],
 ) -> None:
     """Draw a bar for each span in which the cue was found in successive observations."""
     side = next((s for s in ("left", "right", "straight") if cue.cue.endswith(s)), "intersection")
@@ -253,7 +253,7 @@ WIDEST_BIN_M: Final = 20.0
 def draw_range(
     judged: Sequence[RangeJudged],
     scores: Mapping[str, RangeScore],
-    gaps: Mapping[str, Sequence[Gap]] | None = None,
+    gaps: Mapping[str, Sequence[ClockGap]] | None = None,
 ) -> Markup:
     """Draw range errors over true distance, and the consistency of the estimated variances.
 
@@ -274,7 +274,7 @@ def draw_range(
         limit_m = max(limit_m, float(np.percentile(two_sd, 90.0)) * 1.15)
     above = Panel(40, 46, WIDTH - 50, 130, (far, near), (-limit_m, limit_m))
     below = Panel(40, above.bottom + 62, WIDTH - 50, 80, (far, near), (0.0, _max_nees(scores)))
-    drawing = Drawing(
+    drawing = SvgChart(
         WIDTH,
         below.bottom + 38,
         "Range errors and their consistency",
@@ -312,7 +312,7 @@ def draw_range(
 
 
 def _traces(
-    drawing: Drawing, panel: Panel, one: RangeJudged, style: str, gaps: Sequence[Gap]
+    drawing: SvgChart, panel: Panel, one: RangeJudged, style: str, gaps: Sequence[ClockGap]
 ) -> None:
     low, high = panel.y_range
     for number in np.unique(one.approach).tolist():
@@ -327,7 +327,7 @@ def _traces(
             drawing.curve(panel, one.true_m[part], error_m, f"line {style}")
 
 
-def _bins(drawing: Drawing, panel: Panel, score: RangeScore, style: str) -> None:
+def _bins(drawing: SvgChart, panel: Panel, score: RangeScore, style: str) -> None:
     known = {_middle(name): one for name, one in score.by_distance.items()}
     places = sorted(known)
     x = np.array(places, np.float64)
@@ -351,7 +351,7 @@ def _max_nees(scores: Mapping[str, RangeScore]) -> float:
 def draw_reliability(belief: Mapping[str, BeliefScore]) -> Markup:
     """Draw the frequency of features against their stated probability, with 95 % intervals."""
     panel = Panel(40, 46, 300, 260, (0.0, 1.0), (0.0, 1.0))
-    drawing = Drawing(
+    drawing = SvgChart(
         panel.right + 20,
         panel.bottom + 38,
         "Reliability",

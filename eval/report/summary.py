@@ -9,11 +9,11 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.eval.scoring.drives import Scores
+from crosscue.eval.scoring.drives import PooledScores
 from crosscue.eval.scoring.gates import GateResult
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW, Mean, Proportion, mean
 from crosscue.eval.scoring.metric_values import MetricValue
-from crosscue.eval.scoring.pose.score import Errors, PlaneMounting, PoseScore
+from crosscue.eval.scoring.pose.score import PlaneMounting, PoseErrorSummary, PoseScore
 from crosscue.eval.scoring.scene.approaches import ApproachScore
 from crosscue.eval.scoring.scene.belief import BeliefScore
 from crosscue.eval.scoring.scene.cues import CueScore
@@ -24,7 +24,7 @@ WIDTH: Final = 80
 LABEL: Final = 11
 
 
-def summary(scores: Scores, why_no_pose: str = "") -> str:
+def scores_text(scores: PooledScores, why_no_pose: str = "") -> str:
     """Return the pooled scores of any number of drives as text."""
     missing = scores.not_scored() | ({"pose": why_no_pose} if why_no_pose else {})
     lines = [*_coverage(scores), *(_line("not scored", f"{k}: {v}") for k, v in missing.items())]
@@ -72,7 +72,7 @@ def _wrapped(line: str) -> Iterator[str]:
     yield line
 
 
-def _coverage(scores: Scores) -> list[str]:
+def _coverage(scores: PooledScores) -> list[str]:
     frames = sum(one.frames for one in scores.drives)
     reported = sum(one.frames_annotated for one in scores.drives)
     truth_s = sum(one.truth_s for one in scores.drives)
@@ -292,7 +292,7 @@ def _compared_lines(at: PlaneMounting) -> list[str]:
     return lines
 
 
-def _pose_row(name: str, errors: Errors) -> str:
+def _pose_row(name: str, errors: PoseErrorSummary) -> str:
     t = errors.translation_m
     numbers = " ".join(f"{value:8.3f}" for value in (t.rmse, t.mean, t.median, t.max))
     return f"{name:22} {numbers} m {errors.rotation_deg.rmse:9.3f} deg"

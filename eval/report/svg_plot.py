@@ -61,7 +61,7 @@ class Panel:
 
 
 @dataclass(slots=True)
-class Drawing:
+class SvgChart:
     """A chart being drawn.
 
     Attributes:

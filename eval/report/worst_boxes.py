@@ -12,7 +12,7 @@ import numpy as np
 from crosscue.detectors.base import View
 from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.overlay import GREEN, write_label
-from crosscue.eval.runs.stored_images import StoredCamera, camera_of, picture_at
+from crosscue.eval.runs.stored_images import StoredCamera, picture_at, run_camera
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun
 from crosscue.eval.scoring.boxes.matching import match
 from crosscue.replay.columns import Bytes, Floats
@@ -73,7 +73,7 @@ def worst_pictures(labelled: LabelledRun, overlap: float, max_count: int) -> lis
             abs(int(labelled.t_ns[i] - labelled.t_ns[k])) >= APART_NS for k in chosen
         ):
             chosen.append(i)
-    camera = camera_of(labelled.run) if chosen else None
+    camera = run_camera(labelled.run) if chosen else None
     return [
         WorstPicture(
             labelled.names[i],

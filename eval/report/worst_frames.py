@@ -11,9 +11,9 @@ import numpy as np
 
 from crosscue.detectors.base import Detections, View
 from crosscue.detectors.images import Encoded, decode
-from crosscue.detectors.overlay import draw
+from crosscue.detectors.overlay import draw_detections
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.stored_images import camera_of, picture_at
+from crosscue.eval.runs.stored_images import picture_at, run_camera
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.eval.scoring.scene.cues import CueFrames, is_wrong
 from crosscue.replay.errors import CrosscueError
@@ -113,7 +113,7 @@ def _scores(run: RunFolder, times: set[int]) -> dict[int, list[dict[str, Any]]]:
 def _with_picture(one: WorstFrame, run: RunFolder) -> WorstFrame:
     labels = _labels(one.cue, run.drive_manifest().settings)
     rows = [row for row in _scores(run, {one.t_ns}).get(one.t_ns, []) if row["label"] in labels]
-    camera = camera_of(run)
+    camera = run_camera(run)
     if camera is None:
         return one
     try:
@@ -142,7 +142,7 @@ def _drawn(picture: Encoded, one: WorstFrame, rows: Sequence[Mapping[str, Any]])
         tuple(row["label"] for row in rows),
         (b"",) * len(rows),
     )
-    canvas = draw(pixels, (found,), {one.cue: one.count})
+    canvas = draw_detections(pixels, (found,), {one.cue: one.count})
     ok, jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     if not ok:
         return one

@@ -189,7 +189,7 @@ def account(
         is_whole=all(log.is_whole for log in reading)
         and not any(one.dropped or one.unknown for one in (*topics, *stages)),
     )
-    check(made)
+    check_account(made)
     return made
 
 
@@ -200,7 +200,7 @@ def detecting_of(camera: str, ledger: Ledger, frames: int) -> dict[str, Line]:
     return {camera: line(topic.in_file, frames, topic.skipped, topic.dropped, unknown)}
 
 
-def check(of: HasLines) -> None:
+def check_account(of: HasLines) -> None:
     """Check that in = used + skipped + dropped in every line.
 
     Raises:
@@ -275,7 +275,7 @@ def _joined(ours: LogAccount, before: LogAccount | None, topic: str) -> LogAccou
     )
 
 
-def summed(accounts: Iterable[Account | SummedAccount]) -> SummedAccount:
+def sum_accounts(accounts: Iterable[Account | SummedAccount]) -> SummedAccount:
     """Return the sums of the accounts of many runs, topic by topic.
 
     Raises:
@@ -298,7 +298,7 @@ def summed(accounts: Iterable[Account | SummedAccount]) -> SummedAccount:
         scoring=of("scoring"),
         is_whole=whole,
     )
-    check(made)
+    check_account(made)
     return made
 
 

@@ -16,14 +16,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.detectors.base import Choice
+from crosscue.detectors.base import DetectorChoice
 from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, RunFolder
 from crosscue.replay.base import Log, Selection, origin
 from crosscue.replay.errors import CrosscueError, UnreadableRunError, UsageError
 from crosscue.replay.files import door
-from crosscue.replay.files.identity import identity_of, identity_of_all, identity_of_log
+from crosscue.replay.files.identity import identity_of_all, identity_of_log, log_identity
 from crosscue.replay.files.log_identity import as_row, of_row
-from crosscue.replay.files.made_of import SIMULATED, difference
+from crosscue.replay.files.made_of import SIMULATED, first_difference
 from crosscue.replay.files.tree_text import json_tree, spelled, strict_json, unspelled
 from crosscue.replay.files.whole_file import file_sha256, sha256_of
 from crosscue.replay.logs.opening import open_log
@@ -33,7 +33,7 @@ from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.versions import versions
 
-from .manifest import LogRow, part_of
+from .manifest import LogRow, selection_record
 
 # Max depth of folders searched for logs that have moved.
 DEPTH: Final = 8
@@ -81,7 +81,7 @@ def is_simulated(log: Log) -> bool:
     return isinstance(place, Path) and (place.resolve().parent / SIMULATED).is_file()
 
 
-def place_of(run: RunFolder, row: LogRow) -> Path | str:
+def log_location(run: RunFolder, row: LogRow) -> Path | str:
     """Return the present location of a run's log, a URL or a path, after checking its identity.
 
     Args:
@@ -101,7 +101,7 @@ def place_of(run: RunFolder, row: LogRow) -> Path | str:
         if isinstance(place, Path) and not place.exists():
             continue
         try:
-            found = identity_of(place)
+            found = log_identity(place)
         except CrosscueError as error:
             raise UnreadableRunError(
                 f"{run.path}: its log cannot be examined: {error}; a run keeps no user, password "
@@ -140,10 +140,10 @@ def reopened(run: RunFolder, row: LogRow) -> Log:
     """Open a log of a run.
 
     Raises:
-        RunError: As for ``place_of``.
+        RunError: As for ``log_location``.
         LogError: The log cannot be opened.
     """
-    return open_log(place_of(run, row), run.limits)
+    return open_log(log_location(run, row), run.limits)
 
 
 def input_of(
@@ -151,7 +151,7 @@ def input_of(
     logs: Sequence[Log],
     vehicle: Vehicle,
     selection: Selection,
-    choices: Sequence[Choice],
+    choices: Sequence[DetectorChoice],
     draw: int,
     landmarks: Path | None,
 ) -> dict[str, object]:
@@ -168,7 +168,7 @@ def input_of(
     """
     settings = {
         "vehicle": vehicle.model_dump(mode="json"),
-        "selection": part_of(selection).as_json(),
+        "selection": selection_record(selection).as_json(),
         "detectors": [choice.as_row() for choice in choices],
         "draw": draw,
         "landmarks": None if landmarks is None else str(landmarks.resolve()),
@@ -198,7 +198,7 @@ def _renamed(tree: object, names: Mapping[str, str]) -> Any:
     return names.get(tree, tree) if isinstance(tree, str) else tree
 
 
-def refuse_another(run: RunFolder, mine: Mapping[str, Any]) -> None:
+def refuse_other_input(run: RunFolder, mine: Mapping[str, Any]) -> None:
     """Refuse to resume a run of any other input; an empty folder is accepted.
 
     Raises:
@@ -221,7 +221,7 @@ def refuse_another(run: RunFolder, mine: Mapping[str, Any]) -> None:
             f"{run.path}: holds a run of {theirs}, not of {ours}: --resume would destroy it; give "
             "another folder or --overwrite"
         )
-    different = difference(there["settings"], mine["settings"])
+    different = first_difference(there["settings"], mine["settings"])
     if different is not None:
         raise UsageError(
             f"{run.path}: holds a run of {theirs} with other settings ({different}), which "

@@ -19,7 +19,7 @@ from crosscue.replay.base import Selection
 from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.files.log_identity import Identity
 from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.time.segments import LogClock, Segment, Timeline
+from crosscue.replay.time.segments import LogClock, Timeline, TimeSegment
 from crosscue.replay.vehicle.section import tuples
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -93,7 +93,7 @@ class Part(Record):
         return Selection(topics, self.start_ns, self.end_ns)
 
 
-def part_of(selection: Selection) -> Part:
+def selection_record(selection: Selection) -> Part:
     """Return a selection in the form of the manifest."""
     topics = None if selection.topics is None else tuple(sorted(selection.topics))
     return Part(start_ns=selection.start_ns, end_ns=selection.end_ns, topics=topics)
@@ -102,7 +102,7 @@ def part_of(selection: Selection) -> Part:
 class TimeSegments(Record):
     """The drive's time segments and the clock of each log."""
 
-    segments: tuple[Segment, ...]
+    segments: tuple[TimeSegment, ...]
     clocks: tuple[LogClock, ...]
     notices: tuple[str, ...]
 
@@ -392,6 +392,6 @@ def parse_manifest(content: bytes) -> Manifest:
         raise ValueError(f"{place or 'stage'}: {why}") from None
 
 
-def json_schema() -> dict[str, Any]:
+def manifest_json_schema() -> dict[str, Any]:
     """Return the JSON Schema of ``manifest.json``."""
     return _ANY.json_schema(mode="serialization")

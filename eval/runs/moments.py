@@ -16,7 +16,7 @@ from .tables.parquet import TableFolder
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = ["TableFolder", "approach_spans", "moment_ns", "part_of", "seconds_into", "span_ns"]
+__all__ = ["TableFolder", "approach_spans", "moment_ns", "run_between", "seconds_into", "span_ns"]
 
 # Tables that define a run's time span; the first that has rows is used.
 TABLES: Final = ("frames", "pose")
@@ -123,6 +123,6 @@ def _with_time(columns: list[str] | None) -> list[str] | None:
     return columns if columns is None else list(dict.fromkeys([*columns, "t_ns"]))
 
 
-def part_of(run: RunFolder, start_ns: int, end_ns: int) -> RunFolder:
+def run_between(run: RunFolder, start_ns: int, end_ns: int) -> RunFolder:
     """Return a view of the run from one moment to another, both included."""
     return PartOfRun(run.path, run.logs, run.without_images, run.limits, run.home, start_ns, end_ns)

@@ -18,12 +18,12 @@ from crosscue.replay.errors import LogError, RunError, UnreadableRunError
 from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.signals.extractor import Extractor
-from crosscue.replay.signals.kinds import Plan, Source
+from crosscue.replay.signals.extractor import SampleExtractor
+from crosscue.replay.signals.kinds import SignalPlan, SignalSource
 from crosscue.replay.time.segments import UNSHIFTED, LogClock, TimedLog
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .logs import place_of
+from .logs import log_location
 from .manifest import DetectManifest
 
 # Max difference between a picture's own clock and the log's.
@@ -51,7 +51,7 @@ class StoredCamera:
     limits: Limits = DEFAULT_LIMITS
 
 
-def camera_of(run: RunFolder) -> StoredCamera | None:
+def run_camera(run: RunFolder) -> StoredCamera | None:
     """Return the camera of a run; None if its logs have none, or several without a choice.
 
     Raises:
@@ -73,7 +73,7 @@ def camera_of(run: RunFolder) -> StoredCamera | None:
         return None
     number, entry, name = cameras[0]
     try:
-        place = place_of(run, entry)
+        place = log_location(run, entry)
     except RunError as error:
         raise UnreadableRunError(f"{error}; --without-images leaves its pictures out") from None
     with open_log(place, run.limits) as log:
@@ -154,8 +154,8 @@ def read_pictures(
                 lose(ledger, block.topic, log_ns, error)
                 lost += 1
 
-    extractor = Extractor(
-        Plan((Source(0, camera.topic, ()),), {}),
+    extractor = SampleExtractor(
+        SignalPlan((SignalSource(0, camera.topic, ()),), {}),
         Vehicle(version=1),
         0,
         ledger,

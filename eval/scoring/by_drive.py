@@ -108,7 +108,7 @@ def no_longer_scored(
     return tuple(dict.fromkeys(one.metric for one in before if is_lost(one)))
 
 
-def parts_of(
+def drive_contributions(
     log: str, tree: Mapping[str, Any], pose_rmse_m: float | None, is_lost: bool
 ) -> Iterator[DriveMetric]:
     """Yield the contributions of one drive to all metrics that are judged or shown.
@@ -169,7 +169,7 @@ def _of_all(part: DriveMetric, values: Mapping[str, MetricValue]) -> DriveMetric
     return part._replace(metric=part.metric + OR_0, rows=rows)
 
 
-def table_of(parts: Iterator[DriveMetric]) -> pa.Table:
+def by_drive_table(parts: Iterator[DriveMetric]) -> pa.Table:
     """Return the table ``by_drive.parquet``."""
     import pyarrow as pa
 

@@ -1,6 +1,6 @@
 """Scores of drives from their tables: coverage, cues, approaches, belief, range.
 
-``judge`` compares one drive with its truth; ``score`` pools any number of judged drives.
+``score_drive`` compares one drive with its truth; ``score`` pools any number of judged drives.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class DriveJudged:
 
 
 @dataclass(frozen=True, slots=True)
-class Scores:
+class PooledScores:
     """Scores of all drives together.
 
     Attributes:
@@ -133,7 +133,9 @@ class Scores:
         }
 
 
-def judge(tables: RunTables, truth: DriveTruth, settings: ScoreSettings = DEFAULTS) -> DriveJudged:
+def score_drive(
+    tables: RunTables, truth: DriveTruth, settings: ScoreSettings = DEFAULTS
+) -> DriveJudged:
     """Compare one drive with its truth.
 
     Raises:
@@ -202,7 +204,7 @@ def _not_scored(tables: RunTables, truth: DriveTruth) -> dict[str, str]:
     return found
 
 
-def score(drives: Sequence[DriveJudged], settings: ScoreSettings = DEFAULTS) -> Scores:
+def score(drives: Sequence[DriveJudged], settings: ScoreSettings = DEFAULTS) -> PooledScores:
     """Score any number of judged drives together.
 
     Raises:
@@ -212,7 +214,7 @@ def score(drives: Sequence[DriveJudged], settings: ScoreSettings = DEFAULTS) -> 
     if not names or len(set(names)) != len(names):
         raise ValueError(f"drives: expected one or more with different names, got {names}")
     bins_m = settings.bins_m
-    return Scores(
+    return PooledScores(
         settings=settings,
         drives=tuple(one.coverage for one in drives),
         cues=score_cues([cue for one in drives for cue in one.cues], bins_m),
@@ -224,7 +226,7 @@ def score(drives: Sequence[DriveJudged], settings: ScoreSettings = DEFAULTS) -> 
     )
 
 
-def as_metrics(scores: Scores) -> dict[str, Any]:
+def as_metrics(scores: PooledScores) -> dict[str, Any]:
     """Return the scores as plain values, as in ``metrics.json``, coverage first."""
     tree = asdict(scores)
     return {

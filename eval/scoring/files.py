@@ -13,7 +13,7 @@ import numpy as np
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_table, write_text
 
-from .by_drive import BY_DRIVE, DriveMetric, parts_of, table_of
+from .by_drive import BY_DRIVE, DriveMetric, by_drive_table, drive_contributions
 from .by_drive import FOLDER as FOLDER
 from .by_drive import METRICS as METRICS
 from .drives import DriveJudged, as_metrics, score
@@ -42,7 +42,7 @@ def write_scores(folder: Path, scored: Sequence[RunScored], metrics: Mapping[str
         CUE_FRAMES: cue_frame_table(judged),
         APPROACHES: approach_table(judged),
     }
-    for name, table in (tables | {BY_DRIVE: table_of(parts)}).items():
+    for name, table in (tables | {BY_DRIVE: by_drive_table(parts)}).items():
         write_table(folder / f"{name}.parquet", table)
 
 
@@ -50,7 +50,7 @@ def _parts(one: RunScored) -> Iterator[DriveMetric]:
     logs = "+".join(sorted(log.identity.digest for log in one.run.drive_manifest().logs))
     rmse_m = None if one.pose is None else one.pose.ape["none"].translation_m.rmse
     is_lost = one.pose is not None and one.pose.lost_at_m is not None
-    return parts_of(logs, as_metrics(score([one.judged])), rmse_m, is_lost)
+    return drive_contributions(logs, as_metrics(score([one.judged])), rmse_m, is_lost)
 
 
 def curve_table(judged: Sequence[DriveJudged]) -> pa.Table:

@@ -36,7 +36,7 @@ def cluster_numbers(
     return np.concatenate(numbers)
 
 
-def summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+def sum_counts(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     """Return the sums of counts by reason."""
     total: dict[str, int] = {}
     for one in counts:

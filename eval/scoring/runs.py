@@ -11,9 +11,16 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from crosscue.datasets.truth.truth import FILE, Truth
-from crosscue.eval.runs.account import Line, ScoredAccount, SummedAccount, check, line, summed
+from crosscue.eval.runs.account import (
+    Line,
+    ScoredAccount,
+    SummedAccount,
+    check_account,
+    line,
+    sum_accounts,
+)
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.logs import place_of
+from crosscue.eval.runs.logs import log_location
 from crosscue.eval.runs.manifest import LogRow
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.replay.errors import RunError, SchemaError, UsageError
@@ -27,11 +34,11 @@ from .drives import (
     DEFAULTS,
     DriveJudged,
     FilterAndSmoother,
-    Scores,
+    PooledScores,
     ScoreSettings,
     as_metrics,
-    judge,
     score,
+    score_drive,
     score_smoothed,
 )
 from .pose import score as score_pose
@@ -101,7 +108,7 @@ def find_truth(run: RunFolder, given: Path | None) -> Path:
 def _place(run: RunFolder, log: LogRow) -> Path:
     """Return the present or former path of a log, whose truth may still be there."""
     try:
-        return Path(place_of(run, log))
+        return Path(log_location(run, log))
     except RunError:
         return Path(os.path.normpath(run.absolute(log.path)))
 
@@ -129,7 +136,7 @@ def judge_run(
     """
     truth, judged = judge_scene(run, truth_path, settings, any_log=any_log)
     why = _why_no_pose(run, truth.truth)
-    pose, poses = (None, None) if why else score_pose.measure(run, truth_path, rpe_m)
+    pose, poses = (None, None) if why else score_pose.measure_pose(run, truth_path, rpe_m)
     nothing = judged.coverage.not_scored
     if why and {"cues", "belief", "range"} <= nothing.keys():
         reasons = "; ".join(dict.fromkeys([*nothing.values(), why]))
@@ -151,15 +158,15 @@ def judge_scene(
         SchemaError: The truth does not fit the run.
     """
     run.drive_manifest()
-    truth = score_truth.load(truth_path, spelled(str(run.path)))
+    truth = score_truth.read_scored_truth(truth_path, spelled(str(run.path)))
     if not any_log:
         _check_log(run, truth.truth, truth_path)
-    tables = tables_of(run)
+    tables = read_run_tables(run)
     _check_times(run, truth.truth, tables, truth_path)
-    return SceneJudged(truth, judge(tables, truth, settings))
+    return SceneJudged(truth, score_drive(tables, truth, settings))
 
 
-def tables_of(run: RunFolder) -> RunTables:
+def read_run_tables(run: RunFolder) -> RunTables:
     """Read a run's tables; a missing one becomes None.
 
     Raises:
@@ -172,7 +179,7 @@ def tables_of(run: RunFolder) -> RunTables:
 
 def smoothed_ranges(one: RunScored) -> dict[str, FilterAndSmoother]:
     """Return errors of the range filter and of its smoother, by reference."""
-    return score_smoothed(tables_of(one.run), one.truth, odometer_of(one.run))
+    return score_smoothed(read_run_tables(one.run), one.truth, odometer_of(one.run))
 
 
 def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
@@ -195,7 +202,7 @@ def _check_log(run: RunFolder, truth: Truth, path: Path) -> None:
 def _check_times(run: RunFolder, truth: Truth, tables: RunTables, path: Path) -> None:
     """Refuse truth with an approach completely outside a run of the complete log.
 
-    Truth whose time does not overlap with the run's at all is refused by ``judge``.
+    Truth whose time does not overlap with the run's at all is refused by ``score_drive``.
     """
     selection = run.drive_manifest().selection
     span = tables.span_ns()
@@ -218,12 +225,12 @@ def _why_no_pose(run: RunFolder, truth: Truth) -> str:
     return "" if run.table("pose", ["t_ns"]).num_rows else "the run's pose has no row"
 
 
-def scores_of(scored: Sequence[RunScored], settings: ScoreSettings = DEFAULTS) -> Scores:
+def pooled_scores(scored: Sequence[RunScored], settings: ScoreSettings = DEFAULTS) -> PooledScores:
     """Return the pooled scores of runs."""
     return score([one.judged for one in scored], settings)
 
 
-def metrics_of(scored: Sequence[RunScored], scores: Scores) -> dict[str, Any]:
+def metrics_of(scored: Sequence[RunScored], scores: PooledScores) -> dict[str, Any]:
     """Return the content of ``metrics.json``: pooled scores, with the pose.
 
     The pose of a single run is included completely; for several runs, means over drives and the
@@ -256,9 +263,9 @@ def account_of_scores(scored: Sequence[RunScored]) -> ScoredAccount | SummedAcco
             is_whole=of.is_whole,
             scoring=scoring_of(only),
         )
-        check(found)
+        check_account(found)
         return found
-    return summed(account_of_scores([one]) for one in scored)
+    return sum_accounts(account_of_scores([one]) for one in scored)
 
 
 def scoring_of(one: RunScored) -> dict[str, Line]:

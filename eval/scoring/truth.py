@@ -119,7 +119,7 @@ class DriveTruth:
         return next(one for one in self.truth.approaches if one.id == number)
 
 
-def load(path: Path, drive: str) -> DriveTruth:
+def read_scored_truth(path: Path, drive: str) -> DriveTruth:
     """Read a truth file and its ranges.
 
     Ranges are read from its CSV file or, without one, computed along its track.
@@ -128,7 +128,7 @@ def load(path: Path, drive: str) -> DriveTruth:
         AnnotationError: A file is not valid.
         LogError: The trajectory cannot be read.
     """
-    truth = truth_file.load(path)
+    truth = truth_file.read_truth(path)
     folder = path if path.is_dir() else path.parent
     ranges = None
     if truth.ranges is not None:

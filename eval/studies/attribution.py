@@ -17,11 +17,11 @@ from crosscue.eval.scoring.columns import RunTables
 from crosscue.eval.scoring.drives import (
     DEFAULTS,
     DriveJudged,
-    Scores,
+    PooledScores,
     ScoreSettings,
     as_metrics,
-    judge,
     score,
+    score_drive,
 )
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.metric_values import metric_values
@@ -44,7 +44,7 @@ class EstimateWithout(Protocol):
         ...
 
 
-class Drive(NamedTuple):
+class AttributedDrive(NamedTuple):
     """A judged drive, its truth, and the function that estimates it again."""
 
     judged: DriveJudged
@@ -79,7 +79,7 @@ class Attribution:
     """
 
     cues: tuple[str, ...]
-    scores: Scores
+    scores: PooledScores
     measures: dict[str, Worth]
     detected_m: Mean
     full_m: Mean
@@ -91,7 +91,7 @@ class Attribution:
 
 
 def attribute(
-    drives: Sequence[Drive],
+    drives: Sequence[AttributedDrive],
     groups: Mapping[str, Sequence[str]] | None = None,
     settings: ScoreSettings = DEFAULTS,
 ) -> dict[str, Attribution]:
@@ -109,10 +109,13 @@ def attribute(
 
 
 def _without(
-    drives: Sequence[Drive], whole: Scores, cues: tuple[str, ...], settings: ScoreSettings
+    drives: Sequence[AttributedDrive],
+    whole: PooledScores,
+    cues: tuple[str, ...],
+    settings: ScoreSettings,
 ) -> Attribution:
     left = frozenset(cues)
-    judged = [judge(one.estimate(left), one.truth, settings) for one in drives]
+    judged = [score_drive(one.estimate(left), one.truth, settings) for one in drives]
     scores = score(judged, settings)
     pairs = _pairs(whole, scores)
     detected = [(a.detected_m, b.detected_m) for a, b in pairs]
@@ -134,7 +137,9 @@ def _without(
     )
 
 
-def _pairs(whole: Scores, without: Scores) -> list[tuple[ApproachResult, ApproachResult]]:
+def _pairs(
+    whole: PooledScores, without: PooledScores
+) -> list[tuple[ApproachResult, ApproachResult]]:
     if whole.approaches is None or without.approaches is None:
         return []
     others = {(one.drive, one.approach): one for one in without.approaches.results}
@@ -150,7 +155,7 @@ def _only(pairs: Sequence[tuple[float | None, float | None]], side: int) -> int:
     return sum(pair[side] is not None and pair[1 - side] is None for pair in pairs)
 
 
-def _changed(whole: Scores, without: Scores) -> dict[str, Worth]:
+def _changed(whole: PooledScores, without: PooledScores) -> dict[str, Worth]:
     trees = [as_metrics(one) for one in (whole, without)]
     values = [
         metric_values({name: tree[name] or {} for name in SHOWN}, parts=False) for tree in trees

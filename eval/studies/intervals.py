@@ -26,7 +26,7 @@ RIDGE: Final = 1e-6
 STEEPEST: Final = 40.0
 
 
-class Measured(NamedTuple):
+class ValueInterval(NamedTuple):
     """A value and its 95 % interval; infinite beyond the longest drive, NaN for too few drives."""
 
     value: float
@@ -34,16 +34,16 @@ class Measured(NamedTuple):
     high: float
 
 
-def mean_of(values: Floats) -> Measured:
+def mean_of(values: Floats) -> ValueInterval:
     """Return the mean, with the interval of Student's t; NaN without values."""
     return ratio_of(values, np.ones(len(values)))
 
 
-def fraction_of(right: int, of: int) -> Measured:
+def fraction_of(right: int, of: int) -> ValueInterval:
     """Return a fraction with Wilson's interval (1927)."""
     if not of:
-        return Measured(math.nan, 0.0, 1.0)
-    return Measured(right / of, *wilson(right, of))
+        return ValueInterval(math.nan, 0.0, 1.0)
+    return ValueInterval(right / of, *wilson(right, of))
 
 
 def weights_of(n: int, replicates: int = REPLICATES, seed: int = 0) -> Floats:
@@ -53,44 +53,44 @@ def weights_of(n: int, replicates: int = REPLICATES, seed: int = 0) -> Floats:
     return np.vstack([np.ones((1, n)), drawn])
 
 
-def measured(values: Floats, drives: int) -> Measured:
+def measured(values: Floats, drives: int) -> ValueInterval:
     """Return the first value, with percentiles of the bootstrap replicates that follow it."""
     from scipy.special import ndtr, stdtrit
 
     if drives < MIN_CLUSTERS:
-        return Measured(float(values[0]), math.nan, math.nan)
+        return ValueInterval(float(values[0]), math.nan, math.nan)
     tail = float(ndtr(math.sqrt(drives / (drives - 1)) * stdtrit(drives - 1, 0.025)))
     # Replicates can be infinite, so percentiles are by rank, without interpolation.
     low, high = np.quantile(values[1:], [tail, 1.0 - tail], method="nearest")
-    return Measured(float(values[0]), float(low), float(high))
+    return ValueInterval(float(values[0]), float(low), float(high))
 
 
-def ratio_of(top: Floats, bottom: Floats) -> Measured:
+def ratio_of(top: Floats, bottom: Floats) -> ValueInterval:
     """Return the ratio of two sums over the same drives; NaN without drives."""
     if not bottom.any():
-        return Measured(math.nan, math.nan, math.nan)
+        return ValueInterval(math.nan, math.nan, math.nan)
     ratio = float(top.sum() / bottom.sum())
     return _with_t(ratio, (top - ratio * bottom) / bottom.sum())
 
 
-def _with_t(value: float, influence: Floats) -> Measured:
+def _with_t(value: float, influence: Floats) -> ValueInterval:
     """Return a value with Student's interval, from the influence of each drive on it."""
     from scipy.special import stdtrit
 
     n = len(influence)
     if n < MIN_CLUSTERS:
-        return Measured(value, math.nan, math.nan)
+        return ValueInterval(value, math.nan, math.nan)
     half = float(stdtrit(n - 1, 0.975)) * math.sqrt(n / (n - 1) * float(influence @ influence))
-    return Measured(value, value - half, value + half)
+    return ValueInterval(value, value - half, value + half)
 
 
-def ratio_of_means(top: Floats, of_top: Floats, bottom: Floats, of_bottom: Floats) -> Measured:
+def ratio_of_means(top: Floats, of_top: Floats, bottom: Floats, of_bottom: Floats) -> ValueInterval:
     """Return the ratio of two means over paired drives, each over the drives of weight 1.
 
     NaN if all weights of a mean are 0.
     """
     if not (of_top.any() and of_bottom.any()):
-        return Measured(math.nan, math.nan, math.nan)
+        return ValueInterval(math.nan, math.nan, math.nan)
     means = (top @ of_top) / of_top.sum(), (bottom @ of_bottom) / of_bottom.sum()
     moves = (
         (top / means[0] - 1.0) * of_top / of_top.sum(),
@@ -100,7 +100,7 @@ def ratio_of_means(top: Floats, of_top: Floats, bottom: Floats, of_bottom: Float
     return _with_t(ratio, ratio * (moves[0] - moves[1]))
 
 
-def range_at(distances_m: Floats, is_success: Floats, fraction: float) -> Measured:
+def range_at(distances_m: Floats, is_success: Floats, fraction: float) -> ValueInterval:
     """Return the distance at which success falls to ``fraction``, from a logistic curve.
 
     Args:

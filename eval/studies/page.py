@@ -32,7 +32,7 @@ p.note{color:var(--soft)}"""
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class PageTable:
     """A table of text.
 
     Attributes:
@@ -59,8 +59,12 @@ class Table:
         ).rstrip()
 
 
-def write_page(
-    path: Path, title: str, notes: Sequence[str], tables: Sequence[Table], pictures: Sequence[Path]
+def write_study_page(
+    path: Path,
+    title: str,
+    notes: Sequence[str],
+    tables: Sequence[PageTable],
+    pictures: Sequence[Path],
 ) -> None:
     """Write the page.
 
@@ -81,7 +85,7 @@ def write_page(
     )
 
 
-def _table(table: Table) -> str:
+def _table(table: PageTable) -> str:
     head = "".join(f"<th>{html.escape(name)}</th>" for name in table.head)
     rows = "".join(
         "<tr>" + "".join(f"<td>{html.escape(entry)}</td>" for entry in row) + "</tr>\n"

@@ -30,7 +30,7 @@ def figure(columns: int, width: float, height: float) -> tuple[Figure, list[Axes
     return made, list(axes)
 
 
-def save(made: Figure, folder: Path, name: str) -> Path:
+def save_figure(made: Figure, folder: Path, name: str) -> Path:
     """Write ``NAME.png`` and ``NAME.svg``; return the path of the PNG.
 
     Raises:

@@ -23,7 +23,7 @@ from crosscue.datasets.scenes.drive import (
 )
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.detectors.registry import EMBEDDED, chosen
-from crosscue.eval.batch.jobs import Done, Engine, Job, fingerprint_of, run_many
+from crosscue.eval.batch.jobs import Engine, Job, JobOutcome, fingerprint_of, run_many
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
@@ -94,11 +94,11 @@ def code_of(folder: str) -> str:
     """Return a hash of a folder's code, which does not depend on comments and docstrings."""
     digest = hashlib.sha256()
     for source in sorted((Path(__file__).parents[2] / folder).rglob("*.py")):
-        digest.update(meaning_of(source.read_text(encoding="utf-8")).encode())
+        digest.update(code_meaning(source.read_text(encoding="utf-8")).encode())
     return digest.hexdigest()
 
 
-def meaning_of(source: str) -> str:
+def code_meaning(source: str) -> str:
     """Return a module's syntax tree without docstrings and comments."""
     tree = ast.parse(source)
     for node in ast.walk(tree):
@@ -124,7 +124,7 @@ def run_drives(
     *,
     vehicle: Path | None = None,
     imager: Imager = PHOTOGRAPHS,
-) -> tuple[Done[Outcome], ...]:
+) -> tuple[JobOutcome[Outcome], ...]:
     """Simulate and replay all missing drives below ``out``.
 
     Args:

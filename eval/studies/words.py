@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from .intervals import TOO_FEW, Measured
+from .intervals import TOO_FEW, ValueInterval
 
 
-def km(value: Measured, digits: int = 2) -> str:
+def km(value: ValueInterval, digits: int = 2) -> str:
     """Return a distance in kilometres with its interval."""
     if math.isinf(value.value):
         return "beyond"
@@ -17,7 +17,7 @@ def km(value: Measured, digits: int = 2) -> str:
     return f"{value.value / 1e3:.{digits}f} ({value.low / 1e3:.{digits}f}..{high})"
 
 
-def percent(value: Measured) -> str:
+def percent(value: ValueInterval) -> str:
     """Return a fraction in per cent with its interval."""
     if math.isnan(value.low):
         return f"{100 * value.value:.1f} % ({TOO_FEW})"

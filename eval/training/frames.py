@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 from crosscue.datasets.scenes.drive import SOURCE
-from crosscue.datasets.scenes.export.coco import Objects
-from crosscue.datasets.scenes.export.training_frames import frames, joined
+from crosscue.datasets.scenes.export.coco import DriveAnnotations
+from crosscue.datasets.scenes.export.training_frames import frames, merge_annotations
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 from crosscue.eval.training.inputs import check_place, training_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
@@ -78,11 +78,11 @@ def render_training_frames(
     if target.exists():
         raise OutputError(f"{target}: exists; give another folder")
     check_place(images / "any")
-    parts: list[Objects] = []
+    parts: list[DriveAnnotations] = []
     for part in frames(wanted, per_layout, images, workers):
         parts.append(part)
         emit(Progress("rendering", len(parts), len(wanted), "runs"))
-    whole = joined(parts)
+    whole = merge_annotations(parts)
     whole.save(target, f"{SOURCE}; layouts {' '.join(layouts)}, seed {seed}")
     return TrainingFrames(target, len(whole.images), len(whole.annotations))
 

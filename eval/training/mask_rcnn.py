@@ -19,8 +19,8 @@ from crosscue.verb import Option
 if TYPE_CHECKING:
     from crosscue.detectors.networks.mask_rcnn.checkpoint import Facts
     from crosscue.detectors.training.annotations import LabelledSet
-    from crosscue.detectors.training.job import Job, Point
-    from crosscue.detectors.training.measure import Measured
+    from crosscue.detectors.training.job import CurvePoint, TrainingJob
+    from crosscue.detectors.training.measure import NetworkResults
 
 CLASSES: Final = ("car", "stop sign", "traffic light")
 HELD_EVERY: Final = 10
@@ -128,7 +128,7 @@ class MeasuredMaskRcnn(Result):
 
     network: str
     pictures: int
-    by_proposals: dict[int, Measured] = field(metadata=HIDDEN)
+    by_proposals: dict[int, NetworkResults] = field(metadata=HIDDEN)
     also: ClassVar = {"measured": "measured"}
 
     @property
@@ -212,7 +212,7 @@ def train_mask_rcnn(
     for name, one in (("training", train), ("held out", held_out)):
         emit(f"{name}: {_set_text(one)}")
 
-    def report(point: Point) -> None:
+    def report(point: CurvePoint) -> None:
         emit(
             f"step {point.step} of {settings.steps}: loss {point.loss:.3f}, "
             f"{_precision_text(point.ap)}, {point.seconds:.0f} s"
@@ -234,24 +234,24 @@ def _measure(
         raise UsageError("proposals: expected 1 to 2000")
     from crosscue.detectors.networks.devices import chosen_device
     from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, checkpoint_named
-    from crosscue.detectors.training.annotations import read_coco
-    from crosscue.detectors.training.measure import measure
+    from crosscue.detectors.training.annotations import read_training_coco
+    from crosscue.detectors.training.measure import measure_network
 
     device = settings.device if measuring.backend == "torch" else "cpu"
     chosen = chosen_device(device, "train mask-rcnn")
     checkpoint = checkpoint_named(network)
     classes = [name for name in checkpoint.facts.plan.classes if name]
-    whole = read_coco(Path(settings.data), Path(settings.images), classes)
+    whole = read_training_coco(Path(settings.data), Path(settings.images), classes)
     labelled = replace(whole, pictures=whole.pictures[_slice(measuring.subset)])
     if not labelled.pictures:
         count = len(whole.pictures)
         raise UsageError(
             f"subset: {measuring.subset}: selects none of {count} pictures; select others"
         )
-    measured: dict[int, Measured] = {}
+    measured: dict[int, NetworkResults] = {}
     for count in measuring.proposals:
         how = {"proposals": count, "threads": settings.threads, "backend": measuring.backend}
-        measured[count] = measure(
+        measured[count] = measure_network(
             checkpoint, labelled, MaskRcnnSettings.model_validate(how), chosen
         )
         emit(Progress("measuring", len(measured), len(measuring.proposals), "measurements"))
@@ -309,11 +309,13 @@ def _slice(text: str | None) -> slice:
 
 
 def _sets(settings: MaskRcnnTrainingSettings) -> tuple[LabelledSet, LabelledSet]:
-    from crosscue.detectors.training.annotations import read_coco
+    from crosscue.detectors.training.annotations import read_training_coco
 
-    whole = read_coco(Path(settings.data), Path(settings.images), settings.classes)
+    whole = read_training_coco(Path(settings.data), Path(settings.images), settings.classes)
     if settings.val_data is not None and settings.val_images is not None:
-        held_out = read_coco(Path(settings.val_data), Path(settings.val_images), settings.classes)
+        held_out = read_training_coco(
+            Path(settings.val_data), Path(settings.val_images), settings.classes
+        )
         return whole, held_out
     rest = tuple(one for i, one in enumerate(whole.pictures) if i % HELD_EVERY)
     if not rest:
@@ -323,17 +325,17 @@ def _sets(settings: MaskRcnnTrainingSettings) -> tuple[LabelledSet, LabelledSet]
     return replace(whole, pictures=rest), replace(whole, pictures=whole.pictures[::HELD_EVERY])
 
 
-def _job(settings: MaskRcnnTrainingSettings, output: Path) -> Job:
+def _job(settings: MaskRcnnTrainingSettings, output: Path) -> TrainingJob:
     from pydantic import ValidationError
 
-    from crosscue.detectors.networks.mask_rcnn.network import Plan
-    from crosscue.detectors.training.job import Job, architecture_of
+    from crosscue.detectors.networks.mask_rcnn.network import NetworkPlan
+    from crosscue.detectors.training.job import TrainingJob, architecture_of
     from crosscue.detectors.training.loop import Schedule
-    from crosscue.detectors.training.samples import Window
+    from crosscue.detectors.training.samples import SampleSettings
 
     start, steps, window_px = str(settings.init), settings.steps, settings.window_px
     try:
-        plan = Plan.model_validate(
+        plan = NetworkPlan.model_validate(
             {
                 "architecture": architecture_of(start),
                 "classes": settings.classes,
@@ -346,13 +348,13 @@ def _job(settings: MaskRcnnTrainingSettings, output: Path) -> Job:
         first = error.errors(include_url=False)[0]
         name = ".".join(str(part) for part in first["loc"]) or "--crop-top, --crop-bottom"
         raise UsageError(f"train mask-rcnn: {name}: {first['msg'].lower()}") from None
-    return Job(
+    return TrainingJob(
         start=start,
         plan=plan,
         schedule=Schedule(
             steps, settings.batch, settings.learning_rate, min(100, steps), seed=settings.seed
         ),
-        window=Window(*window_px, balance=settings.balance),
+        window=SampleSettings(*window_px, balance=settings.balance),
         output=output,
         check_every=settings.check_every,
         check_pictures=settings.check_images,

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
-from crosscue.datasets.scenes.export.road_frames import RoadFrames, joined, rendered
+from crosscue.datasets.scenes.export.road_frames import RoadFrames, concatenate_frames, rendered
 from crosscue.datasets.scenes.layout import SCORED
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval.training.inputs import Device, check_place, layouts_of, training_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
@@ -203,10 +203,10 @@ def _measure(network: str, settings: RoadTrainingSettings) -> TrainedRoad:
     from crosscue.datasets.adapters.road_folder import load_folder
     from crosscue.detectors.networks.devices import chosen_device
     from crosscue.detectors.networks.road.checkpoint import load_road
-    from crosscue.detectors.networks.road.network import embedded_path
+    from crosscue.detectors.networks.road.network import embedded_road
 
     chosen = chosen_device(settings.device, "train road")
-    checkpoint = load_road(embedded_path() if network == "embedded" else Path(network))
+    checkpoint = load_road(embedded_road() if network == "embedded" else Path(network))
     size = (checkpoint.facts.width_px, checkpoint.facts.height_px)
     if settings.data is None:
         frames = _test_frames(settings, size)
@@ -305,7 +305,7 @@ def _test_frames(settings: RoadTrainingSettings, size: Size) -> RoadFrames | Non
 
 
 def _rendered(names: list[str], size: Size, settings: RoadTrainingSettings) -> RoadFrames:
-    camera, seed = Camera(width_px=2 * size[0], height_px=2 * size[1]), settings.seed
+    camera, seed = SceneCamera(width_px=2 * size[0], height_px=2 * size[1]), settings.seed
     # There are ten kinds of conditions, by number of the run; this uses each equally often.
     runs = [
         SceneSettings(layout=name, run=number % 10 + 1, seed=seed, camera=camera)
@@ -321,4 +321,4 @@ def _rendered(names: list[str], size: Size, settings: RoadTrainingSettings) -> R
     for part in rendered(runs, settings.per_layout, size):
         parts.append(part)
         emit(Progress("rendering", len(parts), len(runs), "runs"))
-    return joined(parts)
+    return concatenate_frames(parts)

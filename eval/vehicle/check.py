@@ -14,13 +14,13 @@ from crosscue.replay.base import Log, Selection, name_of
 from crosscue.replay.columns import Bytes, Floats, Int64s, Topic
 from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import Ledger, warn_of
-from crosscue.replay.signals.extractor import Extractor, pictures_of
-from crosscue.replay.signals.kinds import Plan, Samples, Signal
-from crosscue.replay.signals.plan import camera_of, plan
+from crosscue.replay.signals.extractor import SampleExtractor, pictures_of
+from crosscue.replay.signals.kinds import Samples, Signal, SignalPlan
+from crosscue.replay.signals.plan import chosen_camera, plan
 from crosscue.replay.signals.windows import windows
 from crosscue.replay.vehicle.drafting.agreement import (
     DEGREE,
-    Verdict,
+    SignalVerdict,
     judge_speed,
     judge_steering,
     judge_yaw_rate,
@@ -30,7 +30,7 @@ from crosscue.replay.vehicle.drafting.agreement import (
     of_wheels,
 )
 from crosscue.replay.vehicle.drafting.camera import KnowsItsCameras
-from crosscue.replay.vehicle.drafting.series import Grid, Series, Track
+from crosscue.replay.vehicle.drafting.series import Grid, GroundTrack, Series
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 
 WHEELS: Final = ("front left", "front right", "rear left", "rear right")
@@ -68,7 +68,7 @@ class SignalRow:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shown:
+class CameraPicture:
     """One picture of the camera.
 
     Attributes:
@@ -96,10 +96,10 @@ class Checked:
     signals: tuple[SignalRow, ...]
     missing: Mapping[str, str]
     contradictions: tuple[str, ...]
-    picture: Shown | None
+    picture: CameraPicture | None
 
 
-def check(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> Checked:
+def check_drive_signals(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> Checked:
     """Read a part of a drive and compare its signals with each other.
 
     Args:
@@ -112,7 +112,7 @@ def check(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> Checke
     """
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
     planned = plan(topics, vehicle)
-    camera = camera_of(topics, vehicle)
+    camera = chosen_camera(topics, vehicle)
     samples = _samples(logs, vehicle, planned, selection)
     rows, contradictions = _judged(samples, planned, vehicle)
     picture = None
@@ -131,11 +131,11 @@ def check(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> Checke
 
 
 def _samples(
-    logs: Sequence[Log], vehicle: Vehicle, planned: Plan, selection: Selection
+    logs: Sequence[Log], vehicle: Vehicle, planned: SignalPlan, selection: Selection
 ) -> dict[Signal, Samples]:
     """Return all readings in order of time, by signal."""
     ledgers = [Ledger(name_of(log)) for log in logs]
-    extractors = [Extractor(planned, vehicle, i, ledger) for i, ledger in enumerate(ledgers)]
+    extractors = [SampleExtractor(planned, vehicle, i, ledger) for i, ledger in enumerate(ledgers)]
     wanted = [
         Selection(planned.topics_of(i), selection.start_ns, selection.end_ns)
         for i in range(len(logs))
@@ -157,7 +157,7 @@ def _samples(
 
 
 def _judged(
-    samples: Mapping[Signal, Samples], planned: Plan, vehicle: Vehicle
+    samples: Mapping[Signal, Samples], planned: SignalPlan, vehicle: Vehicle
 ) -> tuple[list[SignalRow], list[str]]:
     times = [one.t_ns for one in samples.values() if len(one.t_ns)]
     if not times:
@@ -173,7 +173,7 @@ def _judged(
         references.append(of_wheels(wheels["rear left"], wheels["rear right"], grid))
     yaw = _series(samples, planned, Signal.YAW_RATE)
     steering = _series(samples, planned, Signal.STEERING)
-    verdicts: dict[Signal, Verdict] = {}
+    verdicts: dict[Signal, SignalVerdict] = {}
     confirmed = yaw is not None and judge_yaw_rate(yaw, references, speed, grid).agrees_with > 0
     if steering is not None:
         rates = [] if yaw is None else [of_rate(yaw, 1, grid)]
@@ -196,16 +196,16 @@ def _judged(
 
 def _rows(
     samples: Mapping[Signal, Samples],
-    planned: Plan,
+    planned: SignalPlan,
     vehicle: Vehicle,
-    verdicts: Mapping[Signal, Verdict],
+    verdicts: Mapping[Signal, SignalVerdict],
 ) -> Iterator[SignalRow]:
     for signal, found in samples.items():
         source = planned.source_of(signal)
         if source is None:
             continue
         names = _named(signal, vehicle)
-        verdict = verdicts.get(signal, Verdict(()))
+        verdict = verdicts.get(signal, SignalVerdict(()))
         wrong = verdict.wrong
         if verdict.sign < 0:
             wrong = ("is positive to the right: change its sign", *wrong)
@@ -251,7 +251,9 @@ def _rate_hz(t_ns: Int64s) -> float:
     return Series("", t_ns, np.zeros(len(t_ns))).rate_hz
 
 
-def _series(samples: Mapping[Signal, Samples], planned: Plan, signal: Signal) -> Series | None:
+def _series(
+    samples: Mapping[Signal, Samples], planned: SignalPlan, signal: Signal
+) -> Series | None:
     found, source = samples.get(signal), planned.source_of(signal)
     if found is None or source is None or len(found.t_ns) < 2:
         return None
@@ -304,20 +306,22 @@ def _of_wheels(wheels: Mapping[str, Series]) -> Iterator[str]:
             )
 
 
-def _track(samples: Mapping[Signal, Samples], planned: Plan) -> Track | None:
+def _track(samples: Mapping[Signal, Samples], planned: SignalPlan) -> GroundTrack | None:
     found, source = samples.get(Signal.COURSE), planned.source_of(Signal.COURSE)
     if found is None or source is None or len(found.t_ns) < 2:
         return None
     course: Floats = found.values[:, 0]
-    return Track.of_course(f"GNSS {source.topic.name}", found.t_ns, found.values[:, 1], course)
+    return GroundTrack.of_course(
+        f"GNSS {source.topic.name}", found.t_ns, found.values[:, 1], course
+    )
 
 
 def _picture(
     log: Log, number: int, topic: Topic, vehicle: Vehicle, selection: Selection
-) -> Shown | None:
+) -> CameraPicture | None:
     """Return the picture in the middle of the part, or the first that decodes if it has no end."""
     ledger = Ledger(name_of(log))
-    shown: Shown | None = None
+    shown: CameraPicture | None = None
     middle_ns = None
     if selection.start_ns is not None and selection.end_ns is not None:
         middle_ns = (selection.start_ns + selection.end_ns) // 2
@@ -333,12 +337,12 @@ def _picture(
                 except LogError as error:
                     lose(ledger, topic.name, t_ns, error)
                     continue
-                shown = Shown(topic.name, t_ns, pixels)
+                shown = CameraPicture(topic.name, t_ns, pixels)
     warn_of(ledger)
     return shown
 
 
-def _of_camera(shown: Shown | None, log: Log, camera: Camera) -> Iterator[str]:
+def _of_camera(shown: CameraPicture | None, log: Log, camera: Camera) -> Iterator[str]:
     """Yield contradictions between the intrinsics and the pictures or the published values."""
     if shown is None:
         yield "camera: not one picture in the seconds examined"

@@ -25,7 +25,7 @@ PICTURES: Final = (".jpg", ".jpeg", ".png")
 WIDTH_PX: Final = 1280
 
 
-def check_output(path: Path, overwrite: bool) -> None:
+def check_report_place(path: Path, overwrite: bool) -> None:
     """Check before any reading that the report can be written.
 
     Raises:

@@ -13,8 +13,8 @@ from crosscue.eval.vehicle.mounting import estimate_mounting
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.vehicle.drafting.camera import Measured, Mounting, camera_of
-from crosscue.replay.vehicle.drafting.text import Examined, draft, examine
+from crosscue.replay.vehicle.drafting.camera import CameraMounting, MountingParameter, first_camera
+from crosscue.replay.vehicle.drafting.text import Examined, draft_text, examine
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from crosscue.results import Result
 from crosscue.verb import Option, keywords
@@ -73,13 +73,13 @@ class DraftSettings:
     overwrite: bool = False
 
     @property
-    def mounting(self) -> Mounting:
+    def mounting(self) -> CameraMounting:
         """The mounting of the camera, as far as it is known.
 
         Raises:
             UsageError: A number is out of range.
         """
-        return Mounting(
+        return CameraMounting(
             self._measured("camera_x_m", -20.0, 20.0),
             self._measured("camera_y_m", -5.0, 5.0),
             self._measured("camera_height_m", 0.1, 10.0),
@@ -87,13 +87,15 @@ class DraftSettings:
             self._measured("camera_yaw_deg", -180.0, 180.0, math.pi / 180.0),
         )
 
-    def _measured(self, name: str, low: float, high: float, scale: float = 1.0) -> Measured | None:
+    def _measured(
+        self, name: str, low: float, high: float, scale: float = 1.0
+    ) -> MountingParameter | None:
         value: float | None = getattr(self, name)
         if value is None:
             return None
         if not low <= value <= high:
             raise UsageError(f"{name}: {value:g}, expected {low:g} to {high:g}")
-        return Measured(value * scale, "as given")
+        return MountingParameter(value * scale, "as given")
 
 
 @keywords(DraftSettings)
@@ -127,22 +129,22 @@ def draft_vehicle(log: WholeDriveGiven, settings: DraftSettings) -> VehicleDraft
         CanDatabase.load([file])
     with opened(log) as drive:
         examined = examine(drive.logs, files)
-        text = draft(examined, folder, _mounting(examined, given))
+        text = draft_text(examined, folder, _mounting(examined, given))
     parse(text, "the draft")
     if path is not None:
         write_text(path, text)
     return VehicleDraft(text, path)
 
 
-def _mounting(examined: Examined, given: Mounting) -> Mounting:
+def _mounting(examined: Examined, given: CameraMounting) -> CameraMounting:
     """Return the given mounting, completed by estimates from pictures of a straight road."""
-    camera = camera_of(examined.logs)
+    camera = first_camera(examined.logs)
     if camera is None:
         return given
     estimate = estimate_mounting(*camera, examined.choices.speed)
     notes = [estimate.why_not] if estimate.why_not else []
     for name in ("pitch_rad", "yaw_rad"):
-        seen: Measured | None = getattr(estimate, name)
+        seen: MountingParameter | None = getattr(estimate, name)
         if getattr(given, name) is not None and seen is not None:
             notes.append(f"{name} from the pictures, not used: {seen.source}")
     return given._replace(

@@ -15,8 +15,8 @@ from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result, json_key, listing
 from crosscue.verb import Option
 
-from .check import Checked, check
-from .check_page import check_output, write_check
+from .check import Checked, check_drive_signals
+from .check_page import check_report_place, write_check
 
 HEAD = ("signal", "read from", "readings", "rate_hz", "lowest", "highest", "unit")
 
@@ -117,13 +117,13 @@ def check_vehicle(
     """
     path = None if output is None else Path(output)
     if path is not None:
-        check_output(path, overwrite)
+        check_report_place(path, overwrite)
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise UsageError(f"seconds: {seconds:g}, expected more than 0")
     settings = vehicle_given(vehicle)
     with opened(log) as drive:
         part = drive.part(start_s, start_s + seconds)
-        found = check(part.logs, settings, part.selection)
+        found = check_drive_signals(part.logs, settings, part.selection)
         names = [name_of(one) for one in part.logs]
     words = f"{seconds:g} s starting at {start_s:g} s"
     if not found.signals and found.picture is None:

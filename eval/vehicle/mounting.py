@@ -16,7 +16,7 @@ from crosscue.replay.columns import Bytes, Floats, Images
 from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.signals.extractor import pictures_of
-from crosscue.replay.vehicle.drafting.camera import Intrinsics, Measured
+from crosscue.replay.vehicle.drafting.camera import Intrinsics, MountingParameter
 from crosscue.replay.vehicle.drafting.series import Series
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 
@@ -43,8 +43,8 @@ class Estimate(NamedTuple):
         why_not: Reason why the estimate is missing; empty if it is not.
     """
 
-    pitch_rad: Measured | None
-    yaw_rad: Measured | None
+    pitch_rad: MountingParameter | None
+    yaw_rad: MountingParameter | None
     pairs: int
     why_not: str = ""
 
@@ -98,10 +98,10 @@ def estimate_mounting(
     )
 
 
-def _measured(angles_rad: Floats) -> Measured:
+def _measured(angles_rad: Floats) -> MountingParameter:
     median = float(np.median(angles_rad))
     spread = 1.4826 * float(np.median(np.abs(angles_rad - median)))
-    return Measured(
+    return MountingParameter(
         median,
         f"ESTIMATED: {median / DEGREE:.2f} deg, the vanishing point of {len(angles_rad)} pairs of "
         f"pictures on a straight road, s.d. of one {spread / DEGREE:.2f} deg",

@@ -71,7 +71,7 @@ class AnnotatedDrive:
     place: str
 
 
-class State(NamedTuple):
+class ChainState(NamedTuple):
     """State on which a cue's chain depends; ``bin`` is None for all distances."""
 
     there: tuple[str, ...]
@@ -84,9 +84,9 @@ class State(NamedTuple):
         return bool(self.there or self.missing)
 
 
-NOWHERE: Final = State((), (), None)
+NOWHERE: Final = ChainState((), (), None)
 # Number of steps by state, previous step (``first``, ``stays``, ``appears``) and current value.
-Tally = Counter[tuple[State, str, bool]]
+Tally = Counter[tuple[ChainState, str, bool]]
 
 
 class TemporalFit(NamedTuple):
@@ -272,10 +272,10 @@ def _features_of(cue: CueNode, graph: FactorGraph) -> tuple[str, ...]:
     return tuple(name for name in graph.feature_names if name in mine and name != PRESENCE)
 
 
-def _state(drive: AnnotatedDrive, features: tuple[str, ...], at: int) -> State:
+def _state(drive: AnnotatedDrive, features: tuple[str, ...], at: int) -> ChainState:
     there = tuple(name for name in features if drive.features.get(name))
     missing = tuple(name for name in features if drive.features.get(name) is False)
-    return State((PRESENCE, *there), missing, at)
+    return ChainState((PRESENCE, *there), missing, at)
 
 
 def _chains(cue: CueNode, graph: FactorGraph, tally: Tally) -> Iterator[CueChain]:
@@ -300,7 +300,7 @@ def _chains(cue: CueNode, graph: FactorGraph, tally: Tally) -> Iterator[CueChain
             *(name for name, there in zip(features, is_there, strict=True) if there),
         )
         missing = tuple(name for name, there in zip(features, is_there, strict=True) if not there)
-        state = State(there, missing, None)
+        state = ChainState(there, missing, None)
         by_distance = {
             what: tuple(
                 _rate(
@@ -322,7 +322,7 @@ def _chains(cue: CueNode, graph: FactorGraph, tally: Tally) -> Iterator[CueChain
         )
 
 
-def _in(tally: Tally, state: State) -> Tally:
+def _in(tally: Tally, state: ChainState) -> Tally:
     """Counts of one state, or of all its distances."""
     return Counter(
         {

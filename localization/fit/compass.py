@@ -332,7 +332,7 @@ def _mirrored() -> VehicleError:
     )
 
 
-class Persistence(NamedTuple):
+class ResidualPersistence(NamedTuple):
     """Persistence of residuals.
 
     Attributes:
@@ -348,14 +348,14 @@ class Persistence(NamedTuple):
     independent: float
 
 
-def persistence(t_ns: Int64s, residual: Floats) -> Persistence:
+def persistence(t_ns: Int64s, residual: Floats) -> ResidualPersistence:
     """Estimate the persistence of residuals at approximately regular times."""
     n = len(residual)
     centred = residual - residual.mean()
     power = np.abs(np.fft.rfft(centred, 2 * n)) ** 2
     correlation = np.fft.irfft(power)[: max(n // 2, 1)]
     if n < 4 or not correlation[0] > 1e-24:
-        return Persistence(math.nan, 0.0, False, float(n))
+        return ResidualPersistence(math.nan, 0.0, False, float(n))
     correlation = correlation / correlation[0]
     period_s = float(np.median(np.diff(t_ns))) * 1e-9
     below = np.flatnonzero(correlation < math.exp(-1.0))
@@ -367,4 +367,4 @@ def persistence(t_ns: Int64s, residual: Floats) -> Persistence:
         fall = correlation[k - 1] - correlation[k]
         steps = k - 1 + float((correlation[k - 1] - math.exp(-1.0)) / fall)
     independent = min(max(n / (2.0 * steps), 1.0), float(n))
-    return Persistence(float(correlation[1]), steps * period_s, is_bound, independent)
+    return ResidualPersistence(float(correlation[1]), steps * period_s, is_bound, independent)

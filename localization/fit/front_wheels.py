@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from crosscue.localization.odometry import Increments, OdometrySettings, WheelSpeeds
+from crosscue.localization.odometry import Increments, OdometrySettings, WheelSamples
 from crosscue.replay.columns import Floats, Int64s
 
 PIECES: Final = 10
@@ -31,7 +31,7 @@ class FrontWheel(NamedTuple):
 
 
 def front_wheels(
-    wheels: WheelSpeeds, made: Increments, settings: OdometrySettings, span_ns: tuple[int, int]
+    wheels: WheelSamples, made: Increments, settings: OdometrySettings, span_ns: tuple[int, int]
 ) -> tuple[FrontWheel, ...]:
     """Return the scales of the front wheels that move and have independent speed readings.
 

@@ -13,10 +13,10 @@ from crosscue.localization.odometry import (
     Increments,
     OdometrySettings,
     TurnSignal,
-    WheelSpeeds,
+    WheelSamples,
     integrate,
 )
-from crosscue.localization.pose_filter import State, at_point, predict, update_position
+from crosscue.localization.pose_filter import State, at_point, predict_pose, update_position
 from crosscue.localization.start_pose import start_pose
 from crosscue.replay.compiled import kept
 
@@ -67,7 +67,7 @@ class KnownDrive:
 
     def __init__(
         self,
-        wheels: WheelSpeeds,
+        wheels: WheelSamples,
         turn: TurnSignal | None,
         fixes: Fixes,
         lever_m: tuple[float, float],
@@ -177,7 +177,7 @@ def _follow(
     """Write the state at each position into ``found``; return their number."""
     count = 0
     for row in range(len(at_fix)):
-        state = predict(
+        state = predict_pose(
             state, distance_m[row], turn_rad[row], distance_var_m2[row], turn_var_rad2[row], 0.0
         )
         k = at_fix[row]
@@ -218,7 +218,7 @@ def whitened(predicted: Predicted, xy_m: Floats, cov_m2: Floats) -> tuple[Floats
     return white, log_det
 
 
-def _covered(wheels: WheelSpeeds, turn: TurnSignal | None, fixes: Fixes) -> Fixes:
+def _covered(wheels: WheelSamples, turn: TurnSignal | None, fixes: Fixes) -> Fixes:
     """Positions while all signals are available, with a margin for the fitted delays."""
     spans = [wheels.t_ns] + ([] if turn is None else [turn.t_ns])
     if any(len(t_ns) < 2 for t_ns in spans):

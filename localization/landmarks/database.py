@@ -27,7 +27,7 @@ import numpy as np
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogError, OutputError, UsageError
 
-from .features import Features
+from .features import Keypoints
 from .file import (
     APPLICATION_ID,
     TABLES,
@@ -39,7 +39,7 @@ from .file import (
     damaged,
     errors_in_one_line,
     journal_of,
-    kind_of,
+    matcher_name,
 )
 
 # Maximum sigmas of a search: the R*Tree's boxes include this many of each landmark's own.
@@ -53,7 +53,7 @@ _COLUMNS: Final = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class LandmarkPosition:
     """Position of the camera when a picture was taken, in the map frame.
 
     Attributes:
@@ -126,7 +126,7 @@ class Nearby(NamedTuple):
     """
 
     key: int
-    place: Place
+    place: LandmarkPosition
     sigmas: float
 
 
@@ -151,7 +151,7 @@ class LandmarkDatabase:
         try:
             with errors_in_one_line(path):
                 check_ours(self._sql, path)
-                self.kind: Final = kind_of(self._sql, path)
+                self.kind: Final = matcher_name(self._sql, path)
         except BaseException:
             self._sql.close()
             raise
@@ -216,7 +216,7 @@ class LandmarkDatabase:
             for row in self._sql.execute(f"SELECT {_COLUMNS} FROM landmark AS l ORDER BY id"):  # noqa: S608
                 yield Nearby(cast("int", row[0]), _place(row, self.path), 0.0)
 
-    def features(self, key: int) -> Features:
+    def features(self, key: int) -> Keypoints:
         """Read the features of one landmark and verify its checksum.
 
         Raises:
@@ -238,7 +238,7 @@ class LandmarkDatabase:
             at = np.frombuffer(points_px, "<f4").reshape(points, 2)
             per = len(descriptors) // points if points else 0
             table = np.frombuffer(descriptors, np.uint8).reshape(points, per)
-            return Features(width, height, at.astype(np.float32), table)
+            return Keypoints(width, height, at.astype(np.float32), table)
         except (TypeError, ValueError) as error:
             raise damaged(self.path, f"landmark {place.name}: {error}") from None
 
@@ -299,7 +299,7 @@ class LandmarkWriter:
             self._abandon()
             raise
 
-    def add(self, place: Place, features: Features) -> None:
+    def add(self, place: LandmarkPosition, features: Keypoints) -> None:
         """Add one landmark.
 
         Raises:
@@ -364,7 +364,7 @@ class LandmarkWriter:
             self._sql.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             self._sql.execute(f"PRAGMA user_version = {VERSION}")
         check_ours(self._sql, self._path)
-        there = kind_of(self._sql, self._path)
+        there = matcher_name(self._sql, self._path)
         if there != kind:
             raise UsageError(
                 f"{self._path}: holds features of matcher {there!r}, not {kind!r}; "
@@ -382,17 +382,19 @@ class LandmarkWriter:
             journal_of(self._path).unlink(missing_ok=True)
 
 
-def _place(row: tuple[object, ...], path: Path) -> Place:
+def _place(row: tuple[object, ...], path: Path) -> LandmarkPosition:
     try:
         _, name, x, y, xx, xy, yy, heading, source = row
         cov = np.array([[xx, xy], [xy, yy]], np.float64)
         turn = None if heading is None else float(str(heading))
-        return Place(str(name), np.array([x, y], np.float64), cov, turn, str(source))
+        return LandmarkPosition(str(name), np.array([x, y], np.float64), cov, turn, str(source))
     except (TypeError, ValueError) as error:
         raise damaged(path, str(error)) from None
 
 
-def _crc(place: Place, width: int, height: int, points_px: bytes, descriptors: bytes) -> int:
+def _crc(
+    place: LandmarkPosition, width: int, height: int, points_px: bytes, descriptors: bytes
+) -> int:
     heading = math.nan if place.heading_rad is None else place.heading_rad
     (xx, xy), (_, yy) = place.cov_m2
     crc = zlib.crc32(place.name.encode("utf-8", "surrogatepass"))

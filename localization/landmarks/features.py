@@ -1,7 +1,7 @@
 """Features of pictures, and the interface of matchers.
 
-A matcher is named in ``MATCHERS`` or as ``module:factory``. It extracts ``Features`` from a grey
-picture and scores two ``Features``. ORB is built in; a learned matcher can replace it, because
+A matcher is named in ``MATCHERS`` or as ``module:factory``. It extracts ``Keypoints`` from a grey
+picture and scores two ``Keypoints``. ORB is built in; a learned matcher can replace it, because
 descriptors are bytes that only their matcher interprets.
 """
 
@@ -25,7 +25,7 @@ MATCHERS: Final[Mapping[str, str]] = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Features:
+class Keypoints:
     """N keypoints of one picture.
 
     Attributes:
@@ -93,11 +93,11 @@ class Matcher(Protocol):
         """Name stored in the database; features of other kinds cannot be compared."""
         ...
 
-    def describe(self, grey: Bytes, /) -> Features:
+    def describe(self, grey: Bytes, /) -> Keypoints:
         """Extract the features of a grey picture, shape (H, W), uint8; zero points are valid."""
         ...
 
-    def match(self, seen: Features, known: Features, /) -> Match:
+    def match(self, seen: Keypoints, known: Keypoints, /) -> Match:
         """Compare two pictures; the result is deterministic."""
         ...
 

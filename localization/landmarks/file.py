@@ -126,7 +126,7 @@ def check_ours(sql: sqlite3.Connection, path: Path) -> None:
         raise damaged(path, "its tables are not those of version 1")
 
 
-def kind_of(sql: sqlite3.Connection, path: Path) -> str:
+def matcher_name(sql: sqlite3.Connection, path: Path) -> str:
     """Read the name of the matcher of its features."""
     row = sql.execute("SELECT value FROM setting WHERE key = 'matcher'").fetchone()
     if row is None:

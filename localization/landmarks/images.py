@@ -15,13 +15,13 @@ from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 GREY: Final = View(is_grey=True)
 
 
-def picture_of(images: Images, row: int) -> Encoded:
+def copy_picture(images: Images, row: int) -> Encoded:
     """Copy one picture of a block, so that the block's large buffer can be released."""
     picture = encoded(images, row)
     return replace(picture, content=memoryview(bytes(picture.content)))
 
 
-def read_picture(path: Path, limits: Limits = DEFAULT_LIMITS) -> Encoded:
+def read_encoded(path: Path, limits: Limits = DEFAULT_LIMITS) -> Encoded:
     """Read a picture file without decoding it.
 
     Raises:

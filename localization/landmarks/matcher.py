@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import UsageError
 
-from .features import CameraGeometry, Features, Match
+from .features import CameraGeometry, Keypoints, Match
 
 # Minimum side of a picture: the size of ORB's patches.
 _MIN_SIDE_PX: Final = 32
@@ -69,7 +69,7 @@ class OrbMatcher:
         """Create the matcher with these settings."""
         self.settings: Final = settings
 
-    def describe(self, grey: Bytes, /) -> Features:
+    def describe(self, grey: Bytes, /) -> Keypoints:
         """Extract the picture's ORB features; see ``Matcher``."""
         import cv2
 
@@ -79,15 +79,15 @@ class OrbMatcher:
             size = (max(round(width * scale), 1), max(round(height * scale), 1))
             grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
         if min(grey.shape) < _MIN_SIDE_PX:
-            return Features(width, height, *_nothing())
+            return Keypoints(width, height, *_nothing())
         orb_features = cv2.ORB.create(nfeatures=self.settings.features)
         points, descriptors = orb_features.detectAndCompute(grey, None)
         if descriptors is None or not len(points):
-            return Features(width, height, *_nothing())
+            return Keypoints(width, height, *_nothing())
         at = np.array([point.pt for point in points], np.float32) / np.float32(scale)
-        return Features(width, height, at, np.asarray(descriptors, np.uint8))
+        return Keypoints(width, height, at, np.asarray(descriptors, np.uint8))
 
-    def match(self, seen: Features, known: Features, /) -> Match:
+    def match(self, seen: Keypoints, known: Keypoints, /) -> Match:
         """Count the consistent points; see ``Matcher``."""
         if (
             len(seen) < 2
@@ -102,7 +102,7 @@ class OrbMatcher:
         return Match(float(agreeing), len(here), agreeing)
 
     def _pairs(
-        self, seen: Features, known: Features
+        self, seen: Keypoints, known: Keypoints
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Matching points of both pictures, shape (N, 2) each."""
         import cv2
@@ -122,7 +122,7 @@ class OrbMatcher:
         return seen.points_px[pairs[:, 0]], known.points_px[pairs[:, 1]]
 
     def _agreeing(
-        self, seen: Features, here: NDArray[np.float32], there: NDArray[np.float32]
+        self, seen: Keypoints, here: NDArray[np.float32], there: NDArray[np.float32]
     ) -> int:
         import cv2
 
@@ -153,7 +153,7 @@ class OrbMatcher:
             return 0
         return 0 if mask is None else int(np.count_nonzero(mask))
 
-    def _camera_of(self, seen: Features) -> tuple[float, tuple[float, float]]:
+    def _camera_of(self, seen: Keypoints) -> tuple[float, tuple[float, float]]:
         focal, centre = self.settings.camera
         assert focal is not None
         return focal, centre or (seen.width_px / 2.0, seen.height_px / 2.0)

@@ -30,8 +30,8 @@ from crosscue.localization.ekf import PoseBelief, Updated
 from crosscue.localization.pose_filter import HEADING, SPEED
 from crosscue.localization.pose_track import ACCEPTED, REJECTED
 
-from .database import REACH_SIGMAS, LandmarkDatabase, Nearby, Place
-from .features import Features, Match, Matcher
+from .database import REACH_SIGMAS, LandmarkDatabase, LandmarkPosition, Nearby
+from .features import Keypoints, Match, Matcher
 from .sighting import Sighting
 
 # Fraction of the peak score below which the peak is over.
@@ -110,7 +110,7 @@ class LandmarkCounts:
 class Best(NamedTuple):
     """Best candidate of one frame."""
 
-    place: Place
+    place: LandmarkPosition
     match: Match
 
 
@@ -167,8 +167,8 @@ def _observed(
     return belief.mean[:2] + offset, observe
 
 
-def best_of(
-    seen: Features, candidates: tuple[Nearby, ...], database: LandmarkDatabase, matcher: Matcher
+def best_candidate(
+    seen: Keypoints, candidates: tuple[Nearby, ...], database: LandmarkDatabase, matcher: Matcher
 ) -> Best | None:
     """Find the best matching candidate, the nearest of equal ones; None without candidates.
 
@@ -184,7 +184,7 @@ def best_of(
 
 
 class _Peak(NamedTuple):
-    place: Place
+    place: LandmarkPosition
     score: float
     travelled_m: float
     heading_rad: float
@@ -212,7 +212,7 @@ class LandmarkSearch:
     _counted_m: dict[str, float] = field(default_factory=dict)
 
     def process(
-        self, belief: PoseBelief, travelled_m: float, describe: Callable[[], Features | None]
+        self, belief: PoseBelief, travelled_m: float, describe: Callable[[], Keypoints | None]
     ) -> PoseBelief | None:
         """Process one frame.
 
@@ -249,7 +249,7 @@ class LandmarkSearch:
         self,
         camera_m: NDArray[np.float64],
         cov_m2: NDArray[np.float64],
-        describe: Callable[[], Features | None],
+        describe: Callable[[], Keypoints | None],
     ) -> Best | None:
         settings = self.settings
         candidates = self.database.near(camera_m, cov_m2, settings.sigmas, settings.max_candidates)
@@ -261,7 +261,7 @@ class LandmarkSearch:
             self.counts.undecodable += 1
             return None
         self.counts.candidates += len(candidates)
-        best = best_of(seen, candidates, self.database, self.matcher)
+        best = best_candidate(seen, candidates, self.database, self.matcher)
         if best is None or best.match.score < settings.min_score:
             return None
         self.counts.matched += 1

@@ -4,8 +4,8 @@ Truth and estimate are separate except in three places: sensors measure the trut
 show the roads of the next intersection relative to the vehicle, and the result compares the two at
 the end. Decisions use the estimate.
 
-All functions are plain Python on numbers and arrays. ``drive`` runs them uncompiled, for example in
-a debugger; ``drive_many`` compiles the same functions and is thousands of times as fast.
+All functions are plain Python on numbers and arrays. ``simulate_town_drive`` runs them uncompiled,
+for example in a debugger; ``drive_many`` compiles the same functions and is thousands of times as fast.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from crosscue.localization.navigation import (
     NONE,
     Memory,
     bearing_after,
-    choose,
+    choose_option,
     empty_memory,
     landmark_ahead,
     penalty,
@@ -36,16 +36,16 @@ from crosscue.localization.pose_filter import (
     SPEED,
     State,
     major_axis_m,
-    nees,
-    predict,
-    update,
+    pose_nees,
+    predict_pose,
     update_position,
+    update_state,
 )
 from crosscue.replay.compiled import kept
 
 from . import settings as settings_of
 from .parameters import Parameters, parameters_of
-from .random_stream import Stream, below, normal, stream_of, uniform
+from .random_stream import RandomStream, below, normal, stream_of, uniform
 from .route import (
     ARC_FIELDS,
     BACK,
@@ -53,7 +53,7 @@ from .route import (
     STRAIGHT,
     UNDECIDED,
     Route,
-    advance,
+    advance_turn,
     enter,
     entry_m,
     lane_of,
@@ -72,10 +72,10 @@ from .streets import (
     has_intersection,
     has_way,
     make_streets,
-    place_of,
+    node_position,
     step_of,
 )
-from .vehicle import Reading, Vehicle, measure, move
+from .vehicle import Reading, TownVehicle, measure_step, move
 
 Keys = NDArray[np.uint64]
 Ints = NDArray[np.int64]
@@ -93,7 +93,7 @@ GOAL_SET, LANDMARK_SET, LANDMARK_MISSED, LANDMARK_TAKEN, LANDMARK_REFUSED = rang
 _QUARTERS: Final = (0, 1, 3)
 
 
-class Outcome(IntEnum):
+class DriveOutcome(IntEnum):
     """Outcome of a drive."""
 
     REACHED = 0
@@ -101,14 +101,14 @@ class Outcome(IntEnum):
     GIVEN_UP = 2
 
 
-REACHED, LOST, GIVEN_UP = (int(outcome) for outcome in Outcome)
+REACHED, LOST, GIVEN_UP = (int(outcome) for outcome in DriveOutcome)
 
 
-class Result(NamedTuple):
+class DriveResult(NamedTuple):
     """Result of a drive; all lengths in metres.
 
     Attributes:
-        outcome: Value of ``Outcome``.
+        outcome: Value of ``DriveOutcome``.
         travelled_m: True distance travelled.
         seconds: Duration of the drive.
         steps: Number of filter steps.
@@ -156,10 +156,10 @@ class Result(NamedTuple):
     longest_gap_m: float
 
 
-FIELDS: Final = len(Result._fields)
+FIELDS: Final = len(DriveResult._fields)
 
 
-class Landmarks(NamedTuple):
+class LandmarkArray(NamedTuple):
     """L landmarks.
 
     Attributes:
@@ -177,11 +177,11 @@ class Targets(NamedTuple):
     """The current goal and landmarks, and the random stream for later ones."""
 
     goal: int
-    landmarks: Landmarks
-    places: Stream
+    landmarks: LandmarkArray
+    places: RandomStream
 
 
-class Tally(NamedTuple):
+class DriveTotals(NamedTuple):
     """Counts and distances of the result that accumulate during the drive."""
 
     passed: int
@@ -198,7 +198,7 @@ class Tally(NamedTuple):
     last_fix_m: float
 
 
-class Log(NamedTuple):
+class DriveRecord(NamedTuple):
     """Record of a drive's steps and events; arrays without rows record nothing.
 
     Attributes:
@@ -214,14 +214,14 @@ class Log(NamedTuple):
     noted: Ints
 
 
-def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Log) -> None:
+def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: DriveRecord) -> None:
     """Simulate one drive.
 
     Args:
         p: Settings.
         seed: Seed of all random numbers.
-        row: Output, shape (22,): the fields of ``Result``. With three more columns, x, y, heading
-            of the filter before the first step follow.
+        row: Output, shape (22,): the fields of ``DriveResult``. With three more columns, x, y,
+            heading of the filter before the first step follow.
         log: Output: steps and events, up to its capacity.
     """
     row[:] = np.nan
@@ -230,12 +230,12 @@ def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Log
         row[0] = NO_CITY
         return
     start, way, targets = _start(p, streets, stream_of(seed, PLACE_STREAM))
-    start_x, start_y = place_of(streets, start)
-    goal_x, goal_y = place_of(streets, targets.goal)
+    start_x, start_y = node_position(streets, start)
+    goal_x, goal_y = node_position(streets, targets.goal)
     _describe_start(row, streets, targets, goal_x - start_x, goal_y - start_y)
     _note_targets(log, 0, streets, targets, True)
     x, y = start_x + p.lane_offset_m * SINES[way], start_y - p.lane_offset_m * COSINES[way]
-    vehicle = Vehicle(x, y, HEADINGS_RAD[way], p.turn_mps, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    vehicle = TownVehicle(x, y, HEADINGS_RAD[way], p.turn_mps, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     belief, noise = _first_belief(p, vehicle, stream_of(seed, SENSOR_STREAM))
     if len(row) > FIELDS:
         row[FIELDS], row[FIELDS + 1], row[FIELDS + 2] = (
@@ -245,14 +245,14 @@ def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Log
         )
     route = Route(way, start + step_of(way, len(streets.xs_m)), UNDECIDED, 0, 0, 0.0)
     arcs, memory = np.empty((MAX_ARCS, ARC_FIELDS)), empty_memory()
-    tally = Tally(0, 0, 0, 0, 0, 0, math.nan, math.nan, math.nan, 0.0, 0.0, 0.0)
+    tally = DriveTotals(0, 0, 0, 0, 0, 0, math.nan, math.nan, math.nan, 0.0, 0.0, 0.0)
     steps = 0
     while True:
         lane = lane_of(p, streets, route, arcs, vehicle)
         moved = move(p, vehicle, lane, wanted_mps(p, streets, route, vehicle))
         distance_m = moved.travelled_m - vehicle.travelled_m
-        vehicle, reading, noise = measure(p, vehicle, moved, noise)
-        route = advance(route, arcs, lane, distance_m)
+        vehicle, reading, noise = measure_step(p, vehicle, moved, noise)
+        route = advance_turn(route, arcs, lane, distance_m)
         belief = estimate(p, belief, reading)
         if steps < len(log.steps):
             _keep(log.steps[steps], vehicle, reading, belief)
@@ -295,7 +295,7 @@ def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Log
     _finish(p, row, vehicle, belief, tally, steps)
 
 
-def drive_each(p: Parameters, seeds: Keys, rows: NDArray[np.float64], log: Log) -> None:
+def drive_each(p: Parameters, seeds: Keys, rows: NDArray[np.float64], log: DriveRecord) -> None:
     """Run ``drive_one`` for each of N seeds; rows have shape (N, 22)."""
     for i in range(len(seeds)):
         drive_one(p, seeds[i], rows[i], log)
@@ -306,7 +306,7 @@ def estimate(p: Parameters, belief: State, reading: Reading) -> State:
     distance_m = 0.5 * (reading.left_m + reading.right_m)
     turn_rad = (reading.right_m - reading.left_m) / p.track_width_m
     slip_var = p.slip_per_sqrt_m**2 * abs(distance_m)
-    belief = predict(
+    belief = predict_pose(
         belief,
         distance_m,
         turn_rad,
@@ -315,14 +315,14 @@ def estimate(p: Parameters, belief: State, reading: Reading) -> State:
         p.accel_var_m2ps3 * p.step_s,
     )
     speed_error = distance_m / p.step_s - belief.speed_mps
-    belief = update(belief, SPEED, speed_error, p.speed_sd_mps**2)
+    belief = update_state(belief, SPEED, speed_error, p.speed_sd_mps**2)
     if math.isnan(reading.compass_rad):
         return belief
     heading_error = wrap(reading.compass_rad - belief.heading_rad)
-    return update(belief, HEADING, heading_error, p.compass_sd_rad**2)
+    return update_state(belief, HEADING, heading_error, p.compass_sd_rad**2)
 
 
-def _start(p: Parameters, streets: Streets, places: Stream) -> tuple[int, int, Targets]:
+def _start(p: Parameters, streets: Streets, places: RandomStream) -> tuple[int, int, Targets]:
     """Draw start, direction and targets of the drive."""
     start, places = draw_place(places, streets.inside)
     way, places = below(places, 4)
@@ -336,7 +336,9 @@ def _start(p: Parameters, streets: Streets, places: Stream) -> tuple[int, int, T
     return start, way, Targets(goal, _landmarks(streets, nodes), places)
 
 
-def _one_landmark(p: Parameters, streets: Streets, places: Stream) -> tuple[Ints, Stream]:
+def _one_landmark(
+    p: Parameters, streets: Streets, places: RandomStream
+) -> tuple[Ints, RandomStream]:
     """Draw at most one landmark, with the requested density on average."""
     number, places = uniform(places)
     nodes = np.empty(1 if number < p.landmarks_per_km2 * streets.area_km2 else 0, np.int64)
@@ -345,14 +347,14 @@ def _one_landmark(p: Parameters, streets: Streets, places: Stream) -> tuple[Ints
     return nodes, places
 
 
-def _landmarks(streets: Streets, nodes: Ints) -> Landmarks:
+def _landmarks(streets: Streets, nodes: Ints) -> LandmarkArray:
     places_m = np.empty((len(nodes), 2))
     for i in range(len(nodes)):
-        places_m[i, 0], places_m[i, 1] = place_of(streets, nodes[i])
-    return Landmarks(nodes, places_m, np.zeros(len(nodes), np.bool_))
+        places_m[i, 0], places_m[i, 1] = node_position(streets, nodes[i])
+    return LandmarkArray(nodes, places_m, np.zeros(len(nodes), np.bool_))
 
 
-def _landmark_at(landmarks: Landmarks, node: int) -> int:
+def _landmark_at(landmarks: LandmarkArray, node: int) -> int:
     for i in range(len(landmarks.nodes)):
         if landmarks.nodes[i] == node:
             return i
@@ -367,7 +369,9 @@ def _next_targets(p: Parameters, streets: Streets, targets: Targets, near: int) 
     return Targets(goal, _landmarks(streets, nodes), places)
 
 
-def _first_belief(p: Parameters, vehicle: Vehicle, noise: Stream) -> tuple[State, Stream]:
+def _first_belief(
+    p: Parameters, vehicle: TownVehicle, noise: RandomStream
+) -> tuple[State, RandomStream]:
     x_error, noise = normal(noise)
     y_error, noise = normal(noise)
     heading_error, noise = normal(noise)
@@ -395,18 +399,23 @@ def _is_at_goal(
     p: Parameters, streets: Streets, targets: Targets, belief: State, axis_m: float
 ) -> bool:
     """Whether the estimated position is at the goal."""
-    x, y = place_of(streets, targets.goal)
+    x, y = node_position(streets, targets.goal)
     away_m = math.hypot(belief.x_m - x, belief.y_m - y)
     return away_m <= max(p.arrive_within_m, axis_m / 2.0)
 
 
 def _arrived(
-    streets: Streets, targets: Targets, tally: Tally, vehicle: Vehicle, start: int, axis_m: float
-) -> Tally:
-    x, y = place_of(streets, targets.goal)
-    start_x, start_y = place_of(streets, start)
+    streets: Streets,
+    targets: Targets,
+    tally: DriveTotals,
+    vehicle: TownVehicle,
+    start: int,
+    axis_m: float,
+) -> DriveTotals:
+    x, y = node_position(streets, targets.goal)
+    start_x, start_y = node_position(streets, start)
     t, is_first = tally, tally.goals == 0
-    return Tally(
+    return DriveTotals(
         t.passed,
         t.detected,
         t.refused,
@@ -452,7 +461,7 @@ def _decide(
         headings[i] = after
         bearings[i] = bearing_after(at_x, at_y, after, target_x, target_y, p.after_m)
         penalties[i] = penalty(memory, place, after, p.same_option_rad, p.penalty_rad)
-    chosen = choose(headings, bearings, penalties)
+    chosen = choose_option(headings, bearings, penalties)
     memory = remember(memory, place, at_x, at_y, headings[chosen], p.same_option_rad)
     return turns[chosen], memory
 
@@ -461,7 +470,7 @@ def _target(
     p: Parameters, streets: Streets, targets: Targets, x_m: float, y_m: float, axis_m: float
 ) -> tuple[float, float]:
     """Position of the goal, or of a landmark on the way to it."""
-    goal_x, goal_y = place_of(streets, targets.goal)
+    goal_x, goal_y = node_position(streets, targets.goal)
     if not seeks_landmarks(p.strategy, axis_m, p.hybrid_above_m):
         return goal_x, goal_y
     marks = targets.landmarks
@@ -475,9 +484,9 @@ def _target(
         marks.is_visited[found] = True
 
 
-def _decided(tally: Tally, turn: int) -> Tally:
+def _decided(tally: DriveTotals, turn: int) -> DriveTotals:
     t = tally
-    return Tally(
+    return DriveTotals(
         t.passed,
         t.detected,
         t.refused,
@@ -496,15 +505,15 @@ def _decided(tally: Tally, turn: int) -> Tally:
 def _pass_landmark(
     p: Parameters,
     streets: Streets,
-    landmarks: Landmarks,
+    landmarks: LandmarkArray,
     landmark: int,
-    vehicle: Vehicle,
+    vehicle: TownVehicle,
     belief: State,
-    tally: Tally,
-    noise: Stream,
-    log: Log,
+    tally: DriveTotals,
+    noise: RandomStream,
+    log: DriveRecord,
     steps: int,
-) -> tuple[State, Tally, Stream]:
+) -> tuple[State, DriveTotals, RandomStream]:
     """Draw whether a landmark is recognised; if so, it measures the vehicle's position."""
     number, noise = uniform(noise)
     node = landmarks.nodes[landmark]
@@ -523,9 +532,11 @@ def _pass_landmark(
     return updated.state, tally, noise
 
 
-def _passed(tally: Tally, vehicle: Vehicle, is_fused: bool, is_refused: bool) -> Tally:
+def _passed(
+    tally: DriveTotals, vehicle: TownVehicle, is_fused: bool, is_refused: bool
+) -> DriveTotals:
     t, gap_m = tally, vehicle.travelled_m - tally.last_fix_m
-    return Tally(
+    return DriveTotals(
         t.passed + 1,
         t.detected + int(is_fused),
         t.refused + int(is_refused),
@@ -551,12 +562,12 @@ def _describe_start(
 def _finish(
     p: Parameters,
     row: NDArray[np.float64],
-    vehicle: Vehicle,
+    vehicle: TownVehicle,
     belief: State,
-    tally: Tally,
+    tally: DriveTotals,
     steps: int,
 ) -> None:
-    """Write the rest of the drive's ``Result``."""
+    """Write the rest of the drive's ``DriveResult``."""
     axis_m = major_axis_m(belief.xx, belief.xy, belief.yy)
     outcome = REACHED if tally.goals == p.goals else GIVEN_UP
     ex, ey = belief.x_m - vehicle.x_m, belief.y_m - vehicle.y_m
@@ -566,12 +577,12 @@ def _finish(
     row[8], row[9], row[10] = tally.passed, tally.detected, tally.refused
     row[11], row[12], row[13] = tally.decisions, tally.turns, tally.goals
     row[14], row[15], row[16] = tally.first_goal_m, tally.first_goal_axis_m, axis_m
-    row[17], row[18] = math.hypot(ex, ey), nees(ex, ey, eh, belief)
+    row[17], row[18] = math.hypot(ex, ey), pose_nees(ex, ey, eh, belief)
     row[19], row[20] = tally.goal_error_m, tally.furthest_m
     row[21] = max(tally.longest_gap_m, vehicle.travelled_m - tally.last_fix_m)
 
 
-def _keep(kept: NDArray[np.float64], vehicle: Vehicle, reading: Reading, belief: State) -> None:
+def _keep(kept: NDArray[np.float64], vehicle: TownVehicle, reading: Reading, belief: State) -> None:
     b = belief
     kept[0], kept[1], kept[2] = vehicle.x_m, vehicle.y_m, vehicle.heading_rad
     kept[3] = vehicle.speed_mps
@@ -581,7 +592,7 @@ def _keep(kept: NDArray[np.float64], vehicle: Vehicle, reading: Reading, belief:
 
 
 def _note_targets(
-    log: Log, steps: int, streets: Streets, targets: Targets, with_landmarks: bool
+    log: DriveRecord, steps: int, streets: Streets, targets: Targets, with_landmarks: bool
 ) -> None:
     _note(log, steps, GOAL_SET, streets, targets.goal, math.nan, math.nan)
     if with_landmarks:
@@ -590,23 +601,27 @@ def _note_targets(
 
 
 def _note(
-    log: Log, steps: int, kind: int, streets: Streets, node: int, x_m: float, y_m: float
+    log: DriveRecord, steps: int, kind: int, streets: Streets, node: int, x_m: float, y_m: float
 ) -> None:
     """Record an event, up to the log's capacity."""
     if log.noted[0] == len(log.events):
         return
     row = log.events[log.noted[0]]
     row[0], row[1], row[4], row[5] = steps, kind, x_m, y_m
-    row[2], row[3] = place_of(streets, node)
+    row[2], row[3] = node_position(streets, node)
     log.noted[0] += 1
 
 
-def no_log() -> Log:
+def no_log() -> DriveRecord:
     """Return a log that records nothing."""
-    return Log(np.empty((0, STEP_FIELDS)), np.empty((0, EVENT_FIELDS)), np.zeros(1, np.int64))
+    return DriveRecord(
+        np.empty((0, STEP_FIELDS)), np.empty((0, EVENT_FIELDS)), np.zeros(1, np.int64)
+    )
 
 
-def drive(settings: settings_of.Drive, seed: int, log: Log | None = None) -> Result:
+def simulate_town_drive(
+    settings: settings_of.TownDrive, seed: int, log: DriveRecord | None = None
+) -> DriveResult:
     """Simulate one drive without compilation; slower, with the same result."""
     row = np.empty(FIELDS)
     with np.errstate(over="ignore"):
@@ -614,7 +629,7 @@ def drive(settings: settings_of.Drive, seed: int, log: Log | None = None) -> Res
     return as_result(row)
 
 
-def drive_many(settings: settings_of.Drive, seeds: Keys) -> NDArray[np.float64]:
+def drive_many(settings: settings_of.TownDrive, seeds: Keys) -> NDArray[np.float64]:
     """Simulate one drive per seed; the interpreter's lock is released meanwhile.
 
     Args:
@@ -622,7 +637,7 @@ def drive_many(settings: settings_of.Drive, seeds: Keys) -> NDArray[np.float64]:
         seeds: Shape (N,), uint64.
 
     Returns:
-        Shape (N, 22): the fields of ``Result``.
+        Shape (N, 22): the fields of ``DriveResult``.
 
     Raises:
         ValueError: The settings yield a city without intersections.
@@ -637,7 +652,7 @@ def drive_many(settings: settings_of.Drive, seeds: Keys) -> NDArray[np.float64]:
     return rows
 
 
-def streets_of(settings: settings_of.Drive, seed: int) -> Streets:
+def streets_of(settings: settings_of.TownDrive, seed: int) -> Streets:
     """Return the streets of the drive with this seed."""
     make = kept(make_streets)
     with np.errstate(over="ignore"):
@@ -650,13 +665,13 @@ class Traced:
     """A simulated drive with all its steps.
 
     Attributes:
-        result: Result of ``drive``.
-        steps: Shape (S, 16), as in ``Log``.
-        events: Shape (E, 6), as in ``Log``.
+        result: Result of ``simulate_town_drive``.
+        steps: Shape (S, 16), as in ``DriveRecord``.
+        events: Shape (E, 6), as in ``DriveRecord``.
         first_belief: x, y, heading of the filter before the first step.
     """
 
-    result: Result
+    result: DriveResult
     steps: NDArray[np.float64]
     events: NDArray[np.float64]
     first_belief: tuple[float, float, float]
@@ -673,7 +688,7 @@ class Traced:
         return float(np.hypot(ways[:, 0], ways[:, 1]).sum())
 
 
-def drive_traced(settings: settings_of.Drive, seed: int) -> Traced:
+def drive_traced(settings: settings_of.TownDrive, seed: int) -> Traced:
     """Simulate one drive and record every step.
 
     Raises:
@@ -682,7 +697,7 @@ def drive_traced(settings: settings_of.Drive, seed: int) -> Traced:
     seeds = np.array([seed], np.uint64)
     result = as_result(drive_many(settings, seeds)[0])
     room = 2 * (result.goals + 1) + result.landmarks + result.passed
-    log = Log(
+    log = DriveRecord(
         np.empty((result.steps, STEP_FIELDS)),
         np.full((room, EVENT_FIELDS), np.nan),
         np.zeros(1, np.int64),
@@ -693,8 +708,8 @@ def drive_traced(settings: settings_of.Drive, seed: int) -> Traced:
     return Traced(result, log.steps, log.events[: log.noted[0]], (x, y, heading))
 
 
-def as_result(row: NDArray[np.float64]) -> Result:
-    """Convert a row to a ``Result`` with integer counts."""
-    kinds = get_type_hints(Result)
-    pairs = zip(Result._fields, row.tolist(), strict=True)
-    return Result(**{name: kinds[name](value) for name, value in pairs})
+def as_result(row: NDArray[np.float64]) -> DriveResult:
+    """Convert a row to a ``DriveResult`` with integer counts."""
+    kinds = get_type_hints(DriveResult)
+    pairs = zip(DriveResult._fields, row.tolist(), strict=True)
+    return DriveResult(**{name: kinds[name](value) for name, value in pairs})

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from crosscue.localization.navigation import STRATEGIES
 
-from .settings import Drive
+from .settings import TownDrive
 
 
 class Parameters(NamedTuple):
@@ -65,7 +65,7 @@ class Parameters(NamedTuple):
     max_s: float
 
 
-def parameters_of(settings: Drive) -> Parameters:
+def parameters_of(settings: TownDrive) -> Parameters:
     """Convert a drive's settings to numbers."""
     city, car, sensors, nav = settings.city, settings.car, settings.sensors, settings.navigation
     compass = sensors.compass_2sigma_deg

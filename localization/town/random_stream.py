@@ -30,7 +30,7 @@ TAIL_FROM: Final = 3.6541528853610088
 ZERO, ONE, U11, U27, U30, U31 = (np.uint64(n) for n in (0, 1, 11, 27, 30, 31))
 
 
-class Stream(NamedTuple):
+class RandomStream(NamedTuple):
     """State of the random numbers of one key."""
 
     state: np.uint64
@@ -44,7 +44,7 @@ def mix(number: np.uint64) -> np.uint64:
     return number ^ (number >> U31)
 
 
-def join(key: np.uint64, part: np.uint64) -> np.uint64:
+def combine_keys(key: np.uint64, part: np.uint64) -> np.uint64:
     """Combine a key and a number to a new key; the order matters."""
     return mix(key ^ mix(part + GOLDEN)) + GOLDEN
 
@@ -54,37 +54,37 @@ def key_of(*parts: int) -> int:
     key = ZERO
     with np.errstate(over="ignore"):
         for part in parts:
-            key = join(key, np.uint64(part))
+            key = combine_keys(key, np.uint64(part))
     return int(key)
 
 
-def stream_of(seed: np.uint64, purpose: np.uint64) -> Stream:
+def stream_of(seed: np.uint64, purpose: np.uint64) -> RandomStream:
     """Create a drive's stream for one purpose."""
-    key = join(join(ZERO, seed), purpose)
+    key = combine_keys(combine_keys(ZERO, seed), purpose)
     step = mix(key ^ GOLDEN) | ONE
     transitions, left = 0, step ^ (step >> ONE)
     while left != ZERO:
         left &= left - ONE
         transitions += 1
-    return Stream(key, step ^ FLIP if transitions < MIN_TRANSITIONS else step)
+    return RandomStream(key, step ^ FLIP if transitions < MIN_TRANSITIONS else step)
 
 
-def uniform(stream: Stream) -> tuple[float, Stream]:
+def uniform(stream: RandomStream) -> tuple[float, RandomStream]:
     """Draw a uniform number in [0, 1), a multiple of 2**-53."""
     state = stream.state + stream.step
-    return np.int64(mix(state) >> U11) * TO_UNIT, Stream(state, stream.step)
+    return np.int64(mix(state) >> U11) * TO_UNIT, RandomStream(state, stream.step)
 
 
-def below(stream: Stream, n: int) -> tuple[int, Stream]:
+def below(stream: RandomStream, n: int) -> tuple[int, RandomStream]:
     """Draw an integer in [0, n)."""
     number, stream = uniform(stream)
     return int(number * n), stream
 
 
-def normal(stream: Stream) -> tuple[float, Stream]:
+def normal(stream: RandomStream) -> tuple[float, RandomStream]:
     """Draw a standard normal number."""
     while True:
-        stream = Stream(stream.state + stream.step, stream.step)
+        stream = RandomStream(stream.state + stream.step, stream.step)
         bits = mix(stream.state)
         layer = np.int64(bits & LAYER_MASK)
         place = 2.0 * np.int64(bits >> U11) * TO_UNIT - 1.0
@@ -101,7 +101,7 @@ def normal(stream: Stream) -> tuple[float, Stream]:
             return x, stream
 
 
-def _tail(stream: Stream) -> tuple[float, Stream]:
+def _tail(stream: RandomStream) -> tuple[float, RandomStream]:
     """Draw a positive number from the tail beyond the last layer."""
     while True:
         one, stream = uniform(stream)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from crosscue.localization.pose_filter import arc
 
 from .parameters import Parameters
-from .streets import COSINES, HEADINGS_RAD, SINES, Streets, place_of, step_of
-from .vehicle import Lane, Vehicle
+from .streets import COSINES, HEADINGS_RAD, SINES, Streets, node_position, step_of
+from .vehicle import Lane, TownVehicle
 
 UNDECIDED: Final = -1
 # Turns at an intersection, in quarter turns to the left.
@@ -42,9 +42,9 @@ class Route(NamedTuple):
     along_m: float
 
 
-def remaining_m(streets: Streets, route: Route, vehicle: Vehicle) -> float:
+def remaining_m(streets: Streets, route: Route, vehicle: TownVehicle) -> float:
     """Distance to the centre of the next intersection, along the lane."""
-    x, y = place_of(streets, route.node)
+    x, y = node_position(streets, route.node)
     return COSINES[route.way] * (x - vehicle.x_m) + SINES[route.way] * (y - vehicle.y_m)
 
 
@@ -55,7 +55,7 @@ def entry_m(p: Parameters, turn: int) -> float:
     return p.right_radius_m + p.lane_offset_m if turn == RIGHT else 0.0
 
 
-def wanted_mps(p: Parameters, streets: Streets, route: Route, vehicle: Vehicle) -> float:
+def wanted_mps(p: Parameters, streets: Streets, route: Route, vehicle: TownVehicle) -> float:
     """Target speed at this position of the path."""
     if route.arc < route.arcs:
         return p.turn_mps
@@ -66,7 +66,7 @@ def wanted_mps(p: Parameters, streets: Streets, route: Route, vehicle: Vehicle) 
 
 
 def lane_of(
-    p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.float64], vehicle: Vehicle
+    p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.float64], vehicle: TownVehicle
 ) -> Lane:
     """Position of the vehicle relative to its lane."""
     c, s = math.cos(vehicle.heading_rad), math.sin(vehicle.heading_rad)
@@ -80,7 +80,7 @@ def lane_of(
         growth = side * (-out_y * s - out_x * c) / apart
         return Lane(side * (abs(radius) - apart), growth, curvature)
     street_c, street_s = COSINES[route.way], SINES[route.way]
-    x, y = place_of(streets, route.node)
+    x, y = node_position(streets, route.node)
     across = street_c * (vehicle.y_m - y) - street_s * (vehicle.x_m - x)
     return Lane(across + p.lane_offset_m, street_c * s - street_s * c, 0.0)
 
@@ -89,7 +89,7 @@ def _arc_at(arcs: NDArray[np.float64], i: int) -> tuple[float, float, float, flo
     return arcs[i, 0], arcs[i, 1], arcs[i, 2], arcs[i, 3], arcs[i, 4]
 
 
-def advance(route: Route, arcs: NDArray[np.float64], lane: Lane, distance_m: float) -> Route:
+def advance_turn(route: Route, arcs: NDArray[np.float64], lane: Lane, distance_m: float) -> Route:
     """Advance along the arc of a turn, if the vehicle is on one."""
     if route.arc == route.arcs:
         return route
@@ -119,7 +119,7 @@ def _lay_turn(p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.fl
     if route.turn == STRAIGHT:
         return 0
     c, s, heading = COSINES[route.way], SINES[route.way], HEADINGS_RAD[route.way]
-    x, y = place_of(streets, route.node)
+    x, y = node_position(streets, route.node)
     before, offset = entry_m(p, route.turn), p.lane_offset_m
     x, y = x - c * before + s * offset, y - s * before - c * offset
     if route.turn == BACK:

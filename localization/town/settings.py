@@ -105,7 +105,7 @@ class Navigation(Section):
     lost_above_m: Positive = 100.0
 
 
-class Drive(Section):
+class TownDrive(Section):
     """Settings of a drive; with a seed, they determine it."""
 
     city: City = City()

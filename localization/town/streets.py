@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .parameters import Parameters
-from .random_stream import Stream, below, uniform
+from .random_stream import RandomStream, below, uniform
 
 HEADINGS_RAD: Final = (0.0, math.pi / 2.0, math.pi, -math.pi / 2.0)
 COSINES: Final = tuple(math.cos(heading) for heading in HEADINGS_RAD)
@@ -55,13 +55,13 @@ def has_way(ways: NDArray[np.uint8], node: int, way: int) -> bool:
     return (int(ways[node]) >> way) & 1 == 1
 
 
-def place_of(streets: Streets, node: int) -> tuple[float, float]:
+def node_position(streets: Streets, node: int) -> tuple[float, float]:
     """Position of an intersection in metres."""
     columns = len(streets.xs_m)
     return streets.xs_m[node % columns], streets.ys_m[node // columns]
 
 
-def make_streets(stream: Stream, p: Parameters) -> Streets:
+def make_streets(stream: RandomStream, p: Parameters) -> Streets:
     """Generate a random city; the same stream and settings yield the same one."""
     number, stream = uniform(stream)
     area_km2 = p.min_km2 + (p.max_km2 - p.min_km2) * number
@@ -91,8 +91,8 @@ def make_streets(stream: Stream, p: Parameters) -> Streets:
 
 
 def _coordinates(
-    stream: Stream, side_m: float, p: Parameters
-) -> tuple[NDArray[np.float64], Stream]:
+    stream: RandomStream, side_m: float, p: Parameters
+) -> tuple[NDArray[np.float64], RandomStream]:
     span = p.max_block_m - p.min_block_m
     places = np.empty(3 + int(side_m / p.min_block_m))
     places[0], count = 0.0, 1
@@ -242,7 +242,7 @@ def has_intersection(streets: Streets) -> bool:
     return False
 
 
-def draw_place(stream: Stream, inside: NDArray[np.bool_]) -> tuple[int, Stream]:
+def draw_place(stream: RandomStream, inside: NDArray[np.bool_]) -> tuple[int, RandomStream]:
     """Draw a random intersection of the connected part."""
     while True:
         node, stream = below(stream, len(inside))
@@ -250,21 +250,23 @@ def draw_place(stream: Stream, inside: NDArray[np.bool_]) -> tuple[int, Stream]:
             return node, stream
 
 
-def draw_goal(stream: Stream, streets: Streets, start: int, min_m: float) -> tuple[int, Stream]:
+def draw_goal(
+    stream: RandomStream, streets: Streets, start: int, min_m: float
+) -> tuple[int, RandomStream]:
     """Draw an intersection at least ``min_m`` from ``start``; after many tries, the last one."""
-    x, y = place_of(streets, start)
+    x, y = node_position(streets, start)
     goal = start
     for _ in range(MAX_TRIES):
         goal, stream = draw_place(stream, streets.inside)
-        there_x, there_y = place_of(streets, goal)
+        there_x, there_y = node_position(streets, goal)
         if goal != start and (there_x - x) ** 2 + (there_y - y) ** 2 >= min_m**2:
             break
     return goal, stream
 
 
 def draw_landmarks(
-    stream: Stream, streets: Streets, per_km2: float
-) -> tuple[NDArray[np.int64], Stream]:
+    stream: RandomStream, streets: Streets, per_km2: float
+) -> tuple[NDArray[np.int64], RandomStream]:
     """Draw distinct intersections with a landmark, in random order."""
     number, stream = uniform(stream)
     wanted = min(int(per_km2 * streets.area_km2 + number), streets.inside.sum())

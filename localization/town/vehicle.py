@@ -12,7 +12,7 @@ from crosscue.localization.angles import wrap
 from crosscue.localization.pose_filter import arc
 
 from .parameters import Parameters
-from .random_stream import Stream, normal
+from .random_stream import RandomStream, normal
 
 MAX_STEERING_RAD: Final = 0.7
 # Ratio of the maximum deceleration to the maximum acceleration.
@@ -30,7 +30,7 @@ class Lane(NamedTuple):
     curvature: float
 
 
-class Vehicle(NamedTuple):
+class TownVehicle(NamedTuple):
     """True state of the vehicle, and state of controllers and encoders."""
 
     x_m: float
@@ -61,7 +61,7 @@ def steering_rad(p: Parameters, lane: Lane, offset_integral: float) -> float:
     return min(max(angle, -MAX_STEERING_RAD), MAX_STEERING_RAD)
 
 
-def move(p: Parameters, vehicle: Vehicle, lane: Lane, wanted_mps: float) -> Vehicle:
+def move(p: Parameters, vehicle: TownVehicle, lane: Lane, wanted_mps: float) -> TownVehicle:
     """Control the vehicle and move it by one step (eq. 5 and 6)."""
     v, dt = vehicle, p.step_s
     slow = wanted_mps - v.speed_mps
@@ -73,7 +73,7 @@ def move(p: Parameters, vehicle: Vehicle, lane: Lane, wanted_mps: float) -> Vehi
     turned = distance * steering_rad(p, lane, v.offset_integral) / p.wheelbase_m
     step = arc(distance, turned)
     c, s = math.cos(v.heading_rad), math.sin(v.heading_rad)
-    return Vehicle(
+    return TownVehicle(
         v.x_m + c * step.dx_m - s * step.dy_m,
         v.y_m + s * step.dx_m + c * step.dy_m,
         wrap(v.heading_rad + turned),
@@ -92,9 +92,9 @@ def _bounded(integral: float) -> float:
     return min(max(integral, -MAX_INTEGRAL), MAX_INTEGRAL)
 
 
-def measure(
-    p: Parameters, before: Vehicle, after: Vehicle, noise: Stream
-) -> tuple[Vehicle, Reading, Stream]:
+def measure_step(
+    p: Parameters, before: TownVehicle, after: TownVehicle, noise: RandomStream
+) -> tuple[TownVehicle, Reading, RandomStream]:
     """Measure wheel paths with slip and encoder resolution, and the compass if a reading is due."""
     distance = after.travelled_m - before.travelled_m
     half = 0.5 * p.track_width_m * wrap(after.heading_rad - before.heading_rad)
@@ -106,7 +106,7 @@ def measure(
         error, noise = normal(noise)
         compass = wrap(after.heading_rad + p.compass_sd_rad * error)
     a = after
-    vehicle = Vehicle(
+    vehicle = TownVehicle(
         a.x_m,
         a.y_m,
         a.heading_rad,
@@ -123,8 +123,8 @@ def measure(
 
 
 def _encoder(
-    p: Parameters, path_m: float, unread_m: float, noise: Stream
-) -> tuple[float, float, Stream]:
+    p: Parameters, path_m: float, unread_m: float, noise: RandomStream
+) -> tuple[float, float, RandomStream]:
     """Measured path of a wheel, and the remaining fraction of a count."""
     error, noise = normal(noise)
     unread = unread_m + path_m + p.slip_per_sqrt_m * math.sqrt(abs(path_m)) * error

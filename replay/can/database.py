@@ -18,9 +18,9 @@ from crosscue.replay.errors import CanDatabaseError, LogTooLargeError, SchemaErr
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 from .dbc_text import read_dbc
-from .extract import Extractor
-from .layout import CanMessage, CanSignal, layout_problem, overlaps
-from .layout_cache import LayoutEntry, cache_folder
+from .extract import MessageExtractor
+from .layout import CanMessage, CanSignal, layout_problem, overlapping_signals
+from .layout_cache import LayoutEntry, layout_cache_folder
 from .sources import MAX_CANTOOLS, DatabaseText, doubts, read_text, refuse_bombs
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class CanDatabase:
     messages: tuple[CanMessage, ...]
     notices: tuple[str, ...] = ()
     conflicts: tuple[Conflict, ...] = ()
-    _extractors: dict[tuple[int, bool, frozenset[str] | None], Extractor] = field(
+    _extractors: dict[tuple[int, bool, frozenset[str] | None], MessageExtractor] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
@@ -135,7 +135,9 @@ class CanDatabase:
         wanted = (arbitration_id, is_extended)
         return next((m for m in self.messages if m.key == wanted), None)
 
-    def extractor(self, message: CanMessage, wanted: Collection[str] | None = None) -> Extractor:
+    def extractor(
+        self, message: CanMessage, wanted: Collection[str] | None = None
+    ) -> MessageExtractor:
         """Return the extractor of a message's signals, which is planned once for all logs.
 
         Args:
@@ -145,7 +147,7 @@ class CanDatabase:
         key = (*message.key, None if wanted is None else frozenset(wanted))
         found = self._extractors.get(key)
         if found is None:
-            found = self._extractors.setdefault(key, Extractor(message, wanted))
+            found = self._extractors.setdefault(key, MessageExtractor(message, wanted))
         return found
 
     def named(self, name: str) -> CanMessage:
@@ -201,7 +203,7 @@ def _load_file(path: Path, limits: Limits) -> tuple[list[CanMessage], list[str]]
         known = " ".join(f".{suffix}" for suffix in FORMATS)
         raise CanDatabaseError(f"{path}: not a CAN database; expected a name ending in {known}")
     source = read_text(path, limits)
-    entry = LayoutEntry(source, form, cache_folder())
+    entry = LayoutEntry(source, form, layout_cache_folder())
     kept = entry.read()
     if kept is not None:
         return kept
@@ -324,7 +326,7 @@ def _doubts_of(message: CanMessage) -> list[str]:
         return []
     if message.problem:
         return [f"{where} cannot be decoded: {message.problem}"]
-    pairs = list(islice(overlaps(message), _MAX_PAIRS + 1))
+    pairs = list(islice(overlapping_signals(message), _MAX_PAIRS + 1))
     notices = [f"{where}: signals {a} and {b} share bits" for a, b in pairs[:_MAX_PAIRS]]
     if len(pairs) > _MAX_PAIRS:
         notices.append(f"{where}: more signals share bits")

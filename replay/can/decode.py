@@ -28,8 +28,8 @@ from crosscue.replay.columns import (
 from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
 
 from .database import CanDatabase, spell_id
-from .extract import PRESENT_SUFFIX, Extractor
-from .grouping import STANDARD_IDS, Engine, Grouped, Rules
+from .extract import PRESENT_SUFFIX, MessageExtractor
+from .grouping import STANDARD_IDS, CanDecoder, Grouped, MessageRules
 from .layout import Arithmetic, CanMessage
 from .numpy_engine import NumpyEngine
 
@@ -80,7 +80,7 @@ class _Entry:
     """The decoder's entry for one message of the database."""
 
     message: CanMessage
-    extractor: Extractor | None
+    extractor: MessageExtractor | None
     refusal: str
 
 
@@ -258,7 +258,7 @@ class BusDecoder:
         self._ledger.skip(self._bus, key[2], count, detail, int(log_ns[np.argmax(rows)]))
 
 
-def compiled_engine(rules: Sequence[Rules]) -> Engine:
+def compiled_engine(rules: Sequence[MessageRules]) -> CanDecoder:
     """Return the engine of compiled loops, importing Numba only now because that is slow."""
     from .numba_engine import NumbaEngine
 
@@ -318,18 +318,20 @@ def _entry(database: CanDatabase, message: CanMessage, chosen: _Chosen | None) -
     return _Entry(message, database.extractor(message, wanted), "")
 
 
-def _rules(entry: _Entry, settings: DecodeSettings) -> Rules:
+def _rules(entry: _Entry, settings: DecodeSettings) -> MessageRules:
     message = entry.message
     if entry.extractor is None:
-        return Rules(message, None, (-1, -1))
+        return MessageRules(message, None, (-1, -1))
     if settings.allow_longer:
         classic = flexible = LENGTH_UNKNOWN
     else:
         classic, flexible = message.longest_frame(False), message.longest_frame(True)
-    return Rules(message, entry.extractor, (classic, -1 if message.is_fd is False else flexible))
+    return MessageRules(
+        message, entry.extractor, (classic, -1 if message.is_fd is False else flexible)
+    )
 
 
-def _dtypes(extractor: Extractor) -> dict[str, np.dtype[np.generic]]:
+def _dtypes(extractor: MessageExtractor) -> dict[str, np.dtype[np.generic]]:
     columns: dict[str, np.dtype[np.generic]] = {}
     for signal in extractor.signals:
         kind = signal.arithmetic

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .extract import PRESENT_SUFFIX, is_one_of, known_values, switches_on
-from .layout import Arithmetic, CanMessage, CanSignal, overlaps
+from .layout import Arithmetic, CanMessage, CanSignal, overlapping_signals
 
 Column: TypeAlias = NDArray[Any]
 
@@ -54,7 +54,7 @@ def encode(message: CanMessage, columns: Mapping[str, Column]) -> NDArray[np.uin
 def _checked_length(message: CanMessage, columns: Mapping[str, Column]) -> int:
     if message.problem:
         raise ValueError(f"{message.name}: {message.problem}")
-    for a, b in overlaps(message):
+    for a, b in overlapping_signals(message):
         raise ValueError(f"{message.name}: signals {a} and {b} share bits; cannot hold both")
     known = {signal.name for signal in message.signals}
     for name in columns:

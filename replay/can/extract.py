@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .layout import Arithmetic, CanMessage, CanSignal, is_whole
+from .layout import Arithmetic, CanMessage, CanSignal, is_integer
 
 # Shape (N, W / 8): payloads as little-endian words.
 Words: TypeAlias = NDArray[np.uint64]
@@ -191,7 +191,7 @@ def _big(raw: Column, signals: list[CanSignal]) -> NDArray[np.float64]:
 
 
 def _plain(number: float) -> float:
-    return int(number) if is_whole(number) else number
+    return int(number) if is_integer(number) else number
 
 
 class _Flat:
@@ -238,7 +238,7 @@ class _Node:
     switches: tuple[_Switch, ...]
 
 
-class Extractor:
+class MessageExtractor:
     """Extractor of some signals of one message from payloads into columns.
 
     A signal that a row's multiplexers do not select is NaN there. An int64 or uint64 column holds 0

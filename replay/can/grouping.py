@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import LENGTH_UNKNOWN, CanFrames
 
-from .extract import Column, Extractor, Words
+from .extract import Column, MessageExtractor, Words
 from .layout import CanMessage
 
 STANDARD_IDS: Final = 2048
@@ -21,7 +21,7 @@ Strange: TypeAlias = NDArray[np.bool_] | None
 
 
 @dataclass(frozen=True, slots=True)
-class Rules:
+class MessageRules:
     """Requirements on the frames of one message.
 
     Attributes:
@@ -31,12 +31,12 @@ class Rules:
     """
 
     message: CanMessage
-    extractor: Extractor | None
+    extractor: MessageExtractor | None
     longest: tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Tables:
+class RuleArrays:
     """The rules of all messages as arrays; message number 0 means no message.
 
     Attributes:
@@ -54,7 +54,7 @@ class Tables:
     fits: dict[int, NDArray[np.bool_]]
 
     @classmethod
-    def of(cls, rules: Sequence[Rules]) -> Tables:
+    def of(cls, rules: Sequence[MessageRules]) -> RuleArrays:
         """Build the tables; messages are numbered from 1."""
         standard = np.zeros(STANDARD_IDS + 1, dtype=np.uint16)
         fits = {width: np.zeros((2, len(rules) + 1, 256), dtype=np.bool_) for width in (8, 64)}
@@ -110,7 +110,7 @@ class Grouped:
         return slice(int(self.stops[number - 1]), int(self.stops[number]))
 
 
-class Engine(Protocol):
+class CanDecoder(Protocol):
     """Engine that groups frames and decodes the columns of each group."""
 
     def group(self, frames: CanFrames) -> Grouped:
@@ -118,11 +118,11 @@ class Engine(Protocol):
         ...
 
     def columns(self, number: int) -> tuple[Columns, Strange]:
-        """Return the columns of one message of the last group of frames, like ``Extractor``."""
+        """Return the columns of one message of the last group, like ``MessageExtractor``."""
         ...
 
 
-def words_of(frames: CanFrames) -> Words:
+def payload_words(frames: CanFrames) -> Words:
     """Return payloads as little-endian words, shape (N, W / 8)."""
     words: Words = np.ascontiguousarray(frames.data).view("<u8").astype(np.uint64, copy=False)
     return words

@@ -32,7 +32,7 @@ EVEN_BYTES: Final = np.uint64(0x00FF_00FF_00FF_00FF)
 EVEN_PAIRS: Final = np.uint64(0x0000_FFFF_0000_FFFF)
 
 
-def compiled(loop: Loop) -> Loop:
+def compile_loop(loop: Loop) -> Loop:
     """Compile a loop at its first call, or load what an earlier process compiled."""
     try:
         return cast("Loop", njit(cache=True, nogil=True)(loop))
@@ -40,7 +40,7 @@ def compiled(loop: Loop) -> Loop:
         return cast("Loop", njit(nogil=True)(loop))
 
 
-@compiled
+@compile_loop
 def look_up(
     arbitration_id: NDArray[np.uint32],
     is_extended: NDArray[np.bool_],
@@ -83,7 +83,7 @@ def look_up(
         unknown[place] += int(is_data & (found == 0))
 
 
-@compiled
+@compile_loop
 def put_in_order(
     number: NDArray[np.uint16],
     good_rows: NDArray[np.intp],
@@ -104,7 +104,7 @@ def put_in_order(
             little[k, row] = words[i, k]
 
 
-@compiled
+@compile_loop
 def swap_bytes(words: NDArray[np.uint64], turned: NDArray[np.uint64]) -> None:
     """Reverse the bytes of each word."""
     for r in range(len(words)):
@@ -114,7 +114,7 @@ def swap_bytes(words: NDArray[np.uint64], turned: NDArray[np.uint64]) -> None:
         turned[r] = (x << np.uint64(32)) | (x >> np.uint64(32))
 
 
-@compiled
+@compile_loop
 def align_left(
     words: NDArray[np.uint64],
     following: NDArray[np.uint64],
@@ -138,7 +138,7 @@ def align_left(
             raw[r] = ((words[r] >> bit) | (following[r] << (full - bit))) << drop
 
 
-@compiled
+@compile_loop
 def to_floats(
     kind: np.uint8,
     raw: NDArray[np.uint64],
@@ -177,7 +177,7 @@ def to_floats(
             out[r] = doubles[r] if kind == DOUBLE else doubles[r] * scale + offset
 
 
-@compiled
+@compile_loop
 def to_whole(
     kind: np.uint8,
     raw: NDArray[np.uint64],
@@ -195,7 +195,7 @@ def to_whole(
             out[r] = (raw[r] >> drop) * scale + offset
 
 
-@compiled
+@compile_loop
 def extract_signals(
     little: NDArray[np.uint64],
     stops: NDArray[np.intp],

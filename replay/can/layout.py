@@ -96,12 +96,12 @@ class CanSignal:
     @property
     def arithmetic(self) -> Arithmetic:
         """Arithmetic of its values, which determines the column's dtype."""
-        if self.is_float or not is_whole(self.scale):
+        if self.is_float or not is_integer(self.scale):
             return Arithmetic.FLOAT
         if self.length <= 32 and abs(self.scale) <= 2**20 and abs(self.offset) <= 2**52:
             return Arithmetic.FLOAT  # a shortcut for nearly all signals
         products = [raw * int(self.scale) for raw in self.raw_range]
-        if not is_whole(self.offset):
+        if not is_integer(self.offset):
             small = _largest([*self.raw_range, *products]) <= EXACT_IN_FLOAT64
             return Arithmetic.FLOAT if small else Arithmetic.BIG
         values = [product + int(self.offset) for product in products]
@@ -183,7 +183,7 @@ class CanMessage:
         return next((n for n in _FD_LENGTHS if n >= self.length), self.length)
 
 
-def is_whole(number: float) -> bool:
+def is_integer(number: float) -> bool:
     """Return whether a number is an integer, regardless of its type."""
     return isinstance(number, int) or number.is_integer()
 
@@ -220,7 +220,7 @@ def _multiplexing_problem(message: CanMessage) -> str:
     return ""
 
 
-def overlaps(message: CanMessage) -> Iterator[tuple[str, str]]:
+def overlapping_signals(message: CanMessage) -> Iterator[tuple[str, str]]:
     """Yield pairs of signals that share a bit although both can occur in one frame."""
     owner: dict[int, list[CanSignal]] = {}
     reported: set[tuple[str, str]] = set()

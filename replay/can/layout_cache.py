@@ -36,7 +36,7 @@ _HEAD: Final = b"crosscue CAN layout "
 _MADE_BY: Final = ("database.py", "dbc_text.py", "layout.py", "layout_cache.py", "sources.py")
 
 
-def cache_folder(environment: Mapping[str, str] = os.environ) -> Path | None:
+def layout_cache_folder(environment: Mapping[str, str] = os.environ) -> Path | None:
     """Return the folder of the cache, or None if it is disabled."""
     asked = environment.get(VARIABLE)
     if asked is not None:

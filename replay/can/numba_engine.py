@@ -15,17 +15,25 @@ from crosscue.replay.columns import CanFrames
 
 from . import kernels
 from .extract import Column, Words, flip_and_bias, is_short_integer
-from .grouping import STANDARD_IDS, Columns, Grouped, Rules, Strange, Tables, words_of
+from .grouping import (
+    STANDARD_IDS,
+    Columns,
+    Grouped,
+    MessageRules,
+    RuleArrays,
+    Strange,
+    payload_words,
+)
 from .layout import Arithmetic, CanSignal
 
 
 class NumbaEngine:
     """Engine of compiled loops; messages with multiplexers still use their extractors."""
 
-    def __init__(self, rules: Sequence[Rules]) -> None:
+    def __init__(self, rules: Sequence[MessageRules]) -> None:
         """Prepare the tables; rules without an extractor must be last."""
         self._rules = rules
-        self._tables = Tables.of(rules)
+        self._tables = RuleArrays.of(rules)
         simple = [_simple_signals(rule) for rule in rules]
         self._simple = [_Simple.of(signals) for signals in simple]
         self._plan = _Plan.of([[], *simple])
@@ -60,7 +68,7 @@ class NumbaEngine:
             good_rows,
         )
         stops = np.cumsum(counts)
-        words, n = _plain(words_of(frames)), int(stops[-1])
+        words, n = _plain(payload_words(frames)), int(stops[-1])
         order = np.empty(n, dtype=np.intp)
         little = np.empty((words.shape[1], n), dtype=np.uint64)
         kernels.put_in_order(number, good_rows[:n], stops - counts, words, order, little)
@@ -196,7 +204,7 @@ def _plain(column: Column) -> Column:
     return np.require(column, requirements=("C", "W"))
 
 
-def _simple_signals(rule: Rules) -> Sequence[CanSignal]:
+def _simple_signals(rule: MessageRules) -> Sequence[CanSignal]:
     """Return the signals to extract with compiled loops; none if the extractor must be used."""
     extractor = rule.extractor
     if extractor is None or extractor.is_multiplexed:

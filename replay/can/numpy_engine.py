@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import DATA, LENGTH_UNKNOWN, CanFrames
 
 from .extract import Words
-from .grouping import STANDARD_IDS, Columns, Grouped, Rules, Strange, Tables, words_of
+from .grouping import (
+    STANDARD_IDS,
+    Columns,
+    Grouped,
+    MessageRules,
+    RuleArrays,
+    Strange,
+    payload_words,
+)
 
 # Max number of messages for which searching for each is faster than sorting (0.11 ms against 0.21
 # ms for 10 messages in 58,000 frames).
@@ -21,11 +29,11 @@ FEW: Final = 16
 class NumpyEngine:
     """Engine of vectorized NumPy code, which is the faster engine for short logs."""
 
-    def __init__(self, rules: Sequence[Rules]) -> None:
+    def __init__(self, rules: Sequence[MessageRules]) -> None:
         """Prepare the tables; rules without an extractor must be last."""
         self._rules = rules
         self._decodable = sum(rule.extractor is not None for rule in rules)
-        self._tables = Tables.of(rules)
+        self._tables = RuleArrays.of(rules)
         self._numbers = np.arange(len(rules) + 1, dtype=np.uint16)
         self._grouped: Grouped | None = None
         self._words: Words = np.zeros((0, 1), dtype=np.uint64)
@@ -43,7 +51,7 @@ class NumpyEngine:
             order, stops = self._sort(np.where(is_good, number, np.uint16(0)))
         order = order[stops[0] : stops[self._decodable]]
         stops = np.minimum(stops, stops[self._decodable]) - stops[0]
-        self._words = words_of(frames).take(order, axis=0)
+        self._words = payload_words(frames).take(order, axis=0)
         unknown = is_data & (number == 0) & ~frames.is_extended
         by_id = np.bincount(
             np.minimum(frames.arbitration_id[unknown], STANDARD_IDS), minlength=STANDARD_IDS

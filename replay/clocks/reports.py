@@ -4,8 +4,8 @@ A recording may store up to three times for a row: the *log time* (when the reco
 *publish time* (when the sender sent it) and the *header stamp* (of the sensor). ``ClockWatch``
 accepts blocks as they are read, in bounded memory, and creates a ``ClockReport`` for every topic.
 
-``choose`` implements the rule. The header stamp is used if it agrees with the log clock, else the
-publish time if it agrees, else the log time. A clock agrees if
+``choose_clock`` implements the rule. The header stamp is used if it agrees with the log clock, else
+the publish time if it agrees, else the log time. A clock agrees if
 
 * at least 99 % of the rows carry it, and it moves;
 * it was never set back, never jumps, and at most 1 % of its rows are late;
@@ -158,7 +158,7 @@ class ClockWatch:
         return {name: copy.deepcopy(t).finish(name) for name, t in self._topics.items()}
 
 
-def choose(
+def choose_clock(
     count: int, log: StampReport, publish: StampReport | None, header: StampReport | None
 ) -> tuple[Clock, str]:
     """Return the clock to use for a topic of ``count`` rows, and the reason in plain English.
@@ -291,7 +291,7 @@ class _TopicWatch:
         reports = {clock: watch.finish() for clock, watch in self._stamps.items()}
         log = reports[Clock.LOG]
         publish, header = reports.get(Clock.PUBLISH), reports.get(Clock.HEADER)
-        used, why = choose(self._count, log, publish, header)
+        used, why = choose_clock(self._count, log, publish, header)
         return ClockReport(topic, self._count, used, why, log, publish, header)
 
     def _process(self) -> None:

@@ -8,7 +8,7 @@ from enum import Enum
 from typing import Final
 
 
-class Picture(Enum):
+class PictureKind(Enum):
     """Kind of picture message, which determines how the coding is found."""
 
     COMPRESSED = "compressed"
@@ -16,15 +16,15 @@ class Picture(Enum):
     RAW = "raw"
 
 
-PICTURES: Final[Mapping[str, Picture]] = {
-    "foxglove.CompressedImage": Picture.COMPRESSED,
-    "foxglove.CompressedVideo": Picture.VIDEO,
-    "foxglove.RawImage": Picture.RAW,
+PICTURES: Final[Mapping[str, PictureKind]] = {
+    "foxglove.CompressedImage": PictureKind.COMPRESSED,
+    "foxglove.CompressedVideo": PictureKind.VIDEO,
+    "foxglove.RawImage": PictureKind.RAW,
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class SourceField:
     """Source field of a standard column.
 
     Attributes:
@@ -36,26 +36,26 @@ class Source:
     count: int = 0
 
 
-def _pose(prefix: str) -> dict[str, Source]:
-    return {f"{axis}_m": Source(f"{prefix}position.{axis}") for axis in "xyz"} | {
-        f"quat_{axis}": Source(f"{prefix}orientation.{axis}") for axis in "xyzw"
+def _pose(prefix: str) -> dict[str, SourceField]:
+    return {f"{axis}_m": SourceField(f"{prefix}position.{axis}") for axis in "xyz"} | {
+        f"quat_{axis}": SourceField(f"{prefix}orientation.{axis}") for axis in "xyzw"
     }
 
 
-TABLES: Final[Mapping[str, Mapping[str, Source]]] = {
+TABLES: Final[Mapping[str, Mapping[str, SourceField]]] = {
     "foxglove.LocationFix": {
-        "latitude_deg": Source("latitude"),
-        "longitude_deg": Source("longitude"),
-        "altitude_m": Source("altitude"),
-        "covariance_m2": Source("position_covariance", 9),
-        "covariance_type": Source("position_covariance_type"),
+        "latitude_deg": SourceField("latitude"),
+        "longitude_deg": SourceField("longitude"),
+        "altitude_m": SourceField("altitude"),
+        "covariance_m2": SourceField("position_covariance", 9),
+        "covariance_type": SourceField("position_covariance_type"),
     },
     "foxglove.CameraCalibration": {
-        "width_px": Source("width"),
-        "height_px": Source("height"),
-        "k": Source("K", 9),
-        "p": Source("P", 12),
-        "d": Source("D", -1),
+        "width_px": SourceField("width"),
+        "height_px": SourceField("height"),
+        "k": SourceField("K", 9),
+        "p": SourceField("P", 12),
+        "d": SourceField("D", -1),
     },
     "foxglove.PoseInFrame": _pose("pose."),
 }

@@ -20,7 +20,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS
 
 from .coding import MAGIC_BYTES
-from .foxglove import PICTURES, TABLES, Picture, Source
+from .foxglove import PICTURES, TABLES, PictureKind, SourceField
 from .pictures import PictureRow, images_of
 from .protobuf import MAX_SECONDS
 from .refuse import MISFIT, refuse
@@ -140,7 +140,7 @@ def _standard(value: dict[str, Any], sources: Any) -> dict[str, Any]:
     return {column: _at(value, source) for column, source in sources.items()}
 
 
-def _at(value: Any, source: Source) -> Any:
+def _at(value: Any, source: SourceField) -> Any:
     for step in source.path.split("."):
         value = value[step]
     if source.count == 0:
@@ -167,7 +167,7 @@ def _column(values: list[Any]) -> NDArray[np.generic]:
 
 @dataclass(frozen=True, slots=True)
 class _PictureDecoder:
-    picture: Picture
+    picture: PictureKind
 
     def __call__(self, block: Block, ledger: Ledger) -> Block:
         if not isinstance(block.rows, Messages):

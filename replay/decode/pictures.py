@@ -12,7 +12,7 @@ from crosscue.replay.decode.ros.standard import MAX_SIDE_PX
 from crosscue.replay.ledger import Ledger
 
 from .coding import STREAMS, coding_of
-from .foxglove import Picture
+from .foxglove import PictureKind
 from .refuse import EMPTY_PICTURE, IMAGE_CODING, MISFIT, VIDEO_CODING, refuse
 
 _NO_TIME: Final = 0
@@ -46,7 +46,7 @@ class PictureRow:
 def images_of(
     block: Block,
     buffer: Bytes,
-    picture: Picture,
+    picture: PictureKind,
     rows: list[PictureRow | str],
     ledger: Ledger,
 ) -> Block:
@@ -73,7 +73,7 @@ def images_of(
     start = np.array([row.start for row in good], np.int64)
     stop = np.array([row.stop for row in good], np.int64)
     images = Images(Messages(buffer, start, stop), tuple(codings))
-    if picture is Picture.RAW:
+    if picture is PictureKind.RAW:
         images = replace(
             images,
             width_px=np.array([row.width_px for row in good], np.int32),
@@ -88,15 +88,15 @@ def images_of(
     return replace(block.take(np.array(kept, np.intp)), rows=images, header_ns=header_ns)
 
 
-def _judge(row: PictureRow | str, picture: Picture) -> tuple[ImageCoding | None, str, str]:
+def _judge(row: PictureRow | str, picture: PictureKind) -> tuple[ImageCoding | None, str, str]:
     """Return the picture's coding, or None with reason and detail."""
     if isinstance(row, str):
         return None, MISFIT, row
     if row.start == row.stop:
         return None, EMPTY_PICTURE, ""
-    if picture is Picture.VIDEO:
+    if picture is PictureKind.VIDEO:
         return STREAMS.get(row.label.lower()), VIDEO_CODING, row.label[:40]
-    if picture is Picture.COMPRESSED:
+    if picture is PictureKind.COMPRESSED:
         return coding_of(row.magic, row.label), IMAGE_CODING, row.label[:40]
     sides = (row.width_px, row.height_px)
     if min(sides) < 1 or max(sides) > MAX_SIDE_PX:

@@ -29,7 +29,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS
 
 from .coding import MAGIC_BYTES
-from .foxglove import PICTURES, TABLES, Picture, Source
+from .foxglove import PICTURES, TABLES, PictureKind, SourceField
 from .pictures import PictureRow, images_of
 from .refuse import MISFIT, refuse
 
@@ -113,7 +113,7 @@ class _Leaf:
         column: Name of the column.
         steps: Field names from the root.
         dtype: NumPy code; ``time``; or empty for the length of a repeated field.
-        count: Length of the array, as in ``Source``.
+        count: Length of the array, as in ``SourceField``.
     """
 
     column: str
@@ -133,7 +133,7 @@ def _leaves(name: str, descriptor: Descriptor) -> tuple[_Leaf, ...]:
     return (*stamp, *(_standard_leaf(name, descriptor, c, s) for c, s in standard.items()))
 
 
-def _standard_leaf(name: str, descriptor: Descriptor, column: str, source: Source) -> _Leaf:
+def _standard_leaf(name: str, descriptor: Descriptor, column: str, source: SourceField) -> _Leaf:
     steps = tuple(source.path.split("."))
     at: Descriptor | None = descriptor
     each = None
@@ -242,7 +242,7 @@ def _column(leaf: _Leaf, values: list[Any]) -> NDArray[np.generic]:
 class _PictureDecoder:
     """Decoder of picture messages, with their field numbers."""
 
-    picture: Picture
+    picture: PictureKind
     numbers: dict[int, str]
 
     def __call__(self, block: Block, ledger: Ledger) -> Block:
@@ -305,7 +305,7 @@ def _picture_decoder(name: str, descriptor: Descriptor) -> _PictureDecoder:
         "data": (FieldDescriptor.TYPE_BYTES,),
     }
     number = (FieldDescriptor.TYPE_FIXED32, FieldDescriptor.TYPE_UINT32)
-    if PICTURES[name] is Picture.RAW:
+    if PICTURES[name] is PictureKind.RAW:
         wanted |= {"encoding": (FieldDescriptor.TYPE_STRING,)}
         wanted |= dict.fromkeys(("width", "height", "step"), number)
     else:

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames
-from crosscue.replay.decode.ros.plan import Plan
+from crosscue.replay.decode.ros.plan import ParsingPlan
 from crosscue.replay.ledger import Ledger
 
 from .outgoing import Outgoing, Ros2Type, own_type, stamps, standard_type, with_rows
@@ -33,7 +33,7 @@ FD_SUFFIX: Final = "/fd"
 
 
 @cache
-def _fd_type() -> tuple[Ros2Type, Plan]:
+def _fd_type() -> tuple[Ros2Type, ParsingPlan]:
     return own_type(FD_TYPE, FD_TEXT)
 
 

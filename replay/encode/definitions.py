@@ -13,17 +13,17 @@ from crosscue.replay.decode.ros.definition import (
     PRIMITIVES,
     TIME,
     Definitions,
-    Field,
-    Shape,
+    MessageField,
+    Multiplicity,
     well_known,
 )
 from crosscue.replay.errors import SchemaError
 
 SEPARATOR: Final = "=" * 80 + "\n"
 HEADER: Final = "std_msgs/msg/Header"
-_TIMES: Final[Mapping[str, tuple[Field, ...]]] = {
-    TIME: (Field("sec", "int32"), Field("nanosec", "uint32")),
-    DURATION: (Field("sec", "int32"), Field("nanosec", "uint32")),
+_TIMES: Final[Mapping[str, tuple[MessageField, ...]]] = {
+    TIME: (MessageField("sec", "int32"), MessageField("nanosec", "uint32")),
+    DURATION: (MessageField("sec", "int32"), MessageField("nanosec", "uint32")),
 }
 
 
@@ -71,7 +71,7 @@ def as_ros2(type_name: str, ros1: Definitions) -> Definitions:
 
     If ROS 2 has a type of this name with the same encoding, its field names are used.
     """
-    known: dict[str, tuple[Field, ...]] = {}
+    known: dict[str, tuple[MessageField, ...]] = {}
     for name, fields in ros1.items():
         kept = fields
         if name == HEADER and fields and fields[0].name == "seq":
@@ -96,8 +96,8 @@ def _alike(name: str, ours: Definitions, theirs: Definitions) -> bool:
     if mine is None or other is None or len(mine) != len(other):
         return False
     return all(
-        (a.type_name, a.shape, a.size if a.shape is Shape.ARRAY else 0)
-        == (b.type_name, b.shape, b.size if b.shape is Shape.ARRAY else 0)
+        (a.type_name, a.shape, a.size if a.shape is Multiplicity.ARRAY else 0)
+        == (b.type_name, b.shape, b.size if b.shape is Multiplicity.ARRAY else 0)
         and (
             a.type_name in PRIMITIVES or "/" not in a.type_name or _alike(a.type_name, ours, theirs)
         )
@@ -121,14 +121,14 @@ def _short(name: str) -> str:
     return name.replace("/msg/", "/")
 
 
-def _body(fields: tuple[Field, ...]) -> str:
+def _body(fields: tuple[MessageField, ...]) -> str:
     return "".join(f"{_type(field)} {field.name}\n" for field in fields)
 
 
-def _type(field: Field) -> str:
+def _type(field: MessageField) -> str:
     name = _short(field.type_name) + (f"<={field.text_bound}" if field.text_bound else "")
-    if field.shape is Shape.ARRAY:
+    if field.shape is Multiplicity.ARRAY:
         return f"{name}[{field.size}]"
-    if field.shape is Shape.SEQUENCE:
+    if field.shape is Multiplicity.SEQUENCE:
         return f"{name}[<={field.size}]" if field.size else f"{name}[]"
     return name

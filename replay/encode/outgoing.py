@@ -10,7 +10,7 @@ import numpy as np
 
 from crosscue.replay.columns import Block, Bytes, Int64s, Messages
 from crosscue.replay.decode.ros.definition import Definitions, definitions_of, well_known
-from crosscue.replay.decode.ros.plan import Plan, plan_of
+from crosscue.replay.decode.ros.plan import ParsingPlan, compile_plan
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 
@@ -56,15 +56,15 @@ class Encoder(Protocol):
 
 
 @cache
-def standard_type(name: str) -> tuple[Ros2Type, Plan]:
+def standard_type(name: str) -> tuple[Ros2Type, ParsingPlan]:
     """Return a type that ROS 2 or crosscue defines, with the plan of its CDR form."""
     known = well_known(name)
     if known is None:
         raise SchemaError(f"{name}: unknown type")
-    return Ros2Type(name, standard_text(name).encode()), plan_of(name, known, is_cdr=True)
+    return Ros2Type(name, standard_text(name).encode()), compile_plan(name, known, is_cdr=True)
 
 
-def own_type(name: str, text: str) -> tuple[Ros2Type, Plan]:
+def own_type(name: str, text: str) -> tuple[Ros2Type, ParsingPlan]:
     """Return a type of crosscue; the definitions of standard types in ``text`` are added."""
     known: dict[str, Definitions] = {}
     own = dict(definitions_of(name, text.encode(), "ros2msg"))
@@ -74,7 +74,7 @@ def own_type(name: str, text: str) -> tuple[Ros2Type, Plan]:
                 known[field.type_name] = well_known(field.type_name) or {}
     for definitions in known.values():
         own.update(definitions)
-    return Ros2Type(name, text_of(name, own).encode()), plan_of(name, own, is_cdr=True)
+    return Ros2Type(name, text_of(name, own).encode()), compile_plan(name, own, is_cdr=True)
 
 
 def with_rows(block: Block, rows: Bytes) -> Block:

@@ -15,9 +15,16 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import Block, Bytes, Int64s, Messages, Topic
 from crosscue.replay.decode.refuse import MISFIT, refuse
 from crosscue.replay.decode.ros.definition import definitions_of
-from crosscue.replay.decode.ros.plan import Items, Plan, Run, Text, jumped, plan_of
+from crosscue.replay.decode.ros.plan import (
+    FixedFields,
+    Items,
+    ParsingPlan,
+    Text,
+    compile_plan,
+    jumped,
+)
 from crosscue.replay.decode.ros.type_names import ros2_spelling
-from crosscue.replay.decode.ros.walk import Bools, Cursor, Found, Rows, Walker
+from crosscue.replay.decode.ros.walk import Bools, Cursor, FieldPositions, Rows, Walker
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 
@@ -90,14 +97,14 @@ class _Transcriber(Walker):
 
     jobs: list[_Job] = field(default_factory=list)
 
-    def run(self, run: Run, cursor: Cursor, keep: bool) -> None:
+    def run(self, run: FixedFields, cursor: Cursor, keep: bool) -> None:
         """Record the values of a run."""
         assert isinstance(cursor, _TwoCursors)
         self._values(run, cursor.numbers(), cursor.origin + cursor.at, cursor.out)
         cursor.out = cursor.out + run.cdr_size[cursor.out & 7]
         Walker.run(self, run, cursor, keep)
 
-    def _values(self, run: Run, rows: Rows, source: Int64s, target: Int64s) -> None:
+    def _values(self, run: FixedFields, rows: Rows, source: Int64s, target: Int64s) -> None:
         """Record copies; values that remain adjacent are copied together."""
         modulo = target & 7
         places = run.cdr_place[modulo[0]] if len(modulo) and (modulo == modulo[0]).all() else None
@@ -163,7 +170,7 @@ class _Transcriber(Walker):
         source = first[owner] + number * items.jumps[0][0]
         target = jumped(items.cdr_jumps, out[owner], number)
         for step in items.item:
-            assert isinstance(step, Run)
+            assert isinstance(step, FixedFields)
             self._values(step, rows[owner], source, target)
 
     def write(self, out: Int64s) -> Messages:
@@ -211,14 +218,14 @@ class Ros1ToCdr:
     """
 
     type: Ros2Type
-    plan: Plan
+    plan: ParsingPlan
     differs: bool
 
     def __call__(self, block: Block, ledger: Ledger) -> list[Outgoing]:
         """Transcode a block; messages that do not fit their definition are dropped."""
         assert isinstance(block.rows, Messages)
         messages = block.rows
-        found = Found(messages.buffer, True, np.ones(len(messages), np.bool_))
+        found = FieldPositions(messages.buffer, True, np.ones(len(messages), np.bool_))
         walker = _Transcriber(found, False)
         zero = np.zeros(len(messages), np.int64)
         cursor = _TwoCursors(
@@ -250,7 +257,7 @@ def ros1_to_cdr(topic: Topic) -> Ros1ToCdr | None:
         return None
     try:
         known = definitions_of(name, topic.schema, topic.schema_encoding or "ros1msg")
-        plan = plan_of(name, known, is_cdr=False)
+        plan = compile_plan(name, known, is_cdr=False)
         modern = as_ros2(name, known)
         text, differs = text_of(name, modern), differs_in_ros2(name, modern)
     except SchemaError as error:

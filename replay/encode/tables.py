@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import Block, Table
 from crosscue.replay.decode.ros.paths import quat, xyz
-from crosscue.replay.decode.ros.plan import Plan
+from crosscue.replay.decode.ros.plan import ParsingPlan
 from crosscue.replay.ledger import Ledger
 
 from .outgoing import Outgoing, Ros2Type, own_type, stamps, standard_type, with_rows
@@ -161,7 +161,7 @@ class _Own:
     """
 
     type: Ros2Type
-    plan: Plan
+    plan: ParsingPlan
     fields: Mapping[str, tuple[str, tuple[int, ...], str]]
 
 

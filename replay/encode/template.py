@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.decode.ros.plan import Items, Plan, Run, Text
+from crosscue.replay.decode.ros.plan import FixedFields, Items, ParsingPlan, Text
 
 ENCAPSULATION: Final = b"\x00\x01\x00\x00"
 
@@ -34,7 +34,9 @@ class Template:
 
 
 def template_of(
-    plan: Plan, texts: Mapping[str, str] | None = None, counts: Mapping[str, int] | None = None
+    plan: ParsingPlan,
+    texts: Mapping[str, str] | None = None,
+    counts: Mapping[str, int] | None = None,
 ) -> Template:
     """Create the template of a message.
 
@@ -45,7 +47,7 @@ def template_of(
     """
     making = _Builder()
     for step in plan.steps:
-        if isinstance(step, Run):
+        if isinstance(step, FixedFields):
             making.run(step)
         elif isinstance(step, Text):
             making.text((texts or {}).get(step.path, ""))
@@ -60,7 +62,7 @@ class _Builder:
     places: dict[str, int] = field(default_factory=dict)
     items: dict[str, int] = field(default_factory=dict)
 
-    def run(self, run: Run) -> None:
+    def run(self, run: FixedFields) -> None:
         modulo, begin = len(self.body) & 7, len(self.body) + len(ENCAPSULATION)
         for k, value in enumerate(run.values):
             self.places[value.path] = begin + int(run.place[modulo, k])
@@ -87,7 +89,7 @@ class _Builder:
 
 
 def filled(
-    plan: Plan,
+    plan: ParsingPlan,
     template: Template,
     size: int,
     values: Mapping[str, NDArray[np.generic]],

@@ -31,7 +31,7 @@ from crosscue.replay.errors import LogError
 from crosscue.replay.files.log_identity import Identity
 from crosscue.replay.limits import MIB
 from crosscue.replay.remote.address import LogAddress, is_remote
-from crosscue.replay.remote.logs import RangedLog, RemoteFiles, by_ranges, fetch
+from crosscue.replay.remote.logs import RangedLog, RemoteFiles, by_ranges, fetch_log
 from crosscue.replay.remote.ranges import RangedFile
 
 from .tree_text import spelled
@@ -49,7 +49,7 @@ _BAG_MAGIC: Final = b"#ROSBAG V2.0\n"
 _BAG_INDEX: Final = re.compile(rb"index_pos=(.{8})", re.DOTALL)
 
 
-def identity_of(place: Path | str) -> Identity:
+def log_identity(place: Path | str) -> Identity:
     """Return the identity of a log: a file, a folder or a URL; see the head of this file.
 
     Raises:
@@ -81,7 +81,7 @@ def identity_of_log(log: Log) -> Identity:
     Raises:
         LogError: It no longer exists or cannot be read.
     """
-    return _identity_of_ranged(log.ranged) if isinstance(log, RangedLog) else identity_of(log.path)
+    return _identity_of_ranged(log.ranged) if isinstance(log, RangedLog) else log_identity(log.path)
 
 
 def _identity_of_url(url: LogAddress) -> Identity:
@@ -91,8 +91,8 @@ def _identity_of_url(url: LogAddress) -> Identity:
             return _identity_of_ranged(ranged)
     found = _identity_of_parts(url)
     if found is None:
-        with fetch(url) as fetched:
-            return identity_of(fetched.path)
+        with fetch_log(url) as fetched:
+            return log_identity(fetched.path)
     return found
 
 

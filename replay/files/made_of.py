@@ -14,7 +14,7 @@ from typing import Any, Final
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.log_identity import as_row, of_row
 
-from .identity import identity_of, identity_of_all
+from .identity import identity_of_all, log_identity
 from .tree_text import json_tree, strict_json
 
 # File that `simulate` writes next to a log: it marks the log as simulated, with its settings.
@@ -29,7 +29,7 @@ def made_of(inputs: Sequence[Path], settings: Mapping[str, object]) -> dict[str,
     Raises:
         LogError: An input does not exist or cannot be read.
     """
-    identity = as_row(identity_of_all([identity_of(path) for path in inputs])) if inputs else None
+    identity = as_row(identity_of_all([log_identity(path) for path in inputs])) if inputs else None
     made: dict[str, Any] = json_tree(strict_json({"identity": identity, "settings": settings}))
     return made
 
@@ -56,7 +56,7 @@ def refuse_another(place: Path, doing: str, there: object, mine: Mapping[str, An
             f"{place}: its inputs are not recorded; {doing} would destroy it; choose another name"
         ) from None
     ours = _name(mine)
-    other = difference(settings, mine["settings"])
+    other = first_difference(settings, mine["settings"])
     but = "" if other is None else f" ({other})"
     raise UsageError(
         f"{place}: was made from {theirs}, not from {ours}{but}; {doing} would destroy it; choose "
@@ -68,11 +68,13 @@ def _name(made: Mapping[str, Any]) -> str:
     return "settings" if made["identity"] is None else str(of_row(made["identity"]))
 
 
-def difference(there: object, here: object, name: str = "") -> str | None:
+def first_difference(there: object, here: object, name: str = "") -> str | None:
     """Describe the first setting that differs, with both values; None if all are equal."""
     if isinstance(there, dict) and isinstance(here, dict):
         for key in sorted({*there, *here}):
-            found = difference(there.get(key), here.get(key), f"{name}.{key}" if name else key)
+            found = first_difference(
+                there.get(key), here.get(key), f"{name}.{key}" if name else key
+            )
             if found is not None:
                 return found
         return None

@@ -15,7 +15,7 @@ from crosscue.replay.remote.logs import RangedLog
 from crosscue.verb import Option
 
 
-def part_of(
+def select_part(
     logs: Sequence[Log],
     start_s: float | None = None,
     end_s: float | None = None,

@@ -1,6 +1,6 @@
 """Summary of a log from a single pass: topics, clocks, account and findings.
 
-``summarise`` reads the log. ``crosscue info --json`` prints the fields of ``LogSummary``.
+``summarise_log`` reads the log. ``crosscue info --json`` prints the fields of ``LogSummary``.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ def quick_summary(log: Log) -> LogSummary:
     return _summary(log, ledger, ClockWatch(), {}, is_quick=True)
 
 
-def summarise(
+def summarise_log(
     log: Log,
     selection: Selection = EVERYTHING,
     watch: Callable[[Block], None] = lambda block: None,
@@ -205,7 +205,7 @@ def _watched(
         emit(Progress("reading", rows_read(ledger), rows_declared(log), "rows"))
 
 
-def together(summaries: Iterable[LogSummary]) -> Together:
+def common_span(summaries: Iterable[LogSummary]) -> Together:
     """Return the common time range of several logs."""
     spans = {
         s.path: (s.start_ns, s.end_ns)

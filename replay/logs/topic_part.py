@@ -62,7 +62,7 @@ def read_topic(
     return TopicPart(topic, tuple(decode(block, ledger) for block in blocks), ledger)
 
 
-def columns_of(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:
+def topic_columns(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:
     """Return the rows of one topic as flat columns of equal length: times, then fields.
 
     A column of vectors becomes one column per component: ``gyro.0``, ``gyro.1``. A field of the

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Words: TypeAlias = NDArray[np.uint64]
 
 
-def words_of(payloads: NDArray[np.uint8]) -> Words:
+def leading_words(payloads: NDArray[np.uint8]) -> Words:
     """Return the first 8 bytes of each row of ``payloads``, shape (N, W), as words."""
     first = np.ascontiguousarray(payloads[:, :8])
     return first.view("<u8").ravel().astype(np.uint64, copy=False)
@@ -44,7 +44,7 @@ def extract(
     return (raised >> np.uint64(drop)).view(np.int64)
 
 
-def place(raw: NDArray[np.int64], start: int, bits: int, is_big_endian: bool) -> Words:
+def place_bits(raw: NDArray[np.int64], start: int, bits: int, is_big_endian: bool) -> Words:
     """Return words that hold the low ``bits`` bits of ``raw`` at ``start``; other bits are 0."""
     low = raw.view(np.uint64) & np.uint64((1 << bits) - 1)
     if is_big_endian:

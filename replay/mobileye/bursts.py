@@ -84,7 +84,7 @@ def no_status() -> Status:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Parts:
+class FrameParts:
     """Frames that are parts of obstacles or lanes, in the order of the log.
 
     Attributes:
@@ -104,9 +104,9 @@ class Parts:
     def __len__(self) -> int:
         return len(self.burst)
 
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Parts:
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> FrameParts:
         """Return the frames selected by ``index``."""
-        return Parts(
+        return FrameParts(
             self.burst[index],
             self.place[index],
             self.part[index],
@@ -114,8 +114,8 @@ class Parts:
             self.words[index],
         )
 
-    def __add__(self, later: Parts) -> Parts:
-        return Parts(
+    def __add__(self, later: FrameParts) -> FrameParts:
+        return FrameParts(
             np.concatenate([self.burst, later.burst]),
             np.concatenate([self.place, later.place]),
             np.concatenate([self.part, later.part]),
@@ -124,10 +124,10 @@ class Parts:
         )
 
 
-def no_parts() -> Parts:
-    """Return an empty ``Parts``."""
+def no_parts() -> FrameParts:
+    """Return an empty ``FrameParts``."""
     none = np.zeros(0, dtype=np.int64)
-    return Parts(none, none, none, none, np.zeros(0, dtype=np.uint64))
+    return FrameParts(none, none, none, none, np.zeros(0, dtype=np.uint64))
 
 
 class Fault(NamedTuple):
@@ -147,9 +147,9 @@ class Fault(NamedTuple):
 class Triples(NamedTuple):
     """Complete obstacles: rows of A, B and C, ordered by burst and slot."""
 
-    a: Parts
-    b: Parts
-    c: Parts
+    a: FrameParts
+    b: FrameParts
+    c: FrameParts
 
 
 class Shortage(NamedTuple):
@@ -167,8 +167,8 @@ class Shortage(NamedTuple):
 
 
 def sift(
-    parts: Parts, status: Status, within_ns: int, kept: int = 0, is_closed: bool = False
-) -> tuple[Parts, list[Fault], bool]:
+    parts: FrameParts, status: Status, within_ns: int, kept: int = 0, is_closed: bool = False
+) -> tuple[FrameParts, list[Fault], bool]:
     """Remove obstacle frames that belong to no burst, or whose burst is ambiguous.
 
     Args:
@@ -202,7 +202,7 @@ def sift(
     return parts, faults, is_shut or (is_closed and len(status) == 1)
 
 
-def join(parts: Parts) -> tuple[Triples, list[Fault]]:
+def join_obstacles(parts: FrameParts) -> tuple[Triples, list[Fault]]:
     """Join the obstacles of finished bursts; ``parts`` are sifted, so that no part is repeated."""
     obstacle = parts.burst * SLOTS_AT_MOST + parts.place
     order = np.lexsort((parts.part, obstacle))
@@ -217,7 +217,7 @@ def join(parts: Parts) -> tuple[Triples, list[Fault]]:
     ), faults
 
 
-def shortage(parts: Parts, status: Status, slots: int) -> Shortage:
+def shortage(parts: FrameParts, status: Status, slots: int) -> Shortage:
     """Return missing frames of finished bursts: three per announced obstacle, minus those found."""
     wanted = 3 * np.minimum(status.count, slots)
     at = status.at(parts.burst) if len(parts) else parts.burst
@@ -227,7 +227,9 @@ def shortage(parts: Parts, status: Status, slots: int) -> Shortage:
     return Shortage(status.number[short], status.log_ns[short], lacking[short])
 
 
-def pair(parts: Parts, within_ns: int, is_last: bool) -> tuple[Parts, Parts, Parts, list[Fault]]:
+def pair_lanes(
+    parts: FrameParts, within_ns: int, is_last: bool
+) -> tuple[FrameParts, FrameParts, FrameParts, list[Fault]]:
     """Pair each frame A of a lane with the B of the same lane that follows in the same burst.
 
     Args:
@@ -259,14 +261,16 @@ def pair(parts: Parts, within_ns: int, is_last: bool) -> tuple[Parts, Parts, Par
     return ordered.take(a_at[by_log]), ordered.take(a_at[by_log] + 1), waiting, faults
 
 
-def _leave(parts: Parts, out: NDArray[np.bool_], reason: str, faults: list[Fault]) -> Parts:
+def _leave(
+    parts: FrameParts, out: NDArray[np.bool_], reason: str, faults: list[Fault]
+) -> FrameParts:
     if not out.any():
         return parts
     faults.append(Fault(reason, parts.log_ns[out], parts.burst[out]))
     return parts.take(~out)
 
 
-def _first_of_slot(parts: Parts) -> NDArray[np.intp]:
+def _first_of_slot(parts: FrameParts) -> NDArray[np.intp]:
     """Return, for each frame, the first frame with the same burst, slot and part."""
     key = (parts.burst * SLOTS_AT_MOST + parts.place) * 3 + parts.part
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)

@@ -17,7 +17,7 @@ Floats: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Mounting:
+class DevicePosition:
     """Position of the device's reference point, from calibration.
 
     Attributes:
@@ -32,7 +32,7 @@ class Mounting:
     yaw_rad: float = 0.0
 
 
-AT_REAR_AXLE: Final = Mounting()
+AT_REAR_AXLE: Final = DevicePosition()
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +44,12 @@ class Pose:
     yaw_rad: float
 
 
-def vehicle_T_device(mounting: Mounting) -> Pose:  # noqa: N802 - the frames' names
+def vehicle_T_device(mounting: DevicePosition) -> Pose:  # noqa: N802 - the frames' names
     """Return the transform from the device's frame to the vehicle's."""
     return Pose(mounting.x_m, mounting.y_m, mounting.yaw_rad)
 
 
-def device_T_vehicle(mounting: Mounting) -> Pose:  # noqa: N802 - the frames' names
+def device_T_vehicle(mounting: DevicePosition) -> Pose:  # noqa: N802 - the frames' names
     """Return the transform from the vehicle's frame to the device's."""
     c, s = cos(mounting.yaw_rad), sin(mounting.yaw_rad)
     x, y = mounting.x_m, mounting.y_m

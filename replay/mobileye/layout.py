@@ -30,7 +30,7 @@ WORD_BITS: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class BitField:
     """One signal: the position of its bits and their meaning.
 
     Value on the wire = (raw - zero) * scale / per. The head of ``layout.toml`` explains each key.
@@ -123,7 +123,7 @@ class Message:
     table: str
     ids: tuple[int, ...]
     lengths: tuple[int, ...]
-    fields: tuple[Field, ...]
+    fields: tuple[BitField, ...]
     variant: Literal["", "length", "revision", "family"] = ""
     variants: Mapping[int, str] = field(default_factory=dict)
     ros_type: str = ""
@@ -153,7 +153,7 @@ class Message:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class MobileyeLayout:
     """All messages, and the tables of their columns."""
 
     messages: tuple[Message, ...]
@@ -191,7 +191,7 @@ class LayoutRow(NamedTuple):
 
 
 @cache
-def layout() -> Layout:
+def layout() -> MobileyeLayout:
     """Return the layout, which is read once.
 
     Raises:
@@ -199,12 +199,12 @@ def layout() -> Layout:
     """
     text = files(__package__).joinpath("layout.toml").read_text(encoding="utf-8")
     try:
-        return parse(text)
+        return parse_layout(text)
     except (ValueError, KeyError, TypeError) as error:
         raise SchemaError(f"layout.toml: {error}; install crosscue again") from None
 
 
-def parse(text: str) -> Layout:
+def parse_layout(text: str) -> MobileyeLayout:
     """Parse a layout from TOML text.
 
     Raises:
@@ -219,7 +219,7 @@ def parse(text: str) -> Layout:
     claimed = [i for m in messages.values() for i in m.ids]
     if len(set(claimed)) != len(claimed):
         raise SchemaError("layout.toml: two messages have the same identifier")
-    return Layout(tuple(messages.values()))
+    return MobileyeLayout(tuple(messages.values()))
 
 
 def _message(entry: dict[str, Any], earlier: Mapping[str, Message]) -> Message:
@@ -243,9 +243,9 @@ def _message(entry: dict[str, Any], earlier: Mapping[str, Message]) -> Message:
     )
 
 
-def _field(entry: Mapping[str, Any]) -> Field:
+def _field(entry: Mapping[str, Any]) -> BitField:
     missing = tuple(entry.get("missing", ()))
-    return Field(**{**entry, "missing": missing})
+    return BitField(**{**entry, "missing": missing})
 
 
 def describe() -> Iterator[LayoutRow]:
@@ -269,13 +269,13 @@ def describe() -> Iterator[LayoutRow]:
             )
 
 
-def _formula(f: Field) -> str:
+def _formula(f: BitField) -> str:
     raw = "raw" if not f.zero else f"(raw - {f.zero:g})"
     scaled = raw if f.scale == 1.0 else f"{raw} * {f.scale:g}"
     return scaled if f.per == 1.0 else f"{scaled} / {f.per:g}"
 
 
-def unit_of(f: Field) -> str:
+def unit_of(f: BitField) -> str:
     """Return the unit of a column unless its name includes it, as for ``Table.units``."""
     return f.unit.rstrip("?") + " (unverified)" if f.unit.endswith("?") else ""
 

@@ -10,7 +10,7 @@ import numpy as np
 from crosscue.replay.columns import Block, CanFrames, Floats, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
-from crosscue.replay.mobileye.geometry import Mounting
+from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS, Samples, Signal
 from crosscue.replay.vehicle.vehicle import Mobileye
@@ -39,7 +39,7 @@ class MobileyeStream:
             types: Message types by topic name.
             is_shared_bus: True if the vehicle's signals are read from the same bus.
         """
-        settings = settings_of(section, is_shared_bus=is_shared_bus)
+        settings = mobileye_settings(section, is_shared_bus=is_shared_bus)
         self._of_frames = MobileyeDecoder(bus, ledger, settings) if not types else None
         self._of_messages = RosMobileye(bus, types, ledger, settings) if types else None
 
@@ -57,9 +57,11 @@ class MobileyeStream:
             yield from samples_of(reader.flush())
 
 
-def settings_of(section: Mobileye, *, is_shared_bus: bool) -> MobileyeSettings:
+def mobileye_settings(section: Mobileye, *, is_shared_bus: bool) -> MobileyeSettings:
     """Return the decoder's settings from the vehicle file; without ``x_m`` there is no mounting."""
-    mounting = None if section.x_m is None else Mounting(section.x_m, section.y_m, section.yaw_rad)
+    mounting = (
+        None if section.x_m is None else DevicePosition(section.x_m, section.y_m, section.yaw_rad)
+    )
     return MobileyeSettings(
         section.revision, section.family, section.slots, mounting, is_shared_bus=is_shared_bus
     )

@@ -7,7 +7,7 @@ from typing import Final, Literal, TypeAlias
 
 from crosscue.replay.ledger import Ledger
 
-from .geometry import AT_REAR_AXLE, Mounting
+from .geometry import AT_REAR_AXLE, DevicePosition
 
 Revision: TypeAlias = Literal["auto", "classic", "2.32"]
 Family: TypeAlias = Literal["auto", "extended", "tsr"]
@@ -41,7 +41,7 @@ class MobileyeSettings:
     revision: Revision = "auto"
     family: Family = "auto"
     slots: Literal[10, 13] = 13
-    mounting: Mounting | None = None
+    mounting: DevicePosition | None = None
     within_ns: int = 50_000_000
     repeat_within_ns: int = 20_000_000
     min_latency_ns: int = 0
@@ -64,7 +64,7 @@ class MobileyeSettings:
 DEFAULTS: Final = MobileyeSettings()
 
 
-def mounting_of(settings: MobileyeSettings, bus: str, ledger: Ledger) -> Mounting:
+def device_mounting(settings: MobileyeSettings, bus: str, ledger: Ledger) -> DevicePosition:
     """Return the mounting; the default is at the rear axle, with a notice."""
     if settings.mounting is None:
         ledger.notice(

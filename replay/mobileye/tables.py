@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Block, Floats, Int64s, Table
-from crosscue.replay.mobileye.geometry import Mounting
+from crosscue.replay.mobileye.geometry import DevicePosition
 
 from .geometry import (
     Pose,
@@ -75,7 +75,7 @@ def lane_places(table: str, instance: Int64s) -> Columns:
     return places
 
 
-def to_vehicle(table: str, columns: Columns, mounting: Mounting) -> Columns:
+def to_vehicle(table: str, columns: Columns, mounting: DevicePosition) -> Columns:
     """Convert columns from the device's reference point to the rear axle."""
     pose = vehicle_T_device(mounting)
     if table in ("lanes", "next_lanes"):
@@ -83,7 +83,7 @@ def to_vehicle(table: str, columns: Columns, mounting: Mounting) -> Columns:
     return _moved(table, columns, pose, mounting.x_m)
 
 
-def to_device(table: str, columns: Columns, mounting: Mounting) -> Columns:
+def to_device(table: str, columns: Columns, mounting: DevicePosition) -> Columns:
     """Convert columns from the rear axle to the device's reference point; some may be missing."""
     pose = device_T_vehicle(mounting)
     if table in ("lanes", "next_lanes"):

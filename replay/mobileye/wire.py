@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from .bits import Words, extract, place
-from .layout import VARIANTS, Column, Columns, Field, Message, Variant
+from .bits import Words, extract, place_bits
+from .layout import VARIANTS, BitField, Column, Columns, Message, Variant
 
 _TO_SI: Final[Mapping[str, float]] = {"deg": pi / 180, "deg/s": pi / 180, "km/h": 1 / 3.6}
 
@@ -44,7 +44,7 @@ def values_of(message: Message, words: Words, variant: Variant) -> dict[str, NDA
     return values
 
 
-def from_raw(f: Field, raw: NDArray[np.int64]) -> NDArray[np.float64]:
+def from_raw(f: BitField, raw: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return (raw - zero) * scale / per, NaN for the codes that mean missing."""
     value = raw.astype(np.float64)
     if f.zero:
@@ -58,7 +58,7 @@ def from_raw(f: Field, raw: NDArray[np.int64]) -> NDArray[np.float64]:
     return value
 
 
-def from_given(f: Field, given: NDArray[np.float64]) -> NDArray[np.float64]:
+def from_given(f: BitField, given: NDArray[np.float64]) -> NDArray[np.float64]:
     """Round values that another program decoded to the table's steps and codes."""
     steps = given * f.per / f.scale + f.zero
     whole = np.rint(steps)
@@ -76,7 +76,7 @@ def blank_dependent(message: Message, values: dict[str, NDArray[np.float64]]) ->
             values[f.name] = np.where(values[f.needs] == 0, np.nan, values[f.name])
 
 
-def columns_of(message: Message, values: Mapping[str, NDArray[np.float64]]) -> Columns:
+def si_columns(message: Message, values: Mapping[str, NDArray[np.float64]]) -> Columns:
     """Return columns in SI units, left-positive, each with its dtype."""
     columns: Columns = {}
     for f in {f.name: f for f in message.fields}.values():
@@ -125,12 +125,12 @@ def words_from(
         if f.only:
             here = variant == VARIANTS.index(f.only)
         raw = np.where(here, _raw_from(f, columns.get(f.name), here, topic), 0)
-        words |= place(raw, f.start, f.width, f.order == "big")
+        words |= place_bits(raw, f.start, f.width, f.order == "big")
     return words
 
 
 def _raw_from(
-    f: Field, column: Column | None, here: NDArray[np.bool_], topic: str
+    f: BitField, column: Column | None, here: NDArray[np.bool_], topic: str
 ) -> NDArray[np.int64]:
     stand_in = f.missing[0] if f.missing else f.default
     if column is None:
@@ -158,14 +158,14 @@ def _inside(steps: NDArray[np.float64], lowest: int, highest: int) -> NDArray[np
     return (steps >= lowest - 0.5 - 1e-6) & (steps <= highest + 0.5 + 1e-6)
 
 
-def _beside_missing(f: Field, nearest: NDArray[np.float64]) -> NDArray[np.float64]:
+def _beside_missing(f: BitField, nearest: NDArray[np.float64]) -> NDArray[np.float64]:
     """Move values that equal a code for missing to the step before it."""
     for code in f.missing:
         nearest = np.where(nearest == code, code - 1 if code > 0 else code + 1, nearest)
     return nearest
 
 
-def _on_wire(f: Field, column: Column) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _on_wire(f: BitField, column: Column) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return a column in the wire's unit and sign, and a mask of its missing values."""
     value = column.astype(np.float64)
     if f.kind != "real":

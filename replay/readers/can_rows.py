@@ -95,12 +95,12 @@ NO_ROWS: Final = FrameRows(
 )
 
 
-def joined(first: FrameRows, second: FrameRows) -> FrameRows:
+def merge_two(first: FrameRows, second: FrameRows) -> FrameRows:
     """Merge two groups of rows by place."""
-    return merged((first, second))
+    return merge_rows((first, second))
 
 
-def merged(all_rows: Sequence[FrameRows]) -> FrameRows:
+def merge_rows(all_rows: Sequence[FrameRows]) -> FrameRows:
     """Merge one or more groups of rows by place."""
     some = [rows for rows in all_rows if len(rows)] or [all_rows[0]]
     if len(some) == 1:
@@ -148,7 +148,7 @@ def merged_by_time(streams: Sequence[Iterator[FrameRows]]) -> Iterator[FrameRows
             held[k] = rows.take(slice(count, None))
             if count == len(rows):
                 held[k] = _next_by_time(streams[k], rows)
-        yield merged(ready)
+        yield merge_rows(ready)
 
 
 def _next_by_time(stream: Iterator[FrameRows], before: FrameRows | None = None) -> FrameRows | None:

@@ -57,7 +57,7 @@ def list_files(folder: Path, suffixes: Sequence[str]) -> list[Path]:
     return sorted(paths, key=lambda path: _natural(path.name))
 
 
-def pair(paths: Sequence[Path], times: TimeFile) -> TimedFiles:
+def pair_with_times(paths: Sequence[Path], times: TimeFile) -> TimedFiles:
     """Pair each file with its time by the rules in the module's docstring.
 
     Raises:

@@ -123,7 +123,7 @@ class _Object:
     version: str
 
 
-class Fetched(Closing):
+class FetchedLog(Closing):
     """A local copy of a log, protected from removal until closed; a context manager."""
 
     def __init__(self, path: Path, hold: int | None) -> None:
@@ -143,7 +143,7 @@ class Fetched(Closing):
             self._hold = None
 
 
-def fetch(url: str, store: Store | None = None) -> Fetched:
+def fetch_log(url: str, store: Store | None = None) -> FetchedLog:
     """Return the local copy of a remote log, downloaded unless the store already has it.
 
     Raises:
@@ -154,7 +154,7 @@ def fetch(url: str, store: Store | None = None) -> Fetched:
     """
     url, system, address = opened_store(url)
     if _is_local(system):
-        return Fetched(Path(address), None)
+        return FetchedLog(Path(address), None)
     store = store or default_store()
     objects = guarded(url, lambda: _objects(system, address, url))
     size = sum(one.size for one in objects)
@@ -171,7 +171,7 @@ def fetch(url: str, store: Store | None = None) -> Fetched:
             hold = _locked(entry, fcntl.LOCK_SH)
             if path.exists():
                 os.utime(entry)
-                return Fetched(path, hold)
+                return FetchedLog(path, hold)
             os.close(hold)
             hold = _locked(entry, fcntl.LOCK_EX)
             try:
@@ -182,7 +182,7 @@ def fetch(url: str, store: Store | None = None) -> Fetched:
                 # From an exclusive to a shared lock; another process may remove the entry between.
                 fcntl.flock(hold, fcntl.LOCK_SH)
                 if path.exists():
-                    return Fetched(path, hold)
+                    return FetchedLog(path, hold)
             except BaseException:
                 os.close(hold)
                 raise
@@ -210,7 +210,7 @@ class RemoteLog(WrappedLog):
     """A downloaded log; closing it releases its local copy."""
 
     def __init__(
-        self, url: str, log: Log, fetched: Fetched, why: str = "its format needs a local file"
+        self, url: str, log: Log, fetched: FetchedLog, why: str = "its format needs a local file"
     ) -> None:
         """Wrap ``log``, which was downloaded completely for the reason ``why``."""
         super().__init__(log)
@@ -248,8 +248,8 @@ class _Partial(Protocol):
 
 # Openers of the formats that can be read in byte ranges.
 RANGED: Final = {
-    ".mcap": "crosscue.replay.readers.mcap.reader:open_ranged",
-    ".bag": "crosscue.replay.readers.rosbag1.reader:open_ranged",
+    ".mcap": "crosscue.replay.readers.mcap.reader:open_remote_mcap",
+    ".bag": "crosscue.replay.readers.rosbag1.reader:open_remote_bag",
 }
 
 
@@ -333,12 +333,12 @@ def open_remote(
         store: Local store; None for the configured one.
 
     Raises:
-        CrosscueError: As raised by ``fetch`` and ``opener``.
+        CrosscueError: As raised by ``fetch_log`` and ``opener``.
     """
     url, system, address = opened_store(url)
 
     def whole(why: str) -> RemoteLog:
-        fetched = fetch(url, store)
+        fetched = fetch_log(url, store)
         try:
             return RemoteLog(url, opener(fetched.path), fetched, why)
         except BaseException:
@@ -371,7 +371,7 @@ def by_ranges(url: str) -> RangedFile | None:
     """Open a remote log in byte ranges; return None if it must be downloaded completely.
 
     Raises:
-        LogError: As raised by ``fetch``.
+        LogError: As raised by ``fetch_log``.
     """
     url, system, address = opened_store(url)
     if _is_local(system) or PurePosixPath(url.name).suffix.lower() not in RANGED:
@@ -390,7 +390,7 @@ class RemoteFiles:
         """Query the store for the log's files.
 
         Raises:
-            LogError: As raised by ``fetch``.
+            LogError: As raised by ``fetch_log``.
         """
         self._store: Final = default_store()
         self._url, self._system, self._address = opened_store(url)
@@ -403,7 +403,7 @@ class RemoteFiles:
 
     @property
     def is_at_hand(self) -> bool:
-        """True if ``fetch`` needs no download, because the log is already on this machine."""
+        """True if ``fetch_log`` needs no download, because the log is already on this machine."""
         entry = self._store.folder / _key(self._url, self._objects)
         return not self._objects or (entry / "log").exists()
 
@@ -411,7 +411,7 @@ class RemoteFiles:
         """Open one of the files in byte ranges; None if the store does not support them.
 
         Raises:
-            LogError: As raised by ``fetch``.
+            LogError: As raised by ``fetch_log``.
         """
         address = next(one.address for one in self._objects if one.name == name)
         return _ranged(self._url, self._system, address, self._store)

@@ -14,7 +14,7 @@ from crosscue.replay.columns import Block
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.admit import all_ids
-from crosscue.replay.mobileye.samples import settings_of
+from crosscue.replay.mobileye.samples import mobileye_settings
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .converters import SPEED_UNITS, angle_samples, column_of, wheel_samples
@@ -45,7 +45,7 @@ class CanSignals:
             ledger.notice(sentence)
         wanted = check_signals(database, vehicle, signals)
         is_shared = not self._signals.isdisjoint(MOBILEYE_SIGNALS)
-        settings = settings_of(vehicle.mobileye, is_shared_bus=is_shared)
+        settings = mobileye_settings(vehicle.mobileye, is_shared_bus=is_shared)
         elsewhere = all_ids(settings) if is_shared else ()
         self._decode: Final = BusDecoder(database, bus, ledger, wanted, elsewhere=elsewhere)
 

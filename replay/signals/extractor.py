@@ -19,7 +19,7 @@ from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .converters import FROM_TABLE
-from .kinds import MOBILEYE_SIGNALS, Plan, Samples, Signal, Source
+from .kinds import MOBILEYE_SIGNALS, Samples, Signal, SignalPlan, SignalSource
 
 if TYPE_CHECKING:
     from crosscue.replay.decode.packets import PacketDecoder
@@ -55,7 +55,7 @@ def _no_pictures(block: Block) -> None:
 
 
 @dataclass(slots=True)
-class Extractor:
+class SampleExtractor:
     """Extractor of samples from one log's blocks, with the state of buses between blocks.
 
     Attributes:
@@ -70,7 +70,7 @@ class Extractor:
             are in drive time; sensors' stamps are shifted likewise.
     """
 
-    planned: Plan
+    planned: SignalPlan
     vehicle: Vehicle
     log: int
     ledger: Ledger
@@ -152,14 +152,14 @@ class Extractor:
         for shown in self._packets[block.topic](block):
             self.on_pictures(shown)
 
-    def _mobileye_sources(self) -> list[Source]:
+    def _mobileye_sources(self) -> list[SignalSource]:
         return [
             source
             for source in self.planned.sources
             if source.log == self.log and not {*source.signals}.isdisjoint(MOBILEYE_SIGNALS)
         ]
 
-    def _mobileye_stream(self, source: Source) -> MobileyeReader:
+    def _mobileye_stream(self, source: SignalSource) -> MobileyeReader:
         if self._mobileye is None:
             types = {
                 one.topic.name: one.topic.type_name
@@ -175,7 +175,7 @@ class Extractor:
             )
         return self._mobileye
 
-    def _can_signals(self, source: Source) -> CanReader:
+    def _can_signals(self, source: SignalSource) -> CanReader:
         bus = source.topic.name
         if bus not in self._buses:
             self._buses[bus] = _reader(Role.CAN)(bus, self.ledger, self.vehicle, source.signals)
@@ -188,7 +188,7 @@ def _reader(role: Role) -> Callable[..., Any]:
 
 
 def probe_clocks(
-    log: Log, planned: Plan, vehicle: Vehicle, number: int, selection: Selection
+    log: Log, planned: SignalPlan, vehicle: Vehicle, number: int, selection: Selection
 ) -> dict[str, Clock]:
     """Choose a clock for each planned topic from the log's first seconds.
 
@@ -199,7 +199,7 @@ def probe_clocks(
         number: Index of the log in the plan.
         selection: Selection that will be read of the log.
     """
-    extractor = Extractor(planned, vehicle, number, Ledger(""))
+    extractor = SampleExtractor(planned, vehicle, number, Ledger(""))
     first_ns: int | None = None
     for block in log.read(extractor.ledger, selection):
         if not len(block):
@@ -213,14 +213,14 @@ def probe_clocks(
 
 
 def wheels_only(
-    planned: Plan, vehicle: Vehicle, number: int, clocks: Mapping[str, Clock]
-) -> Extractor:
+    planned: SignalPlan, vehicle: Vehicle, number: int, clocks: Mapping[str, Clock]
+) -> SampleExtractor:
     """Return an extractor that decodes only the wheel speeds of one log's blocks."""
     can = vehicle.can.model_copy(update={"yaw_rate": None, "steering": None})
     source = planned.source_of(Signal.WHEEL_SPEEDS)
     only = () if source is None else (replace(source, signals=(Signal.WHEEL_SPEEDS,)),)
     lean = vehicle.model_copy(update={"can": can})
-    return Extractor(Plan(only, {}), lean, number, Ledger(""), clocks)
+    return SampleExtractor(SignalPlan(only, {}), lean, number, Ledger(""), clocks)
 
 
 def pictures_of(
@@ -236,11 +236,11 @@ def pictures_of(
         ledger: Ledger that records unusable rows.
         selection: Part of the log to read; its topics are ignored.
     """
-    planned = Plan((Source(number, topic, ()),), {})
+    planned = SignalPlan((SignalSource(number, topic, ()),), {})
     wanted = Selection(frozenset({topic.name}), selection.start_ns, selection.end_ns)
     clocks = probe_clocks(log, planned, vehicle, number, wanted)
     found: list[Block] = []
-    extractor = Extractor(planned, vehicle, number, ledger, clocks, on_pictures=found.append)
+    extractor = SampleExtractor(planned, vehicle, number, ledger, clocks, on_pictures=found.append)
     for block in log.read(ledger, wanted):
         for _ in extractor(block):
             pass

@@ -49,7 +49,7 @@ class Samples:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class SignalSource:
     """One topic of one log and the signals it carries."""
 
     log: int
@@ -58,7 +58,7 @@ class Source:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class SignalPlan:
     """Plan of the topics that are read for each signal.
 
     Attributes:
@@ -66,14 +66,14 @@ class Plan:
         missing: Reasons, in plain English, by signal that no topic carries.
     """
 
-    sources: tuple[Source, ...]
+    sources: tuple[SignalSource, ...]
     missing: Mapping[Signal, str]
 
     def topics_of(self, log: int) -> frozenset[str]:
         """Return the names of the topics to read from one log."""
         return frozenset(source.topic.name for source in self.sources if source.log == log)
 
-    def source_of(self, signal: Signal) -> Source | None:
+    def source_of(self, signal: Signal) -> SignalSource | None:
         """Return the source of ``signal``, or None."""
         return next((source for source in self.sources if signal in source.signals), None)
 

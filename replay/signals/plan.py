@@ -10,7 +10,7 @@ from crosscue.replay.errors import MissingTopicError, VehicleError
 from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .kinds import MOBILEYE_SIGNALS, Plan, Signal, Source
+from .kinds import MOBILEYE_SIGNALS, Signal, SignalPlan, SignalSource
 
 
 @dataclass(slots=True)
@@ -46,7 +46,7 @@ class _Planner:
         self.chosen.setdefault((log, topic.name), (topic, []))[1].append(signal)
 
 
-def plan(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> Plan:
+def plan(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> SignalPlan:
     """Choose a topic for every signal.
 
     Args:
@@ -65,14 +65,15 @@ def plan(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> Plan:
     _plan_mobileye(planner)
     given = {signal for _, signals in planner.chosen.values() for signal in signals}
     sources = tuple(
-        Source(log, topic, tuple(signals)) for (log, _), (topic, signals) in planner.chosen.items()
+        SignalSource(log, topic, tuple(signals))
+        for (log, _), (topic, signals) in planner.chosen.items()
     )
     missing = {
         signal: planner.missing.get(signal, "no topic of a fitting type")
         for signal in Signal
         if signal not in given
     }
-    return Plan(sources, missing)
+    return SignalPlan(sources, missing)
 
 
 def _plan_can(planner: _Planner) -> None:
@@ -185,7 +186,9 @@ def _plan_mobileye(planner: _Planner) -> None:
             planner.choose(place, Signal.MOBILEYE_LANES if lanes else Signal.MOBILEYE_OBSTACLES)
 
 
-def camera_of(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> tuple[int, Topic] | None:
+def chosen_camera(
+    topics: Sequence[tuple[int, Topic]], vehicle: Vehicle
+) -> tuple[int, Topic] | None:
     """Return the camera that the vehicle file names, or the only one; None without a camera.
 
     Raises:
@@ -194,12 +197,12 @@ def camera_of(topics: Sequence[tuple[int, Topic]], vehicle: Vehicle) -> tuple[in
     return _Planner(topics, vehicle).only(Role.CAMERA, vehicle.topics.camera, "topics.camera")
 
 
-def pictures_only(camera: tuple[int, Topic]) -> Plan:
+def pictures_only(camera: tuple[int, Topic]) -> SignalPlan:
     """Return a plan that reads only the camera's pictures."""
-    return with_pictures(Plan((), {}), camera)
+    return with_pictures(SignalPlan((), {}), camera)
 
 
-def with_pictures(planned: Plan, camera: tuple[int, Topic]) -> Plan:
+def with_pictures(planned: SignalPlan, camera: tuple[int, Topic]) -> SignalPlan:
     """Return the plan with the camera's pictures added; see ``Extractor.on_pictures``."""
     log, topic = camera
-    return replace(planned, sources=(*planned.sources, Source(log, topic, ())))
+    return replace(planned, sources=(*planned.sources, SignalSource(log, topic, ())))

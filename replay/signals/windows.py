@@ -16,7 +16,7 @@ import numpy as np
 from crosscue.replay.base import Readable, Selection
 from crosscue.replay.columns import Block
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.signals.kinds import Plan, Samples, Signal
+from crosscue.replay.signals.kinds import Samples, Signal, SignalPlan
 
 WIDTH_NS: Final = 1_000_000_000
 HORIZON_NS: Final = 60_000_000_000
@@ -25,7 +25,7 @@ SLACK_NS: Final = 1_200_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class SampleWindow:
     """All samples with ``start_ns <= t < end_ns``, each signal in order of time."""
 
     start_ns: int
@@ -34,7 +34,7 @@ class Window:
 
 
 class Extracting(Protocol):
-    """Extractor of samples from a log's blocks, see ``replay.signals.extractor.Extractor``."""
+    """Extractor of samples from a log's blocks, see ``signals.extractor.SampleExtractor``."""
 
     @property
     def ledger(self) -> Ledger:
@@ -79,9 +79,9 @@ def windows(
     logs: Sequence[Readable],
     extractors: Sequence[Extracting],
     selections: Sequence[Selection],
-    planned: Plan,
+    planned: SignalPlan,
     width_ns: int = WIDTH_NS,
-) -> Iterator[Window]:
+) -> Iterator[SampleWindow]:
     """Read all logs in parallel, and yield their signals in windows; empty windows are omitted.
 
     Args:
@@ -151,7 +151,7 @@ class _Pending:
         firsts = [int(part.t_ns.min()) for parts in self._parts.values() for part in parts]
         return (min(firsts) // self._width_ns + 1) * self._width_ns if firsts else None
 
-    def close(self, end_ns: int) -> Window:
+    def close(self, end_ns: int) -> SampleWindow:
         """Remove and return the window that ends at ``end_ns``."""
         samples: dict[Signal, Samples] = {}
         for signal in Signal:
@@ -172,4 +172,4 @@ class _Pending:
                 values = np.concatenate([part.values for part in inside])
                 samples[signal] = Samples(signal, t_ns[order], values[order])
         self._closed_ns = end_ns
-        return Window(end_ns - self._width_ns, end_ns, samples)
+        return SampleWindow(end_ns - self._width_ns, end_ns, samples)

@@ -18,10 +18,10 @@ import numpy as np
 from crosscue.replay.base import Log, Selection
 from crosscue.replay.columns import Block
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.signals.kinds import Plan, Samples, Signal, Source
+from crosscue.replay.signals.kinds import Samples, Signal, SignalPlan, SignalSource
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .segments import BEGINNING, Cause, Epoch, LogClock, Marks, Segment, Timeline
+from .segments import BEGINNING, Cause, Epoch, EpochMarks, LogClock, Timeline, TimeSegment
 from .stamp_watch import StampWatch
 
 # Max difference of the set-backs of two topics or logs that count as one.
@@ -122,7 +122,7 @@ class _WheelRuns:
 
 def scan(
     logs: Sequence[Log],
-    planned: Plan,
+    planned: SignalPlan,
     vehicle: Vehicle,
     selections: Sequence[Selection],
     wheels: Sequence[WheelReader],
@@ -153,7 +153,9 @@ class LogWatch:
     It serves callers that read the log anyway; ``scan`` reads the log for this purpose alone.
     """
 
-    def __init__(self, number: int, planned: Plan, vehicle: Vehicle, read: WheelReader) -> None:
+    def __init__(
+        self, number: int, planned: SignalPlan, vehicle: Vehicle, read: WheelReader
+    ) -> None:
         """Prepare the scan of the log with this number in the plan."""
         wheels = planned.source_of(Signal.WHEEL_SPEEDS)
         self.topics: Final[dict[str, StampWatch]] = {}
@@ -185,7 +187,10 @@ class LogWatch:
 
 
 def timeline_from(
-    watches: Sequence[LogWatch], planned: Plan, vehicle: Vehicle, known: Timeline | None = None
+    watches: Sequence[LogWatch],
+    planned: SignalPlan,
+    vehicle: Vehicle,
+    known: Timeline | None = None,
 ) -> Timeline:
     """Return the time segments of completely scanned logs, in the plan's order."""
     limit_ns = round(vehicle.time.max_silence_s * 1e9)
@@ -236,10 +241,10 @@ class _Aligned:
                     break
         return tuple(entries)
 
-    def marks(self) -> dict[str, Marks]:
+    def marks(self) -> dict[str, EpochMarks]:
         """Return the marks for ``LogClock``; empty if no rows need to change."""
         return {
-            name: Marks(self.entries[name], tuple(self.last_ns[:-1]), tuple(watch.strays))
+            name: EpochMarks(self.entries[name], tuple(self.last_ns[:-1]), tuple(watch.strays))
             for name, watch in self.watches.items()
             if self.events or watch.strays
         }
@@ -304,17 +309,17 @@ def _segments(
     aligned: Sequence[_Aligned],
     clocks: Sequence[LogClock],
     runs: Sequence[_Run],
-    wheels: Source | None,
+    wheels: SignalSource | None,
     limit_ns: int,
-) -> tuple[Segment, ...]:
-    found: list[Segment] = []
+) -> tuple[TimeSegment, ...]:
+    found: list[TimeSegment] = []
     if wheels is not None and runs:
         one, clock = aligned[wheels.log], clocks[wheels.log]
         found = _of_wheels(one, clock, wheels, runs, limit_ns)
     else:
         start_ns = min((one.first_ns[0] for one in aligned if one.watches), default=0)
         end_ns = max((one.last_ns[0] for one in aligned if one.watches), default=0)
-        found = [Segment(0, BEGINNING, start_ns, end_ns, start_ns, end_ns, Cause.START)]
+        found = [TimeSegment(0, BEGINNING, start_ns, end_ns, start_ns, end_ns, Cause.START)]
     for one, clock in zip(aligned, clocks, strict=True):
         for number, epoch in enumerate(clock.epochs[1:], start=1):
             if any(abs(other.begins_ns - epoch.begins_ns) <= SAME_NS for other in found[1:]):
@@ -322,7 +327,7 @@ def _segments(
             first_ns, last_ns = one.first_ns[number], one.last_ns[number]
             event = one.events[number - 1]
             found.append(
-                Segment(
+                TimeSegment(
                     0,
                     epoch.begins_ns,
                     first_ns + epoch.shift_ns,
@@ -355,21 +360,21 @@ def _in_epochs(one: _Aligned, topic: str, runs: Sequence[_Run]) -> Iterator[tupl
 
 
 def _of_wheels(
-    one: _Aligned, clock: LogClock, wheels: Source, runs: Sequence[_Run], limit_ns: int
-) -> list[Segment]:
-    found: list[Segment] = []
+    one: _Aligned, clock: LogClock, wheels: SignalSource, runs: Sequence[_Run], limit_ns: int
+) -> list[TimeSegment]:
+    found: list[TimeSegment] = []
     epoch_before = 0
     for number, run in _in_epochs(one, wheels.topic.name, runs):
         epoch = clock.epochs[number]
         first_ns, last_ns = run.first_ns + epoch.shift_ns, run.last_ns + epoch.shift_ns
         if not found:
             found.append(
-                Segment(0, BEGINNING, first_ns, last_ns, run.first_ns, run.last_ns, Cause.START)
+                TimeSegment(0, BEGINNING, first_ns, last_ns, run.first_ns, run.last_ns, Cause.START)
             )
         elif number != epoch_before:
             event = one.events[number - 1]
             found.append(
-                Segment(
+                TimeSegment(
                     0,
                     epoch.begins_ns,
                     first_ns,
@@ -387,7 +392,7 @@ def _of_wheels(
             end_ns = found[-1].end_ns
             begins_ns = max(end_ns + 1, first_ns - limit_ns)
             found.append(
-                Segment(
+                TimeSegment(
                     0,
                     begins_ns,
                     first_ns,

@@ -38,7 +38,7 @@ class Cause(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Segment:
+class TimeSegment:
     """A part of a drive without a gap.
 
     Attributes:
@@ -80,7 +80,7 @@ class Epoch:
 
 
 @dataclass(frozen=True, slots=True)
-class Marks:
+class EpochMarks:
     """Starts of epochs among one topic's rows, and its strays.
 
     Attributes:
@@ -100,7 +100,7 @@ class LogClock:
     """One log's clock relative to drive time."""
 
     epochs: tuple[Epoch, ...] = (Epoch(BEGINNING, 0),)
-    topics: Mapping[str, Marks] = field(default_factory=dict)
+    topics: Mapping[str, EpochMarks] = field(default_factory=dict)
 
     def shift_at(self, drive_ns: Int64s) -> Int64s:
         """Return drive time minus log time at each drive time, shape (N,)."""
@@ -115,7 +115,7 @@ class LogClock:
 
 
 UNSHIFTED: Final = LogClock()
-WHOLE: Final = Segment(0, BEGINNING, 0, 0, 0, 0, Cause.START)
+WHOLE: Final = TimeSegment(0, BEGINNING, 0, 0, 0, 0, Cause.START)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +127,7 @@ class Timeline:
         clocks: One clock for each log.
     """
 
-    segments: tuple[Segment, ...] = (WHOLE,)
+    segments: tuple[TimeSegment, ...] = (WHOLE,)
     clocks: tuple[LogClock, ...] = ()
 
     def clock(self, log: int) -> LogClock:
@@ -218,7 +218,7 @@ class TimedLog:
         return placed.take(~is_stray)
 
 
-def _epochs(log_ns: Int64s, first: int, epoch: int, marks: Marks) -> Int64s:
+def _epochs(log_ns: Int64s, first: int, epoch: int, marks: EpochMarks) -> Int64s:
     """Return the epoch of each row of a block that starts at the topic's row ``first``."""
     found = np.full(len(log_ns), epoch, np.int64)
     at = 0
@@ -235,7 +235,7 @@ def _epochs(log_ns: Int64s, first: int, epoch: int, marks: Marks) -> Int64s:
     return found
 
 
-def _is_stray(first: int, rows: int, marks: Marks) -> NDArray[np.bool_]:
+def _is_stray(first: int, rows: int, marks: EpochMarks) -> NDArray[np.bool_]:
     found = np.zeros(rows, np.bool_)
     for start, stop in marks.strays:
         if start < first + rows and stop > first:
@@ -243,7 +243,7 @@ def _is_stray(first: int, rows: int, marks: Marks) -> NDArray[np.bool_]:
     return found
 
 
-def gaps_text(segments: Sequence[Segment]) -> list[str]:
+def gaps_text(segments: Sequence[TimeSegment]) -> list[str]:
     """Return one sentence about the gaps of a drive; an empty list without gaps."""
     later = segments[1:]
     if not later:

@@ -27,7 +27,7 @@ from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.roles import OF_TABLES
 
-from .mcap import Compression, McapWriter, Stretch
+from .mcap import ChannelMessages, Compression, McapWriter
 
 NO_TYPE: Final = "unknown type, which ROS 2 cannot store"
 BAD_SCHEMA: Final = "its definition is damaged"
@@ -145,7 +145,7 @@ class LogWriter:
         if sequence is None:
             sequence = np.zeros(len(block), np.uint32)
         publish_ns = block.log_ns if block.publish_ns is None else block.publish_ns
-        self._mcap.write(Stretch(channel, block.log_ns, publish_ns, sequence, block.rows))
+        self._mcap.write(ChannelMessages(channel, block.log_ns, publish_ns, sequence, block.rows))
         self.written[block.topic] += len(block)
 
     def close(self) -> Mapping[str, int]:

@@ -34,7 +34,7 @@ Compression: TypeAlias = Literal["zstd", "lz4", "none"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stretch:
+class ChannelMessages:
     """N messages of one channel, in the order in which they are stored.
 
     Attributes:
@@ -97,7 +97,7 @@ class McapWriter:
         self.path = path
         self._ids: dict[tuple[str, str], int] = {}
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
-        self._waiting: list[Stretch] = []
+        self._waiting: list[ChannelMessages] = []
         self._waiting_bytes = 0
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -148,7 +148,7 @@ class McapWriter:
             self._schema_ids[key] = self._writer.register_schema(name, encoding, schema)
         return self._schema_ids[key]
 
-    def write(self, stretch: Stretch) -> None:
+    def write(self, stretch: ChannelMessages) -> None:
         """Write messages; times must not be negative.
 
         Raises:
@@ -214,7 +214,7 @@ class McapWriter:
             self.discard()
 
 
-def _order(stretches: Sequence[Stretch]) -> list[int]:
+def _order(stretches: Sequence[ChannelMessages]) -> list[int]:
     """Return the index of the stretch of each next message when they are merged by log time.
 
     A channel whose clock runs backwards keeps its order: each of its messages counts as no earlier

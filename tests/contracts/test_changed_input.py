@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from crosscue.datasets.scenes.drive import MADE_OF
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval import cli
 from crosscue.replay.errors import OutputError
@@ -67,7 +67,7 @@ def _prepare(name: str, folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch
         drive = out / "A-01"
         drive.mkdir(parents=True)
         (drive / "drive.mcap").touch()
-        settings = SceneSettings(camera=Camera(width_px=64, height_px=36))
+        settings = SceneSettings(camera=SceneCamera(width_px=64, height_px=36))
         (drive / MADE_OF).write_text(strict_json(made_of([], asdict(settings))))
         return argv
     out.mkdir()

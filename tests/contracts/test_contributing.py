@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from crosscue.detectors.base import Choice
+from crosscue.detectors.base import DetectorChoice
 from crosscue.detectors.registry import BUILTIN, make
 from crosscue.eval import cli
 from crosscue.replay.errors import UsageError
@@ -80,7 +80,7 @@ def test_detector_example_fulfils_contract(module: Callable[[str, str], str]) ->
     (code,) = _code("a detector")
     place = f"{module('example_detector', code)}:Lamp.build"
 
-    check_detector(lambda: make(Choice("lamp", "lamp"), {**BUILTIN, "lamp": place}))
+    check_detector(lambda: make(DetectorChoice("lamp", "lamp"), {**BUILTIN, "lamp": place}))
 
 
 def test_command_example_has_the_described_options(

@@ -17,14 +17,14 @@ from crosscue.datasets.scenes.cues import SIMULATED
 from crosscue.datasets.truth.truth import truth_schema
 from crosscue.detectors.base import Detections, Found, Frame
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import Seen
+from crosscue.detectors.cues.observed import FrameDetections
 from crosscue.detectors.cues.rules import rule_of
 from crosscue.eval.recording.series import of_cue
 from crosscue.eval.report.page import write_report
-from crosscue.eval.report.summary import summary
+from crosscue.eval.report.summary import scores_text
 from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.scoring.files import FOLDER
-from crosscue.eval.scoring.runs import judge_run, metrics_of, scores_of
+from crosscue.eval.scoring.runs import judge_run, metrics_of, pooled_scores
 from crosscue.eval.studies.intersections.tables import cue_rows
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.cue_table import CUES, groups
@@ -193,7 +193,7 @@ def test_dummy_cue_requires_only_one_row_and_one_function(
         boxes_px=np.array([[0.0, 0.0, 9.0, 9.0]] * 2),
         masks=(b"", b""),
     )
-    assert CuePass(Vehicle(version=1))(Seen(0, objects=(boxes,))).counts["zebra"] == 2
+    assert CuePass(Vehicle(version=1))(FrameDetections(0, objects=(boxes,))).counts["zebra"] == 2
     assert Fusion().cues["zebra"].precision == 0.61
     schema = truth_schema()
     assert "zebra" in schema["$defs"]["CueTruth"]["properties"]["cue"]["examples"]
@@ -203,10 +203,10 @@ def test_dummy_cue_requires_only_one_row_and_one_function(
     run = run_folder(tmp_path / "run", found)
     reported = truth([*good_truth().truth.cues, span("zebra", 0, 40, count=1)])
     one = judge_run(run, truth_folder(tmp_path / "drive", reported))
-    scores = scores_of([one])
+    scores = pooled_scores([one])
     assert scores.cues["zebra"].reading == "feature"
     assert scores.cues["zebra"].readings["object"].precision.right == 1
-    assert "zebra" in summary(scores)
+    assert "zebra" in scores_text(scores)
     page = write_report(
         run.file(FOLDER), [one], scores, metrics_of([one], scores), worst_frames([one])
     ).read_text()

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import pytest
 
-from crosscue.detectors.base import Choice, Detections, Found, Frame
+from crosscue.detectors.base import Detections, DetectorChoice, Found, Frame
 from crosscue.detectors.registry import BUILTIN, make
 from crosscue.testing import check_detector
 from support.detecting import BrightBlob, BrightSettings, build, too_few, yolox_card
@@ -20,13 +20,13 @@ NEEDS_A_CARD: Final = {"model"}
 
 @pytest.mark.parametrize("name", sorted(BUILTIN.keys() - NEEDS_A_CARD))
 def test_every_detector_fulfils_contract(name: str) -> None:
-    check_detector(lambda: make(Choice(name, name)))
+    check_detector(lambda: make(DetectorChoice(name, name)))
 
 
 def test_detector_of_model_card_fulfils_contract(tmp_path: Path) -> None:
     card = str(yolox_card(tmp_path))
 
-    check_detector(lambda: make(Choice("yolox", "model", {"card": card})))
+    check_detector(lambda: make(DetectorChoice("yolox", "model", {"card": card})))
 
 
 class _WrongTime(BrightBlob):

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 import crosscue
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import RunFolder, open_run
-from crosscue.eval.runs.logs import place_of
+from crosscue.eval.runs.logs import log_location
 from crosscue.replay.files.tree_text import spelled, unspelled
 from support.gap_drive import VEHICLE, Clock, write_drive
 
@@ -110,7 +110,7 @@ def test_commands_accept_any_name(
     manifest = open_run(run).drive_manifest()
     found = crosscue.catalog(run.parent)
 
-    assert place_of(RunFolder(run), manifest.logs[0]) == log
+    assert log_location(RunFolder(run), manifest.logs[0]) == log
     assert manifest.logs[0].name == spelled(log.name)
     assert found.runs == (run,)
     assert found.query("select run from belief limit 1").to_pylist() == [{"run": spelled(name)}]

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import pytest
 
-from crosscue.datasets.labels.table import LABEL_FORMATS, read_labels
-from crosscue.datasets.truth.annotations import Annotations, Picture, Thing, time_in_name
+from crosscue.datasets.labels.table import LABEL_FORMATS, read_tool_labels
+from crosscue.datasets.truth.annotations import Annotation, Annotations, Picture, time_in_name
 from crosscue.replay.errors import CrosscueError, UsageError
 
 T_NS: Final = 1_700_000_000_123_456_789
@@ -20,8 +20,8 @@ def labels() -> Annotations:
     """Boxes at edges and between pixels, a label that needs escaping, a picture without boxes."""
     names = ("stop sign", 'a "car" & <more>: #1')
     things = (
-        Thing(names[0], (0.0, 0.0, 1280.0, 719.0), score=0.25),
-        Thing(names[1], (10.125, 20.5, 11.375, 700.0625), score=1.0),
+        Annotation(names[0], (0.0, 0.0, 1280.0, 719.0), score=0.25),
+        Annotation(names[1], (10.125, 20.5, 11.375, 700.0625), score=1.0),
     )
     pictures = (
         Picture(f"A-01_{T_NS}ns.jpg", SIZE, T_NS, None, things),
@@ -57,7 +57,7 @@ def test_written_labels_are_read_back_unchanged(name: str, is_named: bool, tmp_p
     path = confirm_predictions(path) if path.suffix == ".json" else path
 
     sizes = {Path(one.name).stem: one.size_px for one in wrote.pictures}
-    read = read_labels(path, sizes, name if is_named else None)
+    read = read_tool_labels(path, sizes, name if is_named else None)
 
     assert times(read).keys() == {T_NS, 5_000_000_000}
     for one in wrote.pictures:
@@ -81,22 +81,22 @@ def test_damaged_labels_are_refused_with_file_name(
         text.write_bytes(content)
 
     with pytest.raises(CrosscueError, match=r"^[^\n]*$") as caught:
-        read_labels(path, {"*": SIZE}, name)
+        read_tool_labels(path, {"*": SIZE}, name)
     assert str(tmp_path) in str(caught.value)
 
 
 def test_unknown_label_format_is_wrong_usage(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x")
     with pytest.raises(UsageError, match="expected one of coco, cvat"):
-        read_labels(tmp_path / "a.csv", {}, "voc")
+        read_tool_labels(tmp_path / "a.csv", {}, "voc")
     with pytest.raises(UsageError, match=r"a\.csv"):
-        read_labels(tmp_path / "a.csv", {})
+        read_tool_labels(tmp_path / "a.csv", {})
 
 
 def test_unconfirmed_predictions_are_not_read_as_labels(tmp_path: Path) -> None:
     path = LABEL_FORMATS["labelstudio"].write(tmp_path, labels())
 
-    read = read_labels(path, {})
+    read = read_tool_labels(path, {})
     assert not read.pictures
     assert read.ignored == {"tasks without an annotation": 2}
 
@@ -112,7 +112,7 @@ def test_last_annotation_not_cancelled_is_read(tmp_path: Path) -> None:
     ]
     path.write_text(json.dumps(tasks[:1]))
 
-    (picture,) = read_labels(path, {}).pictures
+    (picture,) = read_tool_labels(path, {}).pictures
     assert [thing.label for thing in picture.things] == ["stop sign"]
 
 
@@ -133,7 +133,7 @@ def test_yolo_labels_are_read_in_layouts_of_common_tools(
     for name, text in names.items():
         (tmp_path / name).write_text(text)
 
-    (picture,) = read_labels(tmp_path, {"a": (100, 80)}).pictures
+    (picture,) = read_tool_labels(tmp_path, {"a": (100, 80)}).pictures
     assert [(one.label, one.box_px) for one in picture.things] == [("car", (25, 20, 75, 60))]
 
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from crosscue.datasets.adapters.comma2k19 import STREAMS
-from crosscue.datasets.adapters.comma2k19_truth import write
+from crosscue.datasets.adapters.comma2k19_truth import write_comma_truth
 from crosscue.datasets.adapters.npy import read_column
 from crosscue.eval import cli
 from crosscue.replay.base import Selection
@@ -194,7 +194,7 @@ def test_array_of_unexpected_type_is_reported(kind: str, tmp_path: Path) -> None
         assert all(block.log_ns.ndim == 1 for block in blocks)
         if "global_pose" in file.parts:
             with pytest.raises(LogFormatError, match="global_pose"):
-                write(log, tmp_path / "truth")
+                write_comma_truth(log, tmp_path / "truth")
         file.write_bytes(whole)
 
 

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from crosscue.datasets.adapters.kitti import TOPICS, open_drive, write_truth
-from crosscue.datasets.adapters.kitti_oxts import COLUMNS, Packets, parse
+from crosscue.datasets.adapters.kitti import TOPICS, open_kitti, write_kitti_truth
+from crosscue.datasets.adapters.kitti_oxts import COLUMNS, Packets, parse_oxts
 from crosscue.datasets.truth.coco import read_coco
-from crosscue.datasets.truth.truth import load as load_truth
+from crosscue.datasets.truth.truth import read_truth as load_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.eval.cli import run
 from crosscue.replay.base import EVERYTHING, Selection
@@ -149,7 +149,7 @@ def test_tracking_period_is_estimated_from_speeds_and_positions(
 def test_truth_equals_simulated_path(make: Callable[[Path], Path], tmp_path: Path) -> None:
     drive = make(tmp_path / "drive")
 
-    truth_file = write_truth(drive, tmp_path / "truth")
+    truth_file = write_kitti_truth(drive, tmp_path / "truth")
 
     truth = json.loads(truth_file.read_text())
     track = read_tum(truth_file.parent / truth["pose"])
@@ -252,7 +252,7 @@ def test_oxts_without_timestamps_is_dropped_and_yields_no_truth(tmp_path: Path) 
         TOPICS, 5
     )
     with pytest.raises(LogFormatError, match="contains no truth"):
-        write_truth(drive, tmp_path / "truth")
+        write_kitti_truth(drive, tmp_path / "truth")
 
 
 def test_invalid_line_in_timestamps_is_refused_with_its_number(tmp_path: Path) -> None:
@@ -295,7 +295,7 @@ def test_truncated_tracking_file_yields_only_complete_lines(
 
     ledger = Ledger("drive")
     blocks = list(
-        open_drive(tmp_path, DEFAULT_LIMITS).read(ledger, Selection(frozenset({"oxts/imu"})))
+        open_kitti(tmp_path, DEFAULT_LIMITS).read(ledger, Selection(frozenset({"oxts/imu"})))
     )
 
     account = ledger.topic("oxts/imu")
@@ -309,7 +309,7 @@ def test_truncated_tracking_file_yields_only_complete_lines(
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=400))
 def test_any_bytes_parse_to_packet_or_reason(raw: bytes) -> None:
-    parsed = parse(raw)
+    parsed = parse_oxts(raw)
 
     assert isinstance(parsed, str) or (len(parsed) == 30 and np.isfinite(parsed).all())
 
@@ -320,7 +320,7 @@ def test_real_sequence_has_known_heading_change_distance_and_frame_rate(
     drive = shared("odometry", "kitti_tracking_0001")
 
     by_topic, ledger = read(drive)
-    track = read_tum(write_truth(drive, tmp_path).parent / "pose.tum")
+    track = read_tum(write_kitti_truth(drive, tmp_path).parent / "pose.tum")
 
     assert ledger.is_whole
     assert len(times(by_topic["oxts/imu"])) == 447
@@ -349,7 +349,7 @@ def test_tracking_labels_become_objects_of_truth(tmp_path: Path) -> None:
         "2 7 Van 0 ? -1.5 10\n"
     )
 
-    truth = load_truth(write_truth(drive, tmp_path / "truth"))
+    truth = load_truth(write_kitti_truth(drive, tmp_path / "truth"))
 
     assert truth.objects is not None
     assert "1 damaged labels" in truth.source
@@ -377,7 +377,7 @@ def test_intrinsics_are_read_from_rectified_calibration(tmp_path: Path) -> None:
 
 
 def test_truth_pose_is_of_imu_with_known_mounting(tmp_path: Path) -> None:
-    truth = load_truth(write_truth(raw_drive(tmp_path / "drive"), tmp_path / "truth"))
+    truth = load_truth(write_kitti_truth(raw_drive(tmp_path / "drive"), tmp_path / "truth"))
 
     assert truth.pose_point == "imu"
     assert truth.mounting is not None

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import crosscue
-from crosscue.datasets.adapters.kitti_odometry import read_poses, write_truth
-from crosscue.datasets.truth.truth import load
+from crosscue.datasets.adapters.kitti_odometry import read_kitti_poses, write_kitti_odometry_truth
+from crosscue.datasets.truth.truth import read_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.ledger import Ledger
@@ -25,8 +25,8 @@ from support.kitti_odometry_drive import (
 def test_left_turn_has_positive_yaw_rate_and_heading(tmp_path: Path) -> None:
     folder = kitti_odometry_drive(tmp_path)
 
-    odometry = read_poses(folder).odometry()
-    truth = load(write_truth(folder, tmp_path / "truth"))
+    odometry = read_kitti_poses(folder).odometry()
+    truth = read_truth(write_kitti_odometry_truth(folder, tmp_path / "truth"))
 
     np.testing.assert_allclose(np.asarray(odometry["speed_x_mps"], float), SPEED_MPS, rtol=2e-3)
     np.testing.assert_allclose(
@@ -66,7 +66,7 @@ def test_sequence_without_poses_has_pictures_but_no_truth(tmp_path: Path) -> Non
     with open_log(folder) as log:
         assert [topic.name for topic in log.topics] == ["image_2"]
     with pytest.raises(LogFormatError, match="sequences 00 to 10"):
-        write_truth(folder, tmp_path / "truth")
+        write_kitti_odometry_truth(folder, tmp_path / "truth")
 
 
 def test_drafted_vehicle_has_published_intrinsics(tmp_path: Path) -> None:

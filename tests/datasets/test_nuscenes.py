@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from crosscue.datasets.adapters.nuscenes_tables import MAX_ROW_CHARS, RowsOf
-from crosscue.datasets.adapters.nuscenes_truth import write
+from crosscue.datasets.adapters.nuscenes_truth import write_nuscenes_truth
 from crosscue.datasets.truth.coco import read_coco
-from crosscue.datasets.truth.truth import load
+from crosscue.datasets.truth.truth import read_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.replay.columns import Floats, Table
 from crosscue.replay.errors import LogFormatError
@@ -78,7 +78,7 @@ def test_scene_is_selected_by_empty_file(tmp_path: Path) -> None:
 
 
 def test_truth_has_rear_axle_pose_and_visible_boxes(tmp_path: Path) -> None:
-    truth = load(write(nuscenes_drive(tmp_path / "root"), tmp_path / "truth"))
+    truth = read_truth(write_nuscenes_truth(nuscenes_drive(tmp_path / "root"), tmp_path / "truth"))
 
     assert truth.pose_point == "rear_axle"
     assert truth.pose is not None
@@ -99,7 +99,7 @@ def test_truth_has_rear_axle_pose_and_visible_boxes(tmp_path: Path) -> None:
 
 
 def test_box_matches_pinhole_projection(tmp_path: Path) -> None:
-    truth = load(write(nuscenes_drive(tmp_path / "root"), tmp_path / "truth"))
+    truth = read_truth(write_nuscenes_truth(nuscenes_drive(tmp_path / "root"), tmp_path / "truth"))
 
     assert truth.objects is not None
     box_px = read_coco(tmp_path / "truth" / truth.objects).pictures[0].things[0].box_px

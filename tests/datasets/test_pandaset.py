@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.datasets.adapters.pandaset import read_poses
+from crosscue.datasets.adapters.pandaset import read_pandaset_poses
 from crosscue.datasets.real.label_pandaset import write_labels
-from crosscue.datasets.truth.truth import load, write_carried
+from crosscue.datasets.truth.truth import read_truth, write_carried
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.replay.base import Selection
 from crosscue.replay.errors import LogFormatError
@@ -41,7 +41,7 @@ def test_every_stream_is_read(tmp_path: Path) -> None:
 
 
 def test_odometry_matches_simulated_motion(tmp_path: Path) -> None:
-    table = read_poses(pandaset_drive(tmp_path / "002")).odometry()
+    table = read_pandaset_poses(pandaset_drive(tmp_path / "002")).odometry()
 
     # A chord of 0.2 s at 0.2 rad/s is 0.007 % shorter than its arc.
     np.testing.assert_allclose(np.asarray(table["speed_x_mps"], float)[1:-1], SPEED_MPS, rtol=1e-4)
@@ -51,7 +51,9 @@ def test_odometry_matches_simulated_motion(tmp_path: Path) -> None:
 
 
 def test_truth_equals_camera_track(tmp_path: Path) -> None:
-    truth = load(write_carried("pandaset", pandaset_drive(tmp_path / "002"), tmp_path / "truth"))
+    truth = read_truth(
+        write_carried("pandaset", pandaset_drive(tmp_path / "002"), tmp_path / "truth")
+    )
     track = read_tum(tmp_path / "truth" / str(truth.pose))
 
     assert truth.pose_point == "camera"
@@ -91,7 +93,7 @@ def test_poses_out_of_order_are_refused(tmp_path: Path) -> None:
     (path / CAMERA / "timestamps.json").write_text(json.dumps(times))
 
     with pytest.raises(LogFormatError, match="poses in order"):
-        read_poses(path)
+        read_pandaset_poses(path)
 
 
 def test_real_sequence_is_read_with_known_speed_and_distance(tmp_path: Path) -> None:
@@ -99,7 +101,7 @@ def test_real_sequence_is_read_with_known_speed_and_distance(tmp_path: Path) -> 
     path = shared("sequences", "pandaset_002")
 
     found, ledger = rows(path)
-    speed = read_poses(path).odometry()["speed_x_mps"]
+    speed = read_pandaset_poses(path).odometry()["speed_x_mps"]
 
     assert found == {"front_camera": 80, "odometry": 80, "gnss": 80}
     assert ledger.is_whole

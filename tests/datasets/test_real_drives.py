@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from crosscue.datasets.real.recordings import FOLDER
-from crosscue.datasets.truth.truth import load as load_truth
+from crosscue.datasets.truth.truth import read_truth as load_truth
 from crosscue.detectors.catalog import fetch as weights
 from crosscue.detectors.catalog import places
 from crosscue.eval.cli import run
@@ -56,7 +56,7 @@ def test_can_segment_and_single_picture_are_replayed_as_one_drive(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(places.VARIABLE, str(tmp_path / "models"))
     monkeypatch.setenv(weights.DATA, str(shared("weights").parent))
-    weights.fetch("yolox-nano")
+    weights.fetch_weights("yolox-nano")
     front = tmp_path / "front"
     front.mkdir()
     shutil.copy(segment / "preview.png", front / "00.png")

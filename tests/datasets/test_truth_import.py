@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from crosscue.datasets.truth.annotations import LogPictures, place
+from crosscue.datasets.truth.annotations import LogPictures, match_frames
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.cvat import read_cvat
-from crosscue.datasets.truth.truth import Truth, load, truth_schema
+from crosscue.datasets.truth.truth import Truth, read_truth, truth_schema
 from crosscue.eval import cli
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.vehicle.cue_table import CUES
@@ -69,7 +69,7 @@ def _error_line(capsys: pytest.CaptureFixture[str]) -> str:
 def test_coco_import_writes_present_and_absent_cues(tmp_path: Path, log: Path) -> None:
     assert _import(_write(tmp_path / "coco.json", coco()), log, tmp_path / "truth.json") == 0
 
-    truth = load(tmp_path / "truth.json")
+    truth = read_truth(tmp_path / "truth.json")
     assert [(one.cue, one.t_ns, one.present, one.count, one.visible) for one in truth.cues] == [
         ("stop_sign", START_NS + STEP_NS, True, 1, 0.5),
         ("stop_sign", START_NS + 3 * STEP_NS, False, 0, None),
@@ -85,7 +85,7 @@ def test_imported_objects_can_be_imported_again(tmp_path: Path, log: Path) -> No
     (tmp_path / "again").mkdir()
     assert _import(tmp_path / "objects.json", log, tmp_path / "again") == 0
 
-    first, second = load(tmp_path), load(tmp_path / "again")
+    first, second = read_truth(tmp_path), read_truth(tmp_path / "again")
     assert first.cues == second.cues
     before, after = (
         json.loads((folder / "objects.json").read_text())
@@ -111,8 +111,8 @@ def test_add_option_keeps_approaches_and_replaces_cues(tmp_path: Path, log: Path
 
     assert _import(source, log, path) == 1
     assert _import(source, log, path, "--add") == 0
-    assert [one.id for one in load(path).approaches] == [4]
-    assert len(load(path).cues) == 2
+    assert [one.id for one in read_truth(path).approaches] == [4]
+    assert len(read_truth(path).cues) == 2
 
 
 # Faults of the file that do not depend on its log: it cannot be read, exit status 4.
@@ -240,7 +240,7 @@ def test_map_option_assigns_labels_to_cues(
     source = _write(tmp_path / "coco.json", tree)
 
     assert _import(source, log, tmp_path / "t.json", "--map", "halt = stop=stop_sign", "dog=") == 0
-    assert {one.cue for one in load(tmp_path / "t.json").cues} == {"stop_sign"}
+    assert {one.cue for one in read_truth(tmp_path / "t.json").cues} == {"stop_sign"}
     assert cli.run(["truth", "check", str(tmp_path / "t.json"), "--log", str(log), "-q"]) == 0
     for own, message in (
         ("cat=stop_sign", "no such label"),
@@ -263,7 +263,7 @@ def test_custom_cue_of_vehicle_file_is_imported(
     assert _import(source, log, path) in (1, 4)
     assert "neither a cue" in _error_line(capsys)
     assert _import(source, log, path, "--vehicle", str(vehicle)) == 0
-    truth = load(path)
+    truth = read_truth(path)
     assert truth.own_cues == ("zebra_crossing",)
     assert {(one.cue, one.present) for one in truth.cues} == {
         ("zebra_crossing", True),
@@ -300,7 +300,7 @@ def test_cvat_for_images_is_imported(
     argv = ["truth", "import", str(tmp_path / "a.xml"), "--log", str(log), "-o", str(tmp_path)]
     assert cli.run(argv) == 0
     assert "ignored    1 polyline" in capsys.readouterr().out
-    found = {(one.cue, one.t_ns): one.present for one in load(tmp_path).cues}
+    found = {(one.cue, one.t_ns): one.present for one in read_truth(tmp_path).cues}
     assert found == {
         ("stop_sign", START_NS + STEP_NS): True,
         ("road_left", START_NS + STEP_NS): True,
@@ -338,7 +338,7 @@ def test_cvat_for_video_covers_every_frame_of_its_task(tmp_path: Path, log: Path
 
     assert _import(tmp_path / "a.xml", log, tmp_path / "truth.json") == 0
     # Frames 1, 3 and 5 of the video; the sign is no longer visible in 5.
-    assert [(one.t_ns, one.present) for one in load(tmp_path / "truth.json").cues] == [
+    assert [(one.t_ns, one.present) for one in read_truth(tmp_path / "truth.json").cues] == [
         (START_NS + STEP_NS, True),
         (START_NS + 3 * STEP_NS, True),
         (START_NS + 5 * STEP_NS, False),
@@ -393,7 +393,7 @@ def test_pictures_are_matched_to_nearest_frame_in_time(tmp_path: Path) -> None:
         image["t_ns"] = START_NS + STEP_NS * image["id"] + off
     annotations = read_coco(_write(tmp_path / "coco.json", tree))
     times = START_NS + STEP_NS * np.arange(FRAMES, dtype=np.int64)
-    placed = place(annotations, LogPictures("log", times, (WIDE, HIGH)))
+    placed = match_frames(annotations, LogPictures("log", times, (WIDE, HIGH)))
 
     assert placed.t_ns == (START_NS + STEP_NS, START_NS + 3 * STEP_NS)
     assert placed.rule == "by time, at most 7.0 ms off"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import crosscue
-from crosscue.detectors.base import Choice, Detections, Frame, View
+from crosscue.detectors.base import Detections, DetectorChoice, Frame, View
 from crosscue.detectors.box_detector import BoxDetector, ScoredBox
 from crosscue.detectors.registry import chosen, make
 from crosscue.replay.errors import CrosscueError, UsageError, VehicleError
@@ -55,7 +55,7 @@ def test_settings_are_checked_and_decide_the_identity() -> None:
 
 
 def test_detector_is_selected_by_class_and_factory() -> None:
-    found = make(Choice("mine", f"{__name__}:Corner.build", {"side_px": 3}))
+    found = make(DetectorChoice("mine", f"{__name__}:Corner.build", {"side_px": 3}))
 
     assert isinstance(found, Corner)
     assert found.side_px == 3
@@ -153,7 +153,7 @@ def test_missing_detector_members_are_named() -> None:
     place = f"{__name__}:NoDetector"
 
     with pytest.raises(VehicleError, match=f"{place}.* without view, identity; .*BoxDetector"):
-        make(Choice("mine", place, {}))
+        make(DetectorChoice("mine", place, {}))
 
 
 def test_detections_are_selected_by_label() -> None:

@@ -16,14 +16,14 @@ from crosscue.detectors.base import Detections
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Checkpoint, Facts, load_checkpoint
 from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, detector_of
 from crosscue.detectors.networks.mask_rcnn.network import build_network
-from crosscue.detectors.training.annotations import LabelledSet, mask_of, read_coco
+from crosscue.detectors.training.annotations import LabelledSet, mask_of, read_training_coco
 from crosscue.detectors.training.loop import Schedule, Training
-from crosscue.detectors.training.samples import Sampler, Window
+from crosscue.detectors.training.samples import Sampler, SampleSettings
 from crosscue.detectors.training.scores import average_precisions
 from crosscue.eval.cli import run
 from support.mask_rcnn import CPU, noise_frame, plan_of, random_checkpoint, write_bars
 
-WINDOW = Window(96, 64)
+WINDOW = SampleSettings(96, 64)
 MASK_HEAD = ("roi_heads.mask_head.", "roi_heads.mask_predictor.")
 
 
@@ -38,7 +38,7 @@ def _without_masks(path: Path, every: int = 1) -> None:
 def _boxes(folder: Path, every: int = 1, count: int = 4) -> LabelledSet:
     path = write_bars(folder / "set", count)
     _without_masks(path, every)
-    return read_coco(path, folder / "set" / "images", ("car",))
+    return read_training_coco(path, folder / "set" / "images", ("car",))
 
 
 def _training(labelled: LabelledSet, schedule: Schedule) -> tuple[Training, Sampler]:
@@ -62,7 +62,7 @@ def test_annotation_without_mask_is_read(tmp_path: Path, absent: object) -> None
     tree["annotations"][0]["segmentation"] = absent
     path.write_text(json.dumps(tree))
 
-    labelled = read_coco(path, tmp_path / "images", ("car",))
+    labelled = read_training_coco(path, tmp_path / "images", ("car",))
 
     assert (labelled.objects, labelled.masks, labelled.left_out) == (4, 3, {})
     one = labelled.pictures[0].objects[0]
@@ -106,11 +106,11 @@ def test_mixed_data_trains_the_mask_head(tmp_path: Path) -> None:
 
 def test_mask_precision_counts_only_objects_with_a_mask(tmp_path: Path) -> None:
     path = write_bars(tmp_path, 2)
-    whole = read_coco(path, tmp_path / "images", ("car",))
+    whole = read_training_coco(path, tmp_path / "images", ("car",))
     _without_masks(path, every=2)
-    mixed = read_coco(path, tmp_path / "images", ("car",))
+    mixed = read_training_coco(path, tmp_path / "images", ("car",))
     _without_masks(path)
-    boxes = read_coco(path, tmp_path / "images", ("car",))
+    boxes = read_training_coco(path, tmp_path / "images", ("car",))
 
     found = []
     for number, picture in enumerate(whole.pictures):
@@ -120,7 +120,7 @@ def test_mask_precision_counts_only_objects_with_a_mask(tmp_path: Path) -> None:
             mask = mask_of(one, picture.size_px)
             if k % 2 == 0:
                 mask[:, : int(one.box_px[0] + one.box_px[2]) // 2] = False
-            masks.append(rle.encode(mask, (0, 0), picture.size_px))
+            masks.append(rle.encode_mask(mask, (0, 0), picture.size_px))
         corners = np.array([one.box_px for one in picture.objects], np.float64)
         found.append(
             Detections(

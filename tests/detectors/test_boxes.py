@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from crosscue.detectors.boxes import best_of, overlaps
+from crosscue.detectors.boxes import box_ious, non_maximum_suppression
 
 
 def test_suppression_keeps_the_best_of_overlapping_boxes() -> None:
@@ -14,8 +14,8 @@ def test_suppression_keeps_the_best_of_overlapping_boxes() -> None:
     expected: list[int] = []
     for i in np.argsort(-scores):
         rivals = [k for k in expected if groups[k] == groups[i]]
-        if scores[i] >= 0.2 and not (overlaps(boxes[i], boxes[rivals]) > 0.45).any():
+        if scores[i] >= 0.2 and not (box_ious(boxes[i], boxes[rivals]) > 0.45).any():
             expected.append(int(i))
 
-    assert best_of(boxes, scores, groups, 0.2, 0.45).tolist() == expected
-    assert not len(best_of(boxes, scores, groups, 2.0, 0.45))
+    assert non_maximum_suppression(boxes, scores, groups, 0.2, 0.45).tolist() == expected
+    assert not len(non_maximum_suppression(boxes, scores, groups, 2.0, 0.45))

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from torchvision.models import get_model_weights
 
-from crosscue.detectors.base import Choice
+from crosscue.detectors.base import DetectorChoice
 from crosscue.detectors.catalog import entries, fetch, places
 from crosscue.detectors.catalog.card import ModelCard, WeightFile
-from crosscue.detectors.catalog.class_names import COCO_80, COCO_90, meaning_of
+from crosscue.detectors.catalog.class_names import COCO_80, COCO_90, cue_label
 from crosscue.detectors.registry import make
 from crosscue.eval.cli import run
 from crosscue.replay.errors import CrosscueError, UsageError, VehicleError
@@ -77,7 +77,7 @@ def test_torchvision_entries_match_the_installed_torchvision(name: str) -> None:
     assert file.url == weights.url
     assert file.sha256.startswith(Path(weights.url).stem.rsplit("-", 1)[-1])
     assert file.size_bytes / 2**20 == pytest.approx(weights.meta["_file_size"], abs=1e-3)
-    assert entries.place_of(card, file).name == Path(weights.url).name
+    assert entries.weights_path(card, file).name == Path(weights.url).name
     theirs = weights.meta["categories"][1:]
     assert len(theirs) == len(card.output.classes)
     assert all(
@@ -98,18 +98,18 @@ def test_every_available_entry_runs(
     monkeypatch.setenv(fetch.DATA, str(shared("weights").parent))
     monkeypatch.setenv(fetch.MIRROR, "http://127.0.0.1:9")
     try:
-        fetch.fetch(name)
+        fetch.fetch_weights(name)
     except CrosscueError:
         pytest.skip(f"the weights of {name} are not available")
 
-    detector = make(Choice(name, name))
+    detector = make(DetectorChoice(name, name))
 
     assert detector.identity.startswith("model-")
 
 
 def test_unfetched_model_is_reported_with_the_fetch_command(cache: Path) -> None:
     with pytest.raises(VehicleError) as error:
-        make(Choice("objects", "yolox-nano"))
+        make(DetectorChoice("objects", "yolox-nano"))
 
     message = "model yolox-nano: not fetched yet (3.7 MB, licence Apache-2.0); crosscue model fetch"
     assert message in str(error.value)
@@ -118,7 +118,7 @@ def test_unfetched_model_is_reported_with_the_fetch_command(cache: Path) -> None
 @pytest.mark.parametrize("name", ["my.onnx", "nets/own.safetensors", "weights.pth"])
 def test_weights_in_place_of_a_detector_are_answered_with_how_to_name_them(name: str) -> None:
     with pytest.raises(UsageError, match=r"expected a model card.*crosscue model init.*detectors"):
-        make(Choice(name, name))
+        make(DetectorChoice(name, name))
 
 
 def test_misspelled_model_name_suggests_the_nearest() -> None:
@@ -127,8 +127,8 @@ def test_misspelled_model_name_suggests_the_nearest() -> None:
 
 
 def test_weights_are_downloaded_once(card: ModelCard, server: Served) -> None:
-    (first,) = fetch.fetch("net")
-    (second,) = fetch.fetch("net")
+    (first,) = fetch.fetch_weights("net")
+    (second,) = fetch.fetch_weights("net")
 
     assert first.path.read_bytes() == CONTENT
     assert second.came_from == "the cache"
@@ -139,10 +139,10 @@ def test_weights_are_downloaded_once(card: ModelCard, server: Served) -> None:
 def test_interrupted_download_is_resumed(card: ModelCard, server: Served) -> None:
     server.failing = 1
     with pytest.raises(CrosscueError, match="interrupted after 524288 of 1048576 bytes"):
-        fetch.fetch("net")
-    assert not entries.place_of(card, card.files[0]).exists()
+        fetch.fetch_weights("net")
+    assert not entries.weights_path(card, card.files[0]).exists()
 
-    (found,) = fetch.fetch("net")
+    (found,) = fetch.fetch_weights("net")
 
     assert server.gets == ["all", "bytes=524288-1048575"]
     assert found.path.read_bytes() == CONTENT
@@ -157,14 +157,14 @@ def test_download_with_another_hash_is_not_kept(
 
     for _ in range(2):
         if content.startswith(CONTENT):
-            (found,) = fetch.fetch("net")
+            (found,) = fetch.fetch_weights("net")
             assert found.path.read_bytes() == CONTENT
             continue
         with pytest.raises(
             CrosscueError, match=r"the download is not net\.onnx|interrupted after 16"
         ):
-            fetch.fetch("net")
-        assert not entries.place_of(card, card.files[0]).exists()
+            fetch.fetch_weights("net")
+        assert not entries.weights_path(card, card.files[0]).exists()
 
 
 def test_failed_download_suggests_other_sources(
@@ -173,7 +173,7 @@ def test_failed_download_suggests_other_sources(
     monkeypatch.setenv(fetch.MIRROR, "http://127.0.0.1:9/")
 
     with pytest.raises(CrosscueError) as error:
-        fetch.fetch("net")
+        fetch.fetch_weights("net")
 
     assert str(error.value).startswith("http://127.0.0.1:9/net.onnx: not fetched: ")
     assert "--from FILE" in str(error.value)
@@ -186,7 +186,7 @@ def test_mirror_replaces_the_original_server(
     server.files["mirror/net.onnx"] = server.files.pop("net.onnx")
     monkeypatch.setenv(fetch.MIRROR, f"{server.base}/mirror")
 
-    (found,) = fetch.fetch("net")
+    (found,) = fetch.fetch_weights("net")
 
     assert found.path.read_bytes() == CONTENT
 
@@ -198,16 +198,16 @@ def test_weights_are_copied_from_a_file_or_folder(
     file.write_bytes(CONTENT)
 
     for given in (file, tmp_path):
-        (found,) = fetch.fetch("net", given)
+        (found,) = fetch.fetch_weights("net", given)
         assert found.path.read_bytes() == CONTENT
         shutil.rmtree(found.path.parent)
     assert not server.gets
 
     file.write_bytes(CONTENT[1:])
     with pytest.raises(UsageError, match="model net requires"):
-        fetch.fetch("net", file)
+        fetch.fetch_weights("net", file)
     with pytest.raises(UsageError, match="No such file"):
-        fetch.fetch("net", tmp_path / "gone.onnx")
+        fetch.fetch_weights("net", tmp_path / "gone.onnx")
 
 
 def test_weights_are_found_in_the_data_folder(
@@ -218,7 +218,7 @@ def test_weights_are_found_in_the_data_folder(
     (folder / "net.onnx").write_bytes(CONTENT)
     monkeypatch.setenv(fetch.DATA, str(tmp_path / "data"))
 
-    (found,) = fetch.fetch("net")
+    (found,) = fetch.fetch_weights("net")
 
     assert found.came_from == str(folder / "net.onnx")
     assert not server.gets
@@ -256,4 +256,4 @@ def test_coco_class_numbers_keep_their_gaps() -> None:
     ],
 )
 def test_class_names_map_to_cue_labels(name: str, label: str | None) -> None:
-    assert meaning_of(name) == label
+    assert cue_label(name) == label

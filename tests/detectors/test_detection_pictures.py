@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.images import Encoded
-from crosscue.detectors.overlay import BLUE, GREEN, MARGIN_PX, Drawer, draw
+from crosscue.detectors.overlay import BLUE, GREEN, MARGIN_PX, Drawer, draw_detections
 
 SIZE = (640, 360)
 GREY = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
@@ -23,7 +23,7 @@ GREY = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
 def _drawn(
     found: tuple[Detections | RoadMask, ...], cues: dict[str, int], enlarge: float = 1.0
 ) -> np.typing.NDArray[np.uint8]:
-    return draw(GREY, found, cues, enlarge)
+    return draw_detections(GREY, found, cues, enlarge)
 
 
 def test_only_the_outline_of_a_box_is_drawn() -> None:
@@ -41,7 +41,7 @@ def test_only_the_outline_of_a_box_is_drawn() -> None:
 def test_only_road_is_tinted() -> None:
     mask = np.zeros((36, 64), np.bool_)
     mask[18:30, :32] = True
-    road = RoadMask(0, SIZE, rle.encode(mask, (0, 0), (64, 36)), (64, 36))
+    road = RoadMask(0, SIZE, rle.encode_mask(mask, (0, 0), (64, 36)), (64, 36))
 
     drawn = _drawn((road,), {})
 

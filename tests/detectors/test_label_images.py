@@ -29,7 +29,7 @@ def test_drawn_object_is_recovered_with_box_mask_and_score(label: str) -> None:
     assert back.labels == (label,)
     assert back.scores[0] == pytest.approx(0.8, abs=1 / 255)
     np.testing.assert_array_equal(back.boxes_px, [[10, 5, 12, 8]])
-    np.testing.assert_array_equal(rle.decode(back.masks[0], SIZE_PX)[5:8, 10:12], mask)
+    np.testing.assert_array_equal(rle.decode_mask(back.masks[0], SIZE_PX)[5:8, 10:12], mask)
 
 
 def test_objects_are_clipped_at_the_edge_and_occluded_ones_hidden() -> None:
@@ -51,7 +51,7 @@ def test_road_mask_is_recovered() -> None:
     (back,) = road()([frame(label_image(is_road, []))])
 
     assert isinstance(back, RoadMask)
-    np.testing.assert_array_equal(rle.decode(back.mask, back.mask_size_px), is_road)
+    np.testing.assert_array_equal(rle.decode_mask(back.mask, back.mask_size_px), is_road)
 
 
 def test_black_image_has_no_objects() -> None:

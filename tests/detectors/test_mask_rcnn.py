@@ -21,17 +21,17 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torchvision.models.detection.roi_heads import paste_masks_in_image
 
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.detectors import rle, weights_file
-from crosscue.detectors.base import Choice, Detections, Frame
-from crosscue.detectors.boxes import overlaps
+from crosscue.detectors.base import Detections, DetectorChoice, Frame
+from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.networks.devices import chosen_device
 from crosscue.detectors.networks.mask_rcnn.checkpoint import (
     KEY,
     Calibration,
     Checkpoint,
     Facts,
-    embedded_path,
+    embedded_mask_rcnn,
     load_checkpoint,
     save_checkpoint,
 )
@@ -43,11 +43,11 @@ from crosscue.detectors.networks.mask_rcnn.detector import (
     calibrated,
     detector_of,
     laid_in,
-    place,
+    place_picture,
     raw_score,
 )
-from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network, set_limits
-from crosscue.detectors.networks.mask_rcnn.parts import Body, Parts, as_input
+from crosscue.detectors.networks.mask_rcnn.network import NetworkPlan, build_network, set_limits
+from crosscue.detectors.networks.mask_rcnn.parts import Body, MaskRcnnLayers, as_input
 from crosscue.detectors.registry import make
 from crosscue.detectors.weights_file import SUM
 from crosscue.replay.columns import Bytes
@@ -82,7 +82,7 @@ def test_detections_above_the_score_match_torchvision() -> None:
     network = build_network(plan_of())
     network.load_state_dict(random_checkpoint().network.state_dict())
     set_limits(network, 1000, 0.05)
-    given = as_input(place(frame.pixels, plan_of()).pixels[None], CPU)
+    given = as_input(place_picture(frame.pixels, plan_of()).pixels[None], CPU)
     network.transform = _Bare()
 
     with torch.inference_mode():
@@ -132,7 +132,9 @@ def test_detections_follow_a_changing_picture_size() -> None:
         width, height = one.size_px
         assert (one.boxes_px >= 0).all()
         assert (one.boxes_px <= [width, height, width, height]).all()
-        assert all(rle.decode(mask, one.size_px).shape == (height, width) for mask in one.masks)
+        assert all(
+            rle.decode_mask(mask, one.size_px).shape == (height, width) for mask in one.masks
+        )
 
 
 def test_grey_picture_equals_picture_with_equal_channels() -> None:
@@ -156,7 +158,7 @@ def test_detections_of_a_reduced_picture_are_in_camera_pixels() -> None:
 
 def test_cropped_picture_keeps_its_offset_and_scale() -> None:
     plan = plan_of(256, top=0.25, bottom=0.25)
-    placed = place(np.zeros((96, 128, 3), np.uint8), plan)
+    placed = place_picture(np.zeros((96, 128, 3), np.uint8), plan)
 
     assert placed.pixels.shape == (96, 256, 3)
     assert placed.corner_px == (0, 48)
@@ -167,7 +169,7 @@ def test_cropped_picture_keeps_its_offset_and_scale() -> None:
 class _Small:
     """Back end of a device with memory for a limited number of pictures."""
 
-    within: Parts
+    within: MaskRcnnLayers
     max_count: int
     tried: list[int] = field(default_factory=list)
 
@@ -265,7 +267,7 @@ def test_mask_in_its_box_matches_torchvision(
     at = (np.arange(28) + 0.5) / 14.0 - 1.0
     mask = (np.hypot(at[:, None], at[None, :]) < fullness).astype(np.float32)
 
-    ours = rle.decode(laid_in(mask, box, (128, 96)), (128, 96))
+    ours = rle.decode_mask(laid_in(mask, box, (128, 96)), (128, 96))
     pasted = paste_masks_in_image(
         torch.from_numpy(mask)[None, None], torch.from_numpy(box).float()[None], (96, 128)
     )
@@ -281,7 +283,7 @@ def test_mask_in_its_box_matches_torchvision(
 
 
 def test_full_mask_fills_exactly_its_box() -> None:
-    mask = rle.decode(
+    mask = rle.decode_mask(
         laid_in(np.ones((28, 28), np.float32), np.array([3.0, 4.0, 9.0, 8.0]), (16, 12)), (16, 12)
     )
 
@@ -421,10 +423,10 @@ def test_flipped_bit_in_a_checkpoint_is_refused(at: float, bit: int) -> None:
 def test_damaged_embedded_checkpoint_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    content = bytearray(embedded_path().read_bytes())
+    content = bytearray(embedded_mask_rcnn().read_bytes())
     content[-1000] ^= 1
     (tmp_path / "checkpoints").mkdir()
-    (tmp_path / "checkpoints" / embedded_path().name).write_bytes(content)
+    (tmp_path / "checkpoints" / embedded_mask_rcnn().name).write_bytes(content)
     monkeypatch.setattr(weights_file, "__file__", str(tmp_path / "weights_file.py"))
 
     with pytest.raises(VehicleError, match="damaged: expected sha256 270a84"):
@@ -480,7 +482,7 @@ def test_failed_download_reports_the_cache_folder(
 def test_coco_checkpoint_has_class_names() -> None:
     from torchvision.models.detection import MaskRCNN_ResNet50_FPN_Weights as Weights
 
-    plan = Plan(architecture="resnet50", classes=("x",) * 90, width_px=1333)
+    plan = NetworkPlan(architecture="resnet50", classes=("x",) * 90, width_px=1333)
     checkpoint = coco_checkpoint("resnet50", Weights.DEFAULT, build_network(plan).state_dict())
 
     names = checkpoint.facts.plan.classes
@@ -528,15 +530,17 @@ def test_coco_weights_yield_the_feature_levels_of_torchvision(
 
 
 def test_registry_builds_mask_rcnn_and_checks_its_settings() -> None:
-    assert isinstance(make(Choice("mine", "mask-rcnn", {"device": "cpu"})), MaskRcnnDetector)
+    assert isinstance(
+        make(DetectorChoice("mine", "mask-rcnn", {"device": "cpu"})), MaskRcnnDetector
+    )
     with pytest.raises(VehicleError, match="proposals"):
-        make(Choice("mine", "mask-rcnn", {"proposals": 0}))
+        make(DetectorChoice("mine", "mask-rcnn", {"proposals": 0}))
 
 
 def test_embedded_checkpoint_is_small_and_documented() -> None:
-    facts = load_checkpoint(embedded_path()).facts
+    facts = load_checkpoint(embedded_mask_rcnn()).facts
 
-    assert embedded_path().stat().st_size < 25e6
+    assert embedded_mask_rcnn().stat().st_size < 25e6
     assert facts.plan.classes == CLASSES
     assert set(facts.calibration) == set(CLASSES)
     assert {"box", "mask", "box car", "mask stop sign"} <= set(facts.measured)
@@ -555,7 +559,7 @@ def test_embedded_checkpoint_is_small_and_documented() -> None:
 def test_embedded_checkpoint_detects_objects_of_unseen_layouts(
     layout: str, x_m: float, category: str, label: str
 ) -> None:
-    picture = picture_at(world(layout), x_m, Camera())
+    picture = picture_at(world(layout), x_m, SceneCamera())
     largest = max(
         (one for one in picture.seen if one.thing.category == category),
         key=lambda one: int(one.mask.sum()),
@@ -566,9 +570,9 @@ def test_embedded_checkpoint_detects_objects_of_unseen_layouts(
 
     assert isinstance(found, Detections)
     kept = [i for i, name in enumerate(found.labels) if name == label]
-    fraction = overlaps(np.array(largest.box_px, np.float64), found.boxes_px[kept])
+    fraction = box_ious(np.array(largest.box_px, np.float64), found.boxes_px[kept])
     assert fraction.max() > 0.5
     best = kept[int(fraction.argmax())]
     x0, y0, x1, y1 = largest.box_px
-    mask = rle.decode(found.masks[best], (1280, 720))[y0:y1, x0:x1]
+    mask = rle.decode_mask(found.masks[best], (1280, 720))[y0:y1, x0:x1]
     assert (mask & largest.mask).sum() > 0.6 * (mask | largest.mask).sum()

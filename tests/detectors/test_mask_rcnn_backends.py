@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Checkpoint, Facts
@@ -31,7 +31,7 @@ from crosscue.detectors.networks.mask_rcnn.detector import (
     checkpoint_named,
     detector_of,
     laid_in,
-    place,
+    place_picture,
 )
 from crosscue.detectors.networks.mask_rcnn.network import build_network
 from crosscue.detectors.networks.mask_rcnn.parts import TorchParts, as_input
@@ -78,7 +78,7 @@ def _simulated() -> tuple[Frame, ...]:
     """Render pictures of a simulated drive with lights and cars."""
     taken = []
     for layout, x_m in (("E", -25.0), ("C", -15.0)):
-        rgb = picture_at(world(layout), x_m, Camera()).rgb
+        rgb = picture_at(world(layout), x_m, SceneCamera()).rgb
         taken.append(Frame(0, "", np.ascontiguousarray(rgb[:, :, ::-1]), (1280, 720)))
     return tuple(taken)
 
@@ -101,7 +101,7 @@ def _found_by_torchvision(
     from torchvision.models.detection.image_list import ImageList
 
     plan = checkpoint.facts.plan
-    placed = place(frame.pixels, plan)
+    placed = place_picture(frame.pixels, plan)
     network = _torchvision(checkpoint.network, objectness)
     with torch.inference_mode():
         pictures = as_input(placed.pixels[None], CPU)
@@ -135,7 +135,9 @@ def _assert_equal(ours: Detections, theirs: Detections) -> None:
         assert ours.labels[j] == label
         assert apart_px[j] <= 0.5
         assert ours.scores[j] == pytest.approx(theirs.scores[i], abs=1e-3)
-        mine, other = (rle.decode(one, ours.size_px) for one in (ours.masks[j], theirs.masks[i]))
+        mine, other = (
+            rle.decode_mask(one, ours.size_px) for one in (ours.masks[j], theirs.masks[i])
+        )
         assert int((mine ^ other).sum()) <= 4 + 0.01 * int(other.sum())
 
 

@@ -138,7 +138,7 @@ def test_mask_has_the_size_of_the_camera_picture(tmp_path: Path) -> None:
     )
 
     np.testing.assert_allclose(found.boxes_px, [[160, 80, 480, 240]])
-    mask = rle.decode(found.masks[0], (640, 320))
+    mask = rle.decode_mask(found.masks[0], (640, 320))
     expected_input = np.zeros((320, 640), bool)
     expected_input[80:240, 160:320] = True
     np.testing.assert_array_equal(mask[:, :300], expected_input[:, :300])

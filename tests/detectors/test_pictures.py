@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import View
-from crosscue.detectors.images import MAX_PIXELS, Encoded, decode, reduction, size_of
+from crosscue.detectors.images import MAX_PIXELS, Encoded, decode, picture_size, reduction
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
 
@@ -151,7 +151,7 @@ def test_truncated_picture_is_refused(suffix: str, fraction: float) -> None:
 @pytest.mark.parametrize("coding", ["h264", "tiff", "png"])
 def test_unsupported_picture_is_refused(coding: str) -> None:
     with pytest.raises(LogError, match=f"{coding} picture without a size, or not decoded here"):
-        size_of(Encoded(coding, memoryview(b"\0" * 64)))
+        picture_size(Encoded(coding, memoryview(b"\0" * 64)))
 
 
 def test_raw_picture_shorter_than_its_size_is_refused() -> None:

@@ -16,7 +16,7 @@ from crosscue.detectors.base import Frame, RoadMask
 from crosscue.detectors.cues.road import road_fractions
 from crosscue.detectors.networks.road.checkpoint import RoadFacts, load_road, save_road
 from crosscue.detectors.networks.road.detector import build
-from crosscue.detectors.networks.road.network import RoadNetwork, embedded_path
+from crosscue.detectors.networks.road.network import RoadNetwork, embedded_road
 from crosscue.detectors.training.road import RoadSchedule, RoadTraining, road_score
 from crosscue.eval.cli import run
 from crosscue.replay.columns import Bytes
@@ -147,15 +147,15 @@ def test_every_picture_size_yields_a_road_mask() -> None:
 
     for mask, frame in zip(masks(frames), frames, strict=True):
         assert (mask.t_ns, mask.size_px) == (frame.t_ns, frame.size_px)
-        assert rle.decode(mask.mask, mask.mask_size_px).shape == mask.mask_size_px[::-1]
+        assert rle.decode_mask(mask.mask, mask.mask_size_px).shape == mask.mask_size_px[::-1]
         fractions = road_fractions(mask, Regions())
         assert min(fractions.left, fractions.straight, fractions.right) >= 0.0
 
 
 def test_embedded_road_network_is_small_and_documented() -> None:
-    facts = load_road(embedded_path()).facts
+    facts = load_road(embedded_road()).facts
 
-    assert embedded_path().stat().st_size < 2_000_000
+    assert embedded_road().stat().st_size < 2_000_000
     assert str(facts.recipe["layouts"]).startswith("L")
     assert float(facts.recipe["held_out_iou"]) > 0.9
 

@@ -3,7 +3,7 @@
 import hashlib
 
 from crosscue.datasets.scenes.rendering.signs import WIDTH_M, sign
-from crosscue.detectors.signs.templates import KINDS, draw, drawings
+from crosscue.detectors.signs.templates import KINDS, draw_sign_template, drawings
 
 
 def test_detector_drawings_do_not_depend_on_the_opencv_version() -> None:
@@ -13,7 +13,11 @@ def test_detector_drawings_do_not_depend_on_the_opencv_version() -> None:
 
 
 def test_drawings_at_other_heights_do_not_depend_on_the_opencv_version() -> None:
-    grey = b"".join(draw(kind, height).grey.tobytes() for kind in KINDS for height in (31, 97, 256))
+    grey = b"".join(
+        draw_sign_template(kind, height).grey.tobytes()
+        for kind in KINDS
+        for height in (31, 97, 256)
+    )
 
     assert hashlib.sha256(grey).hexdigest()[:12] == "f1dc178b82bd"
 

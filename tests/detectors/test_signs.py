@@ -10,11 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.detectors.base import Detections, Frame
-from crosscue.detectors.boxes import overlaps
+from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.signs.detector import build, orb_points
 from crosscue.detectors.signs.matching import nearest, window_counts
-from crosscue.detectors.signs.templates import AMERICAN, Kind, draw
-from crosscue.detectors.training.operating_point import Judged, judge, rates_at, threshold_for
+from crosscue.detectors.signs.templates import AMERICAN, Kind, draw_sign_template
+from crosscue.detectors.training.operating_point import (
+    Verdicts,
+    match_signs,
+    rates_at,
+    threshold_at_precision,
+)
 from crosscue.eval.cli import run
 from crosscue.replay.columns import Block, Bytes, Images, Messages, Topic
 from crosscue.replay.errors import VehicleError
@@ -38,7 +43,7 @@ def test_each_american_sign_is_located_and_classified(kind: Kind) -> None:
     for seed in range(8):
         grey, box = scene(kind, seed)
         found = _signs(grey)
-        over = overlaps(box, found.boxes_px) if len(found) else np.empty(0)
+        over = box_ious(box, found.boxes_px) if len(found) else np.empty(0)
         hits += any(
             label == kind and fraction > 0.4
             for label, fraction in zip(found.labels, over, strict=True)
@@ -55,12 +60,12 @@ def test_one_way_arrows_are_not_confused(kind: Kind, other: Kind) -> None:
         grey, box = scene(kind, seed)
         found = _signs(grey)
         for label, candidate in zip(found.labels, found.boxes_px, strict=True):
-            assert not (label == other and overlaps(box, candidate[None])[0] > 0.4)
+            assert not (label == other and box_ious(box, candidate[None])[0] > 0.4)
 
 
 @pytest.mark.parametrize("height_px", [40, 150, 220, 320])
 def test_sign_is_found_at_every_height(height_px: int) -> None:
-    drawing = draw("do not enter", height_px).grey
+    drawing = draw_sign_template("do not enter", height_px).grey
     grey = clutter(7, (1280, 720))
     h, w = drawing.shape
     grey[60 : 60 + h, 300 : 300 + w] = drawing
@@ -69,7 +74,7 @@ def test_sign_is_found_at_every_height(height_px: int) -> None:
     found = _signs(np.asarray(cv2.GaussianBlur(grey, (0, 0), 0.7), np.uint8))
 
     assert "do not enter" in found.labels
-    assert overlaps(box, found.boxes_px).max() > 0.5
+    assert box_ious(box, found.boxes_px).max() > 0.5
 
 
 def test_clutter_yields_no_one_way_signs() -> None:
@@ -84,7 +89,7 @@ def test_sign_in_the_cropped_part_is_not_found() -> None:
 
     assert len(_signs(grey, crop_bottom=0.0))
     found = _signs(grey, crop_bottom=float(bottom))
-    assert all(overlaps(box, b[None])[0] < 0.4 for b in found.boxes_px)
+    assert all(box_ious(box, b[None])[0] < 0.4 for b in found.boxes_px)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (20, 20), (40, 300)])
@@ -148,20 +153,20 @@ def test_window_counts_each_template_point_once(seed: int, reach: int) -> None:
 def test_each_true_sign_matches_only_its_best_detection() -> None:
     boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10], [50, 50, 60, 60]], np.float64)
 
-    judged = judge(boxes, np.array([0.5, 0.9, 0.7]), boxes[:1], 0.4)
+    judged = match_signs(boxes, np.array([0.5, 0.9, 0.7]), boxes[:1], 0.4)
 
     assert judged.is_right.tolist() == [False, True, False]
     assert judged.signs == 1
 
 
 def test_threshold_is_the_lowest_that_meets_the_precision() -> None:
-    judged = Judged(np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, True, False, True]), 4)
+    judged = Verdicts(np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, True, False, True]), 4)
 
-    assert threshold_for(judged, 0.95) == 0.8
-    assert threshold_for(judged, 0.6) == 0.6
+    assert threshold_at_precision(judged, 0.95) == 0.8
+    assert threshold_at_precision(judged, 0.6) == 0.6
     assert rates_at(judged, 0.8).precision == 1.0
     assert rates_at(judged, 0.8).recall == 0.5
-    assert threshold_for(Judged(np.array([0.9]), np.array([False]), 1), 0.95) is None
+    assert threshold_at_precision(Verdicts(np.array([0.9]), np.array([False]), 1), 0.95) is None
 
 
 def test_fit_signs_measures_on_frames_not_used_for_the_choice(
@@ -305,7 +310,7 @@ def test_signs_below_the_min_height_are_ignored() -> None:
     truth = np.array([[0, 0, 10, 8], [50, 50, 60, 70]], np.float64)
     boxes = np.vstack([truth, [[90, 90, 99, 99]]])
 
-    judged = judge(boxes, np.array([0.9, 0.8, 0.7]), truth, 0.4, 12.0)
+    judged = match_signs(boxes, np.array([0.9, 0.8, 0.7]), truth, 0.4, 12.0)
 
     assert judged.scores.tolist() == [0.8, 0.7]
     assert judged.is_right.tolist() == [True, False]
@@ -378,4 +383,4 @@ def test_real_no_entry_sign_is_found_in_a_photo() -> None:
 
     true_sign = np.array([504, 155, 593, 243], np.float64)
     assert "do not enter" in found.labels
-    assert overlaps(true_sign, found.boxes_px).max() > 0.4
+    assert box_ious(true_sign, found.boxes_px).max() > 0.4

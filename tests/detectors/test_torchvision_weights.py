@@ -95,7 +95,7 @@ def test_boxes_and_masks_match_torchvision(
         # Torchvision's masks extend a pixel beyond their box, crosscue's do not.
         x0, y0 = np.floor(box[:2]).astype(int)
         x1, y1 = np.ceil(box[2:]).astype(int)
-        ours = rle.decode(text, (200, 120)) if text else np.zeros_like(expected)
+        ours = rle.decode_mask(text, (200, 120)) if text else np.zeros_like(expected)
         np.testing.assert_array_equal(ours[y0:y1, x0:x1], expected[y0:y1, x0:x1])
     assert any(found.masks) == ("masks" in theirs)
 
@@ -311,10 +311,10 @@ def test_torchscript_archive_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
 def test_crosscue_checkpoint_is_refused_because_it_needs_no_card(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from crosscue.detectors.networks.mask_rcnn.checkpoint import embedded_path
+    from crosscue.detectors.networks.mask_rcnn.checkpoint import embedded_mask_rcnn
 
     path = tmp_path / "own.safetensors"
-    path.write_bytes(embedded_path().read_bytes())
+    path.write_bytes(embedded_mask_rcnn().read_bytes())
 
     assert run(["model", "init", str(path)]) == 2
 

@@ -17,22 +17,22 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Facts, load_checkpoint, save_checkpoint
 from crosscue.detectors.networks.mask_rcnn.network import build_network
-from crosscue.detectors.training.annotations import LabelledSet, mask_of, read_coco
+from crosscue.detectors.training.annotations import LabelledSet, mask_of, read_training_coco
 from crosscue.detectors.training.loop import Schedule, Training
 from crosscue.detectors.training.measure import fitted, judged
-from crosscue.detectors.training.operating_point import Judged
-from crosscue.detectors.training.samples import Sampler, Window, read_picture
+from crosscue.detectors.training.operating_point import Verdicts
+from crosscue.detectors.training.samples import Sampler, SampleSettings, read_bgr
 from crosscue.detectors.training.scores import average_precisions
 from crosscue.eval.cli import run
 from crosscue.replay.errors import CrosscueError, LogError, SchemaError
 from support.mask_rcnn import CPU, plan_of, write_bars
 
-WINDOW = Window(96, 64)
+WINDOW = SampleSettings(96, 64)
 CARS = ("car",)
 
 
 def _bars(folder: Path, count: int = 4) -> LabelledSet:
-    return read_coco(write_bars(folder / "set", count), folder / "set" / "images", CARS)
+    return read_training_coco(write_bars(folder / "set", count), folder / "set" / "images", CARS)
 
 
 def _changed(folder: Path, **rows: Any) -> LabelledSet:
@@ -42,7 +42,7 @@ def _changed(folder: Path, **rows: Any) -> LabelledSet:
     for name, value in rows.items():
         tree[name] = value(tree[name]) if callable(value) else value
     path.write_text(json.dumps(tree))
-    return read_coco(path, folder / "set" / "images", CARS)
+    return read_training_coco(path, folder / "set" / "images", CARS)
 
 
 def _with(row: dict[str, Any]) -> Any:
@@ -117,7 +117,7 @@ def test_invalid_coco_file_is_refused(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
 
     with pytest.raises(SchemaError, match="expected a COCO file"):
-        read_coco(path, tmp_path, CARS)
+        read_training_coco(path, tmp_path, CARS)
 
 
 @pytest.mark.parametrize(
@@ -154,13 +154,13 @@ def test_truncated_picture_is_refused(tmp_path: Path, fraction: float) -> None:
     path.write_bytes(content[: int(fraction * len(content))])
 
     with pytest.raises(LogError, match=rf"{path.name}: .*leave it out of the annotations"):
-        read_picture(labelled.pictures[0])
+        read_bgr(labelled.pictures[0])
 
 
 def test_all_mask_encodings_decode_to_the_same_pixels(tmp_path: Path) -> None:
     mask = np.zeros((96, 128), np.bool_)
     mask[20:50, 30:90] = True
-    text = rle.encode(mask, (0, 0), (128, 96))
+    text = rle.encode_mask(mask, (0, 0), (128, 96))
     encodings = (
         [[30, 20, 90, 20, 90, 50, 30, 50]],
         {"size": [96, 128], "counts": text.decode()},
@@ -260,7 +260,7 @@ def _perfect(labelled: LabelledSet) -> list[Detections]:
     for number, picture in enumerate(labelled.pictures):
         boxes = np.array([one.box_px for one in picture.objects], np.float64).reshape(-1, 4)
         masks = tuple(
-            rle.encode(mask_of(one, picture.size_px), (0, 0), picture.size_px)
+            rle.encode_mask(mask_of(one, picture.size_px), (0, 0), picture.size_px)
             for one in picture.objects
         )
         labels = tuple(labelled.classes[one.label] for one in picture.objects)
@@ -309,14 +309,14 @@ def test_calibration_recovers_the_logistic_parameters() -> None:
     logit = np.log(scores / (1.0 - scores))
     is_right = rng.random(20_000) < 1.0 / (1.0 + np.exp(-(0.7 * logit - 1.0)))
 
-    by = fitted(Judged(scores, is_right, 1))
+    by = fitted(Verdicts(scores, is_right, 1))
 
     assert by.slope == pytest.approx(0.7, abs=0.05)
     assert by.offset == pytest.approx(-1.0, abs=0.06)
 
 
 def test_too_few_detections_leave_scores_uncalibrated() -> None:
-    rows = Judged(np.linspace(0.1, 0.9, 25), np.ones(25, np.bool_), 25)
+    rows = Verdicts(np.linspace(0.1, 0.9, 25), np.ones(25, np.bool_), 25)
 
     assert (fitted(rows).slope, fitted(rows).offset) == (1.0, 0.0)
 
@@ -495,7 +495,9 @@ def test_objects_of_other_classes_are_sampled_without_labels(tmp_path: Path) -> 
         images=lambda rows: rows[:1],
         annotations=lambda rows: [rows[0], {**rows[1], "category_id": 9}],
     )
-    sampler = Sampler(labelled, plan_of(256), Window(64, 64, zoom=(1.0, 1.0), mirror=0.0), 0)
+    sampler = Sampler(
+        labelled, plan_of(256), SampleSettings(64, 64, zoom=(1.0, 1.0), mirror=0.0), 0
+    )
 
     samples = [sampler(number) for number in range(40)]
 

@@ -14,15 +14,15 @@ from crosscue.fusion.intersection_range import (
     initialise,
     nis,
     predict,
-    smooth,
+    smooth_ranges,
     update,
 )
 from crosscue.fusion.range_track import (
     NOTHING,
     RangeTrack,
     Verdict,
-    advance,
-    measure,
+    advance_range,
+    fuse_range,
 )
 from crosscue.replay.vehicle.fusion import RangeFilter
 
@@ -125,7 +125,7 @@ def test_negative_odometry_variance_is_refused(bad: float) -> None:
 def test_contradictory_measurements_start_no_range() -> None:
     track = NOTHING
     for measured_m in (60.0, 20.0, 110.0, 45.0, 80.0):
-        track, verdict = measure(track, measured_m, 2.9, RangeFilter(), 20.0)
+        track, verdict = fuse_range(track, measured_m, 2.9, RangeFilter(), 20.0)
         assert verdict is Verdict.WAITS
 
     assert track.belief is None
@@ -134,7 +134,7 @@ def test_contradictory_measurements_start_no_range() -> None:
 def test_contradictory_implausible_measurements_never_replace_belief() -> None:
     track = RangeTrack(RangeBelief(50.0, 2.0))
     for measured_m in (100.0, 20.0, 130.0, 10.0, 90.0, 140.0, 70.0):
-        track, verdict = measure(track, measured_m, 2.9, RangeFilter(restart_after=2), 20.0)
+        track, verdict = fuse_range(track, measured_m, 2.9, RangeFilter(restart_after=2), 20.0)
         assert verdict is Verdict.REFUSED
 
     assert track.belief == RangeBelief(50.0, 2.0)
@@ -153,8 +153,8 @@ def test_filter_errors_match_variance_with_distance_correlated_noise() -> None:
             error_m = rho * error_m + math.sqrt(1.0 - rho**2) * float(rng.normal(0.0, sd_m))
             for fade in tracks:
                 filters = RangeFilter(gate_nis=None, fade_m=fade)
-                gone = advance(tracks[fade], 1.0, 0.0, filters)
-                tracks[fade], _ = measure(gone, truth_m + error_m, sd_m**2, filters, 20.0)
+                gone = advance_range(tracks[fade], 1.0, 0.0, filters)
+                tracks[fade], _ = fuse_range(gone, truth_m + error_m, sd_m**2, filters, 20.0)
         for fade, track in tracks.items():
             assert track.belief is not None
             nees[fade].append((track.belief.mean_m - truth_m) ** 2 / track.belief.var_m2)
@@ -182,7 +182,7 @@ def test_smoother_equals_least_squares_over_all_measurements() -> None:
         right.append(-way_m / np.sqrt(way_m2))
     cov = np.linalg.inv(np.array(rows).T @ np.array(rows))
 
-    found = smooth(filtered, travelled_m, way_var_m2)
+    found = smooth_ranges(filtered, travelled_m, way_var_m2)
 
     np.testing.assert_allclose(
         [one.mean_m for one in found], cov @ np.array(rows).T @ np.array(right), rtol=1e-9

@@ -10,9 +10,9 @@ from crosscue.fusion.range_track import (
     NOTHING,
     RangeTrack,
     Verdict,
-    advance,
+    advance_range,
     follow,
-    measure,
+    fuse_range,
     predict_without_odometry,
 )
 from crosscue.replay.vehicle.fusion import RangeFilter
@@ -32,24 +32,26 @@ def test_advance_subtracts_distance_and_adds_its_length_to_unseen_distance() -> 
     """In reverse, 50 + 3, 80 + 3, and |-3| + 1; both variances grow by 0.5."""
     after = RangeTrack(RangeBelief(53.0, 4.5), RangeBelief(83.0, 9.5), 2, 4.0)
 
-    assert advance(RIVALLED, -3.0, 0.5, SETTINGS) == after
-    assert advance(NOTHING, -3.0, 0.5, SETTINGS) == NOTHING
+    assert advance_range(RIVALLED, -3.0, 0.5, SETTINGS) == after
+    assert advance_range(NOTHING, -3.0, 0.5, SETTINGS) == NOTHING
 
 
 def test_belief_is_dropped_above_maximum_sd() -> None:
     """The maximum is 20 m: 399 + 1 = 20^2 is kept, 399 + 1.001 is not."""
     track = RangeTrack(RangeBelief(50.0, 399.0))
 
-    assert advance(track, 2.0, 1.0, SETTINGS) == RangeTrack(RangeBelief(48.0, 400.0), unseen_m=2.0)
-    assert advance(track, 2.0, 1.001, SETTINGS) == NOTHING
+    assert advance_range(track, 2.0, 1.0, SETTINGS) == RangeTrack(
+        RangeBelief(48.0, 400.0), unseen_m=2.0
+    )
+    assert advance_range(track, 2.0, 1.001, SETTINGS) == NOTHING
 
 
 def test_first_measurement_is_forgotten_beyond_five_metres() -> None:
     """2 + 3 = 5 m is not beyond; 2 + 3.001 m is."""
     after = RangeTrack(None, RangeBelief(57.0, 2.1), 1, 5.0)
 
-    assert advance(PENDING, 3.0, 0.1, SETTINGS) == after
-    assert advance(PENDING, 3.001, 0.1, SETTINGS) == NOTHING
+    assert advance_range(PENDING, 3.0, 0.1, SETTINGS) == after
+    assert advance_range(PENDING, 3.001, 0.1, SETTINGS) == NOTHING
 
 
 def test_unknown_distance_adds_to_sd_of_belief() -> None:
@@ -78,8 +80,10 @@ def test_measurement_counts_as_independent_fraction(
     settings = RangeFilter(fade_m=fade_m, begin_after=2)
     near = RangeBelief(20.0, 6.0)
 
-    taken, verdict = measure(RangeTrack(near, None, 3, unseen_m), 24.0, sensor_var_m2, settings, 0)
-    began, first = measure(RangeTrack(None, near, 1, unseen_m), 24.0, sensor_var_m2, settings, 0)
+    taken, verdict = fuse_range(
+        RangeTrack(near, None, 3, unseen_m), 24.0, sensor_var_m2, settings, 0
+    )
+    began, first = fuse_range(RangeTrack(None, near, 1, unseen_m), 24.0, sensor_var_m2, settings, 0)
 
     assert (verdict, first) == (Verdict.TAKEN, Verdict.BEGAN)
     for track in (taken, began):
@@ -90,7 +94,7 @@ def test_measurement_counts_as_independent_fraction(
 def test_measurement_at_same_place_changes_nothing() -> None:
     track = RangeTrack(RangeBelief(40.0, 2.9))
 
-    again, verdict = measure(track, 42.0, 2.9, SETTINGS, 20.0)
+    again, verdict = fuse_range(track, 42.0, 2.9, SETTINGS, 20.0)
 
     assert verdict is Verdict.TAKEN
     assert again.belief == pytest.approx(track.belief)
@@ -103,14 +107,14 @@ def test_gate_rejects_normalised_innovation_above_sixteen(sign: float) -> None:
     ungated = RangeFilter(gate_nis=None)
     far_m = 40.0 + sign * 8.001
 
-    assert measure(track, 40.0 + sign * 8.0, 1.0, SETTINGS, 20.0)[1] is Verdict.TAKEN
-    assert measure(track, far_m, 1.0, ungated, 20.0)[1] is Verdict.TAKEN
+    assert fuse_range(track, 40.0 + sign * 8.0, 1.0, SETTINGS, 20.0)[1] is Verdict.TAKEN
+    assert fuse_range(track, far_m, 1.0, ungated, 20.0)[1] is Verdict.TAKEN
     assert follow(track, 40.0 + sign * 8.0, 1.0, 1.0, SETTINGS)[1] is Verdict.TAKEN
     assert follow(track, far_m, 1.0, 1.0, ungated)[1] is Verdict.TAKEN
     restarted = RangeTrack(RangeBelief(far_m, 1.0))
     assert follow(track, far_m, 1.0, 1.0, SETTINGS) == (restarted, Verdict.RESTARTED)
     after = RangeTrack(track.belief, RangeBelief(far_m, 1.0), 1, 7.0)
-    assert measure(track, far_m, 1.0, SETTINGS, 20.0) == (after, Verdict.REFUSED)
+    assert fuse_range(track, far_m, 1.0, SETTINGS, 20.0) == (after, Verdict.REFUSED)
 
 
 @pytest.mark.parametrize(
@@ -139,7 +143,7 @@ def test_measurements_that_agree_with_each_other_begin_or_replace_range(
     """The measurement is 84 m with variance 2; a range begins with two and is replaced by five."""
     before = None if mean_m is None else RangeBelief(mean_m, 1.0)
     # Forty metres are many fading lengths, so a first measurement counts fully.
-    track, found = measure(RangeTrack(before, rival, seen, 40.0), 84.0, 2.0, SETTINGS, 20.0)
+    track, found = fuse_range(RangeTrack(before, rival, seen, 40.0), 84.0, 2.0, SETTINGS, 20.0)
 
     assert found is verdict
     if verdict in (Verdict.BEGAN, Verdict.RESTARTED):
@@ -153,8 +157,8 @@ def test_rival_counts_fully_at_standstill_unlike_first_measurements() -> None:
     """At the place of the last one, only a rejected measurement has its full weight."""
     rival = RangeBelief(80.0, 2.0)
 
-    track, _ = measure(RangeTrack(RangeBelief(40.0, 1.0), rival, 1), 84.0, 2.0, SETTINGS, 20.0)
-    first, _ = measure(RangeTrack(None, rival, 1), 84.0, 2.0, SETTINGS, 20.0)
+    track, _ = fuse_range(RangeTrack(RangeBelief(40.0, 1.0), rival, 1), 84.0, 2.0, SETTINGS, 20.0)
+    first, _ = fuse_range(RangeTrack(None, rival, 1), 84.0, 2.0, SETTINGS, 20.0)
 
     assert track.rival == RangeBelief(82.0, 1.0)
     assert first.belief == pytest.approx(rival)
@@ -198,7 +202,7 @@ def test_correction_within_take_up_distance_never_increases_range(correction_m: 
     for i in range(1, 120):
         way_m = (0.0, 0.3, 1.1)[i % 3]
         gone_m = sum((0.0, 0.3, 1.1)[k % 3] for k in range(1, i + 1))
-        track = advance(track, way_m, 0.0, SETTINGS)
+        track = advance_range(track, way_m, 0.0, SETTINGS)
         track, _ = follow(track, 80.0 + correction_m - gone_m, 100.0, way_m, SETTINGS)
         ranges.append(belief(track).mean_m)
 
@@ -217,7 +221,7 @@ def test_followed_range_errors_match_reported_variance(take_up_m: float) -> None
         for n in range(1, 31):
             if n > 1:
                 true_m -= 1.0
-                track = advance(track, 1.0, 0.0, settings)
+                track = advance_range(track, 1.0, 0.0, settings)
             sum_m += rng.normal(0.0, 6.0)
             track, _ = follow(track, true_m + sum_m / n, 36.0 / n, 1.0, settings)
         squares.append((belief(track).mean_m - true_m) ** 2 / belief(track).var_m2)

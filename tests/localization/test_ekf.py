@@ -19,7 +19,7 @@ from crosscue.localization.ekf import (
     coast,
     is_lost,
     major_axis_m,
-    predict,
+    predict_ekf,
     predict_odometry,
     predict_yaw_rate,
     turning,
@@ -61,7 +61,7 @@ def test_prediction_along_a_quarter_circle_matches_geometry() -> None:
     radius_m = 10.0
     start = PoseBelief(0, np.array([0.0, 0.0, 0.0, 5.0]), np.zeros((4, 4)))
     dt_s = radius_m * math.pi / 2 / 5.0
-    after = predict(start, 0.0, 2.7 / radius_m, dt_s, MotionNoise(wheelbase_m=2.7))
+    after = predict_ekf(start, 0.0, 2.7 / radius_m, dt_s, MotionNoise(wheelbase_m=2.7))
 
     np.testing.assert_allclose(after.mean, [10.0, 10.0, math.pi / 2, 5.0], atol=1e-12)
     assert after.t_ns == round(dt_s * 1e9)
@@ -201,9 +201,9 @@ def test_car_is_lost_above_a_major_axis_of_100_metres() -> None:
 def test_reversing_along_the_same_circle_returns_to_the_start() -> None:
     start = PoseBelief(0, np.array([4.0, 1.0, 2.9, 6.0]), np.zeros((4, 4)))
     noise = MotionNoise(wheelbase_m=2.7)
-    there = predict(start, 0.0, 0.3, 1.5, noise)
+    there = predict_ekf(start, 0.0, 0.3, 1.5, noise)
     turned_back = PoseBelief(there.t_ns, there.mean * [1, 1, 1, -1], there.cov)
-    back = predict(turned_back, 0.0, 0.3, 1.5, noise)
+    back = predict_ekf(turned_back, 0.0, 0.3, 1.5, noise)
 
     np.testing.assert_allclose(back.mean[:3], start.mean[:3], atol=1e-12)
 
@@ -256,7 +256,7 @@ def test_steering_and_equivalent_yaw_rate_predict_the_same_pose(
 ) -> None:
     start = belief(heading=heading, speed=speed)
     noise = MotionNoise(wheelbase_m=2.7)
-    steered = predict(start, 0.0, steering, 0.2, noise)
+    steered = predict_ekf(start, 0.0, steering, 0.2, noise)
     turned = predict_yaw_rate(start, 0.0, speed * steering / 2.7, 0.2, noise)
 
     np.testing.assert_allclose(turned.mean, steered.mean, atol=1e-12)
@@ -285,8 +285,8 @@ def test_prediction_commutes_with_rotation_of_the_map(
         mean[2] = wrap(mean[2] + turn)
         return PoseBelief(b.t_ns, mean, rotation @ b.cov @ rotation.T)
 
-    first = predict(rotated(start), 0.4, 0.2, 0.3, NOISE)
-    last = rotated(predict(start, 0.4, 0.2, 0.3, NOISE))
+    first = predict_ekf(rotated(start), 0.4, 0.2, 0.3, NOISE)
+    last = rotated(predict_ekf(start, 0.4, 0.2, 0.3, NOISE))
     np.testing.assert_allclose(first.cov, last.cov, atol=1e-9)
     np.testing.assert_allclose(wrap_all(first.mean - last.mean), 0.0, atol=1e-9)
 
@@ -324,7 +324,7 @@ def test_covariance_stays_symmetric_and_positive(seed: int, steps: int) -> None:
     rng = np.random.default_rng(seed)
     now = belief(seed=seed)
     for _ in range(steps):
-        now = predict(now, rng.normal(), rng.normal(0.0, 0.3), 0.1, NOISE)
+        now = predict_ekf(now, rng.normal(), rng.normal(0.0, 0.3), 0.1, NOISE)
         now = update_heading(now, rng.uniform(-3.0, 3.0), 1e-6).belief
         now = update_speed(now, rng.normal(5.0, 5.0), 1e-6).belief
         now = update_position(now, rng.normal(size=2), np.diag([1e-6, 1e4])).belief
@@ -372,7 +372,7 @@ def test_filter_matches_filterpy_on_the_same_inputs() -> None:
         theirs.Q = theirs.Q + 0.05**2 * distance_m * np.outer(along, along)
         theirs.predict_x = lambda _u, after=motion.mean: setattr(theirs, "x", after)
         theirs.predict()
-        ours = predict(ours, accel, steering, 0.1, NOISE)
+        ours = predict_ekf(ours, accel, steering, 0.1, NOISE)
 
         speed, heading, xy = rng.normal(8, 1), rng.uniform(-9, 9), rng.normal(0, 20, 2)
         theirs.update(np.array([speed]), observe([3]), measured([3]), R=0.1)
@@ -391,10 +391,16 @@ def test_filter_matches_filterpy_on_the_same_inputs() -> None:
 
 
 REFUSALS: list[tuple[Callable[[], object], str]] = [
-    (lambda: predict(belief(), math.nan, 0, 0.1, NOISE), "accel_mps2: expected a finite number"),
-    (lambda: predict(belief(), 0, math.inf, 0.1, NOISE), "steering_rad: expected a finite number"),
-    (lambda: predict(belief(), 0, 0, -0.1, NOISE), "dt_s: expected finite and >= 0"),
-    (lambda: predict(belief(), 0, 0, math.inf, NOISE), "dt_s: expected finite and >= 0"),
+    (
+        lambda: predict_ekf(belief(), math.nan, 0, 0.1, NOISE),
+        "accel_mps2: expected a finite number",
+    ),
+    (
+        lambda: predict_ekf(belief(), 0, math.inf, 0.1, NOISE),
+        "steering_rad: expected a finite number",
+    ),
+    (lambda: predict_ekf(belief(), 0, 0, -0.1, NOISE), "dt_s: expected finite and >= 0"),
+    (lambda: predict_ekf(belief(), 0, 0, math.inf, NOISE), "dt_s: expected finite and >= 0"),
     (lambda: predict_yaw_rate(belief(), math.nan, 0, 1, NOISE), "accel_mps2: expected a finite"),
     (lambda: predict_yaw_rate(belief(), 0, math.nan, 1, NOISE), "yaw_rate_radps: expected a fini"),
     (lambda: predict_odometry(belief(), math.nan, 0, 0, 0, 1, 0), "distance_m: expected a finite"),
@@ -452,7 +458,7 @@ def test_limits_of_arguments_are_accepted() -> None:
     """A step of no length, and a variance that rounding made negative."""
     rounded = PoseBelief(0, np.zeros(4), np.diag([-1e-9, 0.0, 0.0, 0.0]))
 
-    assert predict(rounded, 0.0, 0.0, 0.0, MotionNoise(0.5)).mean.tolist() == [0.0] * 4
+    assert predict_ekf(rounded, 0.0, 0.0, 0.0, MotionNoise(0.5)).mean.tolist() == [0.0] * 4
 
 
 @given(angle=st.floats(-1e6, 1e6))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from crosscue.localization.fit.front_wheels import front_wheels
-from crosscue.localization.odometry import OdometrySettings, WheelSpeeds, integrate
+from crosscue.localization.odometry import OdometrySettings, WheelSamples, integrate
 from support.simulated_drive import BASE_M, TRACK_M, Truth, drive, gyro, wheels
 
 FRONT = {"front_left_scale": 1.008, "front_right_scale": 0.991}
@@ -21,13 +21,13 @@ FOUR_SCALES = replace(
 )
 
 
-def four_wheels(truth: Truth, rng: np.random.Generator) -> WheelSpeeds:
+def four_wheels(truth: Truth, rng: np.random.Generator) -> WheelSamples:
     """Simulate the speeds reported by wheels with the scales of ``FOUR_SCALES``."""
     rear = wheels(truth, CAR, rng).wheels_mps
     across = BASE_M * truth.yaw_radps[:, None]
     front = np.sign(rear) * np.hypot(rear, across)
     scales = FOUR_SCALES.wheel_scales
-    return WheelSpeeds(truth.t_ns, np.hstack([front, rear]) / scales)
+    return WheelSamples(truth.t_ns, np.hstack([front, rear]) / scales)
 
 
 def test_distinct_scales_of_four_wheels_are_recovered() -> None:
@@ -64,7 +64,7 @@ def test_scaled_front_and_rear_wheels_measure_the_same_distance() -> None:
 def test_equal_front_and_rear_speeds_yield_no_front_scales() -> None:
     truth = drive(np.random.default_rng(seed=7))
     rear = wheels(truth, CAR).wheels_mps
-    car = WheelSpeeds(truth.t_ns, np.hstack([rear, rear]))
+    car = WheelSamples(truth.t_ns, np.hstack([rear, rear]))
     made = integrate(car, CAR).increments
 
     assert front_wheels(car, made, CAR, (int(truth.t_ns[0]), int(truth.t_ns[-1]))) == ()

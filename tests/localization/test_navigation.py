@@ -13,7 +13,7 @@ from crosscue.localization.navigation import (
     Memory,
     Strategy,
     bearing_after,
-    choose,
+    choose_option,
     empty_memory,
     landmark_ahead,
     option_cost,
@@ -32,7 +32,7 @@ def test_car_of_fig_13_goes_straight() -> None:
     headings = np.array([0.0, -math.pi / 2])
     bearings = np.array([bearing_after(0.0, 0.0, h, 80.0, 10.0, 10.0) for h in headings])
 
-    assert choose(headings, bearings, np.zeros(2)) == 0
+    assert choose_option(headings, bearings, np.zeros(2)) == 0
 
 
 @given(heading=_ANGLE, bearing=_ANGLE, added=_PENALTY, turn=_ANGLE)
@@ -51,12 +51,12 @@ def test_choice_is_the_first_option_of_lowest_cost(
 ) -> None:
     costs = [option_cost(*option) for option in options]
 
-    assert choose(*np.array(options).T) == costs.index(min(costs))
+    assert choose_option(*np.array(options).T) == costs.index(min(costs))
 
 
 def test_choice_without_options_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one option"):
-        choose(np.empty(0), np.empty(0), np.empty(0))
+        choose_option(np.empty(0), np.empty(0), np.empty(0))
 
 
 def _decided(memory: Memory, x: float, y: float, heading: float) -> Memory:
@@ -71,7 +71,7 @@ def test_penalty_grows_until_a_repeated_decision_changes() -> None:
         x, y = 3.0 * visit, -2.0 * visit
         place = recognise(memory, x, y, RADIUS_M)
         penalties = np.array([penalty(memory, place, h, SAME_RAD, EACH_RAD) for h in headings])
-        taken.append(choose(headings, bearings, penalties))
+        taken.append(choose_option(headings, bearings, penalties))
         memory = _decided(memory, x, y, headings[taken[-1]])
 
     assert taken[:3] == [0, 0, 0]

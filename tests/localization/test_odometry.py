@@ -19,7 +19,7 @@ from crosscue.localization.odometry import (
     OdometrySettings,
     Pending,
     TurnSignal,
-    WheelSpeeds,
+    WheelSamples,
     integrate,
 )
 from crosscue.replay.columns import Floats, Int64s
@@ -32,16 +32,16 @@ def times(n: int, period_ns: int = 20_000_000) -> Int64s:
     return np.arange(n, dtype=np.int64) * period_ns
 
 
-def both_wheels(speed_mps: float, n: int = 101) -> WheelSpeeds:
-    return WheelSpeeds(times(n), np.full((n, 2), speed_mps))
+def both_wheels(speed_mps: float, n: int = 101) -> WheelSamples:
+    return WheelSamples(times(n), np.full((n, 2), speed_mps))
 
 
-def on_circle(radius_m: float, speed_mps: float, n: int = 101) -> WheelSpeeds:
+def on_circle(radius_m: float, speed_mps: float, n: int = 101) -> WheelSamples:
     """Four wheels rolling without slip about a point to the left of the rear axle."""
     yaw = speed_mps / radius_m
     left, right = radius_m - TRACK_M / 2, radius_m + TRACK_M / 2
     front = [math.hypot(left, BASE_M) * yaw, math.hypot(right, BASE_M) * yaw]
-    return WheelSpeeds(times(n), np.tile([*front, left * yaw, right * yaw], (n, 1)))
+    return WheelSamples(times(n), np.tile([*front, left * yaw, right * yaw], (n, 1)))
 
 
 @given(speed=st.floats(-20.0, 40.0), scale=st.floats(0.9, 1.1))
@@ -86,7 +86,7 @@ def test_wheels_steering_and_gyro_agree_on_a_circle() -> None:
 
 
 def test_reversing_with_left_steering_turns_the_car_right() -> None:
-    backwards = WheelSpeeds(times(51), -on_circle(10.0, 2.0, 51).wheels_mps)
+    backwards = WheelSamples(times(51), -on_circle(10.0, 2.0, 51).wheels_mps)
     steering = TurnSignal(times(51), np.full(51, 0.2), "steering")
 
     made = integrate(backwards, CAR, steering).increments
@@ -97,8 +97,8 @@ def test_reversing_with_left_steering_turns_the_car_right() -> None:
 
 def test_reverse_flag_negates_wheel_speeds() -> None:
     forward = on_circle(10.0, 2.0, 51)
-    flagged = WheelSpeeds(forward.t_ns, forward.wheels_mps, np.ones(51, np.bool_))
-    signed = WheelSpeeds(forward.t_ns, -forward.wheels_mps)
+    flagged = WheelSamples(forward.t_ns, forward.wheels_mps, np.ones(51, np.bool_))
+    signed = WheelSamples(forward.t_ns, -forward.wheels_mps)
 
     ours, theirs = integrate(flagged, CAR).increments, integrate(signed, CAR).increments
     np.testing.assert_array_equal(ours.distance_m, theirs.distance_m)
@@ -107,7 +107,7 @@ def test_reverse_flag_negates_wheel_speeds() -> None:
 
 def test_swapped_left_and_right_wheels_negate_the_turn() -> None:
     speeds = on_circle(9.0, 3.0)
-    mirrored = WheelSpeeds(speeds.t_ns, speeds.wheels_mps[:, [1, 0, 3, 2]])
+    mirrored = WheelSamples(speeds.t_ns, speeds.wheels_mps[:, [1, 0, 3, 2]])
     car = replace(CAR, use_front_wheels=True)
 
     ours, theirs = integrate(speeds, car).increments, integrate(mirrored, car).increments
@@ -117,7 +117,7 @@ def test_swapped_left_and_right_wheels_negate_the_turn() -> None:
 
 def test_right_wheel_scale_corrects_a_larger_tyre() -> None:
     turning = np.tile([10.0, 10.0 / 1.001], (101, 1))
-    made = integrate(WheelSpeeds(times(101), turning), replace(CAR, right_wheel_scale=1.001))
+    made = integrate(WheelSamples(times(101), turning), replace(CAR, right_wheel_scale=1.001))
 
     np.testing.assert_allclose(made.increments.turn_rad, 0.0, atol=1e-15)
 
@@ -127,7 +127,7 @@ def test_gyro_is_integrated_between_wheel_rows() -> None:
     pulse = np.zeros(11)
     pulse[5] = 1.0
     rate = TurnSignal(times(11, 10_000_000), pulse, "yaw rate")
-    slow = WheelSpeeds(times(2, 100_000_000), np.zeros((2, 2)))
+    slow = WheelSamples(times(2, 100_000_000), np.zeros((2, 2)))
 
     assert integrate(slow, CAR, rate).increments.turn_rad[0] == pytest.approx(0.01)
 
@@ -149,7 +149,7 @@ def test_invalid_wheel_rows_are_dropped_and_counted() -> None:
     speeds = np.full((7, 2), 3.0)
     speeds[4, 1] = np.nan
     speeds[5, 0] = np.inf
-    made = integrate(WheelSpeeds(t_ns, speeds), CAR)
+    made = integrate(WheelSamples(t_ns, speeds), CAR)
 
     assert made.counts == OdometryCounts(
         rows=7, not_finite=2, repeated=1, out_of_order=1, intervals=2
@@ -161,7 +161,7 @@ def test_invalid_wheel_rows_are_dropped_and_counted() -> None:
 def test_invalid_turn_rows_are_dropped_and_counted() -> None:
     t_ns = np.array([0, 50, 50, 40, 60, 100], np.int64) * 1_000_000
     values = np.array([0.1, 0.1, 9.0, 9.0, np.nan, 0.1])
-    speeds = WheelSpeeds(times(6, 20_000_000), np.zeros((6, 2)))
+    speeds = WheelSamples(times(6, 20_000_000), np.zeros((6, 2)))
     made = integrate(speeds, CAR, TurnSignal(t_ns, values, "yaw rate"))
 
     assert (made.counts.turn_rows, made.counts.turn_dropped) == (6, 3)
@@ -170,7 +170,7 @@ def test_invalid_turn_rows_are_dropped_and_counted() -> None:
 
 def test_gap_is_counted_and_raises_the_distance_variance() -> None:
     t_ns = np.array([0, 100, 200, 3_200, 3_300], np.int64) * 1_000_000
-    made = integrate(WheelSpeeds(t_ns, np.full((5, 2), 10.0)), CAR)
+    made = integrate(WheelSamples(t_ns, np.full((5, 2), 10.0)), CAR)
 
     assert made.increments.is_gap.tolist() == [False, False, True, False]
     assert made.counts.gaps == 1
@@ -181,7 +181,7 @@ def test_gap_is_counted_and_raises_the_distance_variance() -> None:
 def test_gap_variance_covers_hard_braking_and_acceleration() -> None:
     """After maximum braking and acceleration, the error is within three claimed s.d."""
     t_ns = np.array([0, 4_000], np.int64) * 1_000_000
-    made = integrate(WheelSpeeds(t_ns, np.full((2, 2), 15.0)), CAR).increments
+    made = integrate(WheelSamples(t_ns, np.full((2, 2), 15.0)), CAR).increments
     true_m = 15.0 * 4.0 - 3.0 * 2.0**2
 
     assert abs(made.distance_m[0] - true_m) < 3.0 * math.sqrt(made.distance_var_m2[0])
@@ -211,8 +211,8 @@ def test_distance_variance_includes_rounding_of_wheel_speeds() -> None:
     for _ in range(300):
         true = rng.uniform(5.0, 15.0, (60, 2))
         rounded = np.round(true / 0.5) * 0.5
-        exact = integrate(WheelSpeeds(times(60), true), car).increments
-        made = integrate(WheelSpeeds(times(60), rounded), car).increments
+        exact = integrate(WheelSamples(times(60), true), car).increments
+        made = integrate(WheelSamples(times(60), rounded), car).increments
         misses.append((made.distance_m - exact.distance_m).sum())
         claims.append(made.distance_var_m2.sum())
 
@@ -224,7 +224,7 @@ def test_speed_variance_implies_the_distance_variance() -> None:
     for rate_hz in (10.0, 100.0):
         dt_s = 1.0 / rate_hz
         t_ns = times(round(rate_hz) + 1, round(dt_s * 1e9))
-        made = integrate(WheelSpeeds(t_ns, np.full((len(t_ns), 2), 9.0)), CAR).increments
+        made = integrate(WheelSamples(t_ns, np.full((len(t_ns), 2), 9.0)), CAR).increments
         assert (made.speed_var_m2ps2 * dt_s**2).sum() == pytest.approx(made.distance_var_m2.sum())
 
 
@@ -242,7 +242,7 @@ def test_noise_per_radian_does_not_depend_on_the_sampling_rate(rate_hz: int) -> 
     t_ns = times(2 * rate_hz + 1, 1_000_000_000 // rate_hz)
     turn = TurnSignal(t_ns, np.full(len(t_ns), -0.5), "yaw rate")
     car = replace(CAR, gyro_noise_rad_per_sqrt_s=0.0, turn_rad_per_sqrt_rad=0.02)
-    speeds = WheelSpeeds(t_ns, np.full((len(t_ns), 2), 5.0))
+    speeds = WheelSamples(t_ns, np.full((len(t_ns), 2), 5.0))
 
     assert integrate(speeds, car, turn).increments.turn_var_rad2.sum() == pytest.approx(0.02**2)
 
@@ -263,11 +263,11 @@ def test_turn_delay_shifts_the_turn_signal_back() -> None:
 def test_steering_noise_scales_with_the_derivative_of_the_turn(angle: float) -> None:
     def turned(by: float) -> float:
         steering = TurnSignal(times(2), np.full(2, by), "steering")
-        speeds = WheelSpeeds(times(2), np.full((2, 2), 10.0))
+        speeds = WheelSamples(times(2), np.full((2, 2), 10.0))
         return float(integrate(speeds, CAR, steering).increments.turn_rad[0])
 
     steering = TurnSignal(times(2), np.full(2, angle), "steering")
-    speeds = WheelSpeeds(times(2), np.full((2, 2), 10.0))
+    speeds = WheelSamples(times(2), np.full((2, 2), 10.0))
     made = integrate(speeds, CAR, steering).increments
     slope = (turned(angle + 1e-6) - turned(angle - 1e-6)) / 2e-6
     density = CAR.steering_noise_rad_sqrt_m / math.sqrt(made.distance_m[0])
@@ -277,7 +277,7 @@ def test_steering_noise_scales_with_the_derivative_of_the_turn(angle: float) -> 
 
 def test_wheel_gap_raises_the_turn_variance_only_without_gyro() -> None:
     t_ns = np.array([0, 4_000], np.int64) * 1_000_000
-    speeds = WheelSpeeds(t_ns, np.full((2, 2), 10.0))
+    speeds = WheelSamples(t_ns, np.full((2, 2), 10.0))
     rate = TurnSignal(times(41, 100_000_000), np.zeros(41), "yaw rate")
 
     assert integrate(speeds, CAR).increments.turn_var_rad2[0] > 1.5**2
@@ -285,8 +285,8 @@ def test_wheel_gap_raises_the_turn_variance_only_without_gyro() -> None:
 
 
 def test_empty_inputs_yield_no_increments() -> None:
-    empty = WheelSpeeds(np.empty(0, np.int64), np.empty((0, 4)))
-    one = WheelSpeeds(times(1), np.ones((1, 2)))
+    empty = WheelSamples(np.empty(0, np.int64), np.empty((0, 4)))
+    one = WheelSamples(times(1), np.ones((1, 2)))
     no_turn = TurnSignal(np.empty(0, np.int64), np.empty(0), "yaw rate")
 
     assert len(integrate(empty, CAR).increments) == 0
@@ -306,7 +306,7 @@ def test_windowed_increments_are_bit_identical(
     cuts: list[int], turn_period: int, lag: int, delay: int
 ) -> None:
     rng = np.random.default_rng(0)
-    speeds = WheelSpeeds(times(101), rng.normal(5.0, 1.0, (101, 2)))
+    speeds = WheelSamples(times(101), rng.normal(5.0, 1.0, (101, 2)))
     turn_t = times(2_000 // turn_period, turn_period * 1_000_000) + lag * 1_000_000
     turn = TurnSignal(turn_t, rng.normal(size=len(turn_t)), "yaw rate")
     car = replace(CAR, max_gap_s=0.08, turn_delay_s=delay * 1e-3)
@@ -318,7 +318,7 @@ def test_windowed_increments_are_bit_identical(
         w = slice(*np.searchsorted(speeds.t_ns, [low, high]))
         g = slice(*np.searchsorted(turn_t, [low, high]))
         made = integrate(
-            WheelSpeeds(speeds.t_ns[w], speeds.wheels_mps[w]),
+            WheelSamples(speeds.t_ns[w], speeds.wheels_mps[w]),
             car,
             TurnSignal(turn_t[g], turn.values[g], "yaw rate"),
             pending,
@@ -338,7 +338,7 @@ def test_pending_rows_do_not_accumulate() -> None:
     pending = Pending()
     for k in range(50):
         t_ns = times(100) + k * 2_000_000_000
-        window = WheelSpeeds(t_ns, np.ones((100, 2)))
+        window = WheelSamples(t_ns, np.ones((100, 2)))
         turn = TurnSignal(t_ns, np.zeros(100), "yaw rate")
         pending = integrate(window, CAR, turn, pending, int(t_ns[-1]) + 1).pending
         assert len(pending.t_ns) + len(pending.turn_t_ns) <= 2
@@ -348,9 +348,9 @@ def test_invalid_settings_and_shapes_are_refused() -> None:
     with pytest.raises(
         ValueError, match=r"wheels_mps: expected \(3, 2\) or \(3, 4\), got \(3, 3\)"
     ):
-        WheelSpeeds(times(3), np.zeros((3, 3)))
+        WheelSamples(times(3), np.zeros((3, 3)))
     with pytest.raises(ValueError, match=r"is_reverse: expected \(3,\), got \(2,\)"):
-        WheelSpeeds(times(3), np.zeros((3, 2)), np.zeros(2, np.bool_))
+        WheelSamples(times(3), np.zeros((3, 2)), np.zeros(2, np.bool_))
     with pytest.raises(ValueError, match=r"values: expected \(3,\), got \(2,\)"):
         TurnSignal(times(3), np.zeros(2), "steering")
     with pytest.raises(ValueError, match="track_width_m: expected > 0, got 0"):

@@ -26,7 +26,7 @@ from crosscue.localization.odometry import (
     OdometrySettings,
     Pending,
     TurnSignal,
-    WheelSpeeds,
+    WheelSamples,
     integrate,
 )
 from crosscue.localization.pose_track import (
@@ -37,7 +37,7 @@ from crosscue.localization.pose_track import (
     TrackCounts,
     TrackSettings,
     TrackState,
-    advance,
+    advance_pose,
     start_belief,
 )
 from crosscue.replay.columns import Floats, Int64s
@@ -74,7 +74,7 @@ def run(seed: int, settings: TrackSettings, persists_s: float = 0.0) -> tuple[Ad
     made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng))
     headings = compass(truth, 0.1, rng, persists_s=persists_s)
     first = TrackState(draw_start(truth, rng))
-    return advance(first, made.increments, settings, headings, truth.t_ns[::200]), truth
+    return advance_pose(first, made.increments, settings, headings, truth.t_ns[::200]), truth
 
 
 def test_simulated_nees_and_nis_are_in_their_bands() -> None:
@@ -141,7 +141,7 @@ def test_advance_matches_the_filter_functions_step_by_step(seed: int) -> None:
     mixed = belief.cov + 0.01 * np.outer([1.0, 2.0, 0.1, 0.5], [1.0, 2.0, 0.1, 0.5])
     belief = PoseBelief(belief.t_ns, belief.mean, mixed)
 
-    done = advance(TrackState(belief), made, EVERY_READING, headings)
+    done = advance_pose(TrackState(belief), made, EVERY_READING, headings)
     wanted = reference(belief, made, EVERY_READING, headings)
     np.testing.assert_allclose(done.state.belief.mean, wanted.mean, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(done.state.belief.cov, wanted.cov, rtol=1e-9, atol=1e-9)
@@ -186,13 +186,13 @@ def test_windowed_track_is_bit_identical(
             w, g = cut(speeds.t_ns, low, high), cut(rate_t, low, high)
             h, f = cut(heading_t, low, high), cut(frames, low, high)
             made, pending, _ = integrate(
-                WheelSpeeds(speeds.t_ns[w], speeds.wheels_mps[w]),
+                WheelSamples(speeds.t_ns[w], speeds.wheels_mps[w]),
                 ODOMETRY,
                 TurnSignal(rate_t[g], rate[g], "yaw rate"),
                 pending,
                 None if high == edges[-1] else high,
             )
-            state, poses, _, some = advance(
+            state, poses, _, some = advance_pose(
                 state,
                 made,
                 track,
@@ -220,7 +220,7 @@ def test_noise_free_track_matches_ground_truth() -> None:
     exact = OdometrySettings(track_width_m=TRACK_M)
     made = integrate(wheels(truth, exact), exact, gyro(truth, exact)).increments
     belief = start_belief(int(truth.t_ns[0]), *truth.xyh[0])
-    poses = advance(TrackState(belief), made, TrackSettings()).poses
+    poses = advance_pose(TrackState(belief), made, TrackSettings()).poses
 
     np.testing.assert_allclose(poses.x_m, truth.xyh[1:, 0], atol=1e-8)
     np.testing.assert_allclose(poses.y_m, truth.xyh[1:, 1], atol=1e-8)
@@ -234,7 +234,7 @@ def test_missing_compass_raises_the_heading_variance() -> None:
     truth = drive(rng)
     made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng)).increments
     first = TrackState(draw_start(truth, np.random.default_rng(3)))
-    without = advance(first, made, EVERY_READING, NO_HEADINGS, truth.t_ns[::200])
+    without = advance_pose(first, made, EVERY_READING, NO_HEADINGS, truth.t_ns[::200])
 
     assert len(without.poses) == len(with_compass.poses)
     assert without.poses.cov_xyh[-1, 5] > with_compass.poses.cov_xyh[-1, 5]
@@ -243,7 +243,7 @@ def test_missing_compass_raises_the_heading_variance() -> None:
 
 def straight(n: int = 11, speed: float = 10.0, first_ns: int = 0) -> Increments:
     t_ns = first_ns + np.arange(n, dtype=np.int64) * 100_000_000
-    speeds = WheelSpeeds(t_ns, np.full((n, 2), speed))
+    speeds = WheelSamples(t_ns, np.full((n, 2), speed))
     return integrate(speeds, OdometrySettings(track_width_m=TRACK_M)).increments
 
 
@@ -263,7 +263,7 @@ def test_every_heading_is_accounted_for() -> None:
     )
     belief = start_belief(210_000_000, 0.0, 0.0, 0.0, heading_sd_rad=0.1)
     settings = TrackSettings(heading_interval_m=1.2)
-    done = advance(TrackState(belief), straight(), settings, every)
+    done = advance_pose(TrackState(belief), straight(), settings, every)
 
     assert done.counts == TrackCounts(
         intervals=8,
@@ -283,7 +283,7 @@ def test_every_heading_is_accounted_for() -> None:
 @pytest.mark.parametrize("var", [np.inf, np.nan, 0.0, -1.0])
 def test_heading_with_invalid_variance_is_counted_as_bad(var: float) -> None:
     belief = start_belief(0, 0.0, 0.0, 0.0, heading_sd_rad=0.1)
-    done = advance(TrackState(belief), straight(), TrackSettings(), headings_at(0.5, var=var))
+    done = advance_pose(TrackState(belief), straight(), TrackSettings(), headings_at(0.5, var=var))
 
     assert (done.counts.headings_bad, done.counts.headings) == (1, 0)
 
@@ -291,14 +291,14 @@ def test_heading_with_invalid_variance_is_counted_as_bad(var: float) -> None:
 def test_stationary_car_accepts_one_compass_reading() -> None:
     belief = start_belief(0, 0.0, 0.0, 0.0, heading_sd_rad=0.1)
     many = headings_at(*np.arange(0.0, 1.0, 0.05))
-    done = advance(TrackState(belief), straight(speed=0.0), TrackSettings(), many)
+    done = advance_pose(TrackState(belief), straight(speed=0.0), TrackSettings(), many)
 
     assert done.counts.headings_accepted == 1
 
 
 def test_time_without_odometry_is_coasted_and_counted() -> None:
     belief = start_belief(0, 0.0, 0.0, 0.0, speed_mps=10.0, speed_sd_mps=0.5)
-    done = advance(TrackState(belief), straight(first_ns=2_000_000_000), TrackSettings())
+    done = advance_pose(TrackState(belief), straight(first_ns=2_000_000_000), TrackSettings())
 
     assert done.counts.coasts == 1
     assert done.counts.coast_ns == 2_000_000_000
@@ -310,7 +310,7 @@ def test_time_without_odometry_is_coasted_and_counted() -> None:
 def test_poses_are_reported_at_the_requested_times() -> None:
     belief = start_belief(0, 0.0, 0.0, 0.0, speed_mps=10.0)
     wanted = np.array([-5, 50_000_000, 333_000_000, 333_000_000, 9_000_000_000], np.int64)
-    done = advance(TrackState(belief), straight(), TrackSettings(), rows_ns=wanted)
+    done = advance_pose(TrackState(belief), straight(), TrackSettings(), rows_ns=wanted)
 
     assert done.poses.t_ns.tolist() == [50_000_000, 333_000_000, 333_000_000]
     np.testing.assert_allclose(done.poses.x_m, [0.5, 3.33, 3.33])

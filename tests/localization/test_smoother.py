@@ -13,16 +13,16 @@ from crosscue.localization.angles import wrap_all
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.landmarks.update import update_camera_position
-from crosscue.localization.odometry import Increments, OdometrySettings, WheelSpeeds, integrate
+from crosscue.localization.odometry import Increments, OdometrySettings, WheelSamples, integrate
 from crosscue.localization.pose_track import (
     NO_HEADINGS,
     Headings,
     TrackSettings,
     TrackState,
-    advance,
+    advance_pose,
     start_belief,
 )
-from crosscue.localization.smoother import smooth
+from crosscue.localization.smoother import smooth_poses
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import UsageError
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
@@ -40,7 +40,7 @@ def straight(n: int, slip: float) -> Increments:
     settings = OdometrySettings(
         track_width_m=TRACK_M, slip_per_sqrt_m=slip, wheel_turn_rad_per_sqrt_m=0.0, max_gap_s=2.0
     )
-    return integrate(WheelSpeeds(t_ns, np.full((n + 1, 2), 10.0)), settings).increments
+    return integrate(WheelSamples(t_ns, np.full((n + 1, 2), 10.0)), settings).increments
 
 
 def test_straight_drive_matches_the_least_squares_solution() -> None:
@@ -54,7 +54,7 @@ def test_straight_drive_matches_the_least_squares_solution() -> None:
         np.tile(fix_var * np.eye(2), (2, 1, 1)),
     )
     at = np.arange(11, dtype=np.int64) * 1_000_000_000
-    found = smooth(start, made, NO_HEADINGS, fixes, at)
+    found = smooth_poses(start, made, NO_HEADINGS, fixes, at)
 
     step_var = float(made.distance_var_m2[0])
     information = np.zeros((11, 11))
@@ -80,8 +80,8 @@ def test_smoother_without_measurements_matches_dead_reckoning() -> None:
     made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng)).increments
     x, y, heading = truth.xyh[0].tolist()
     first = start_belief(int(truth.t_ns[0]), x, y, heading, 0.0, 1.0, 0.02, 1.0)
-    track = advance(TrackState(first), made, EVERY_READING).poses
-    found = smooth(first, made, NO_HEADINGS, at_ns=track.t_ns[19::40])
+    track = advance_pose(TrackState(first), made, EVERY_READING).poses
+    found = smooth_poses(first, made, NO_HEADINGS, at_ns=track.t_ns[19::40])
 
     rows = np.searchsorted(track.t_ns, found.t_ns)
     np.testing.assert_allclose(found.xyh[:, 0], track.x_m[rows], atol=1e-5)
@@ -134,8 +134,10 @@ def test_smoother_is_consistent_and_more_accurate_than_the_filter() -> None:
         truth, first, made, headings, fixes = simulate(seed)
         at = truth.t_ns[20::20]
         measurements = FixMeasurements(fixes)
-        track = advance(TrackState(first), made, EVERY_READING, headings, at, measurements).poses
-        found = smooth(first, made, headings, fixes, at)
+        track = advance_pose(
+            TrackState(first), made, EVERY_READING, headings, at, measurements
+        ).poses
+        found = smooth_poses(first, made, headings, fixes, at)
         error = errors(truth, found.t_ns, found.xyh)
         nees.append(float(error[15] @ np.linalg.solve(found.cov[15], error[15])))
         smoother_m2.append(np.mean(np.sum(error[:, :2] ** 2, axis=1)))
@@ -159,11 +161,11 @@ def test_smoother_matches_the_filter_at_the_end_of_a_long_drive() -> None:
     )
     t_ns = np.arange(n + 1, dtype=np.int64) * 1_000_000_000
     speeds = 2.0 + np.outer(rng.normal(0.0, 3e-3 * math.sqrt(2.0), n + 1), [-0.5, 0.5]) * TRACK_M
-    made = integrate(WheelSpeeds(t_ns, speeds), settings).increments
+    made = integrate(WheelSamples(t_ns, speeds), settings).increments
     first = start_belief(0, 0.0, 0.0, 0.0, 2.0, 1.0, 0.09, 1.0)
     headings = Headings(t_ns[1:], rng.normal(0.0, 0.2, n), np.full(n, 0.04))
-    end = advance(TrackState(first), made, EVERY_READING, headings).poses
-    found = smooth(first, made, headings, at_ns=t_ns[[-1]])
+    end = advance_pose(TrackState(first), made, EVERY_READING, headings).poses
+    found = smooth_poses(first, made, headings, at_ns=t_ns[[-1]])
 
     sd_m = math.sqrt(found.cov[0, 1, 1])
     assert 20.0 < sd_m < 60.0
@@ -177,7 +179,7 @@ def test_fix_is_applied_at_the_camera_position() -> None:
     made = straight(4, 0.5)
     start = start_belief(0, 0.0, 0.0, 0.0, 10.0, 10.0, 1e-4, 1.0)
     fix = Fixes(np.array([2_000_000_000]), np.array([[25.0, 1.0]]), 1e-4 * np.eye(2)[None])
-    found = smooth(start, made, NO_HEADINGS, fix, np.array([2_000_000_000]), (2.0, 0.5))
+    found = smooth_poses(start, made, NO_HEADINGS, fix, np.array([2_000_000_000]), (2.0, 0.5))
 
     np.testing.assert_allclose(found.xyh[0, :2], [23.0, 0.5], atol=0.01)
 
@@ -187,9 +189,9 @@ def test_gaps_and_inconsistent_shapes_are_refused() -> None:
     late = start_belief(9_000_000_000, 0.0, 0.0, 0.0)
     early = start_belief(-1, 0.0, 0.0, 0.0)
     with pytest.raises(ValueError, match="expected odometry after 9000000000 ns"):
-        smooth(late, made, NO_HEADINGS)
+        smooth_poses(late, made, NO_HEADINGS)
     with pytest.raises(ValueError, match="expected no gaps, got one at -1 ns"):
-        smooth(early, made, NO_HEADINGS)
+        smooth_poses(early, made, NO_HEADINGS)
     with pytest.raises(ValueError, match=r"expected xy_m \(1, 2\)"):
         Fixes(np.zeros(1, np.int64), np.zeros((2, 2)), np.zeros((1, 2, 2)))
 
@@ -199,4 +201,4 @@ def test_missing_gtsam_is_reported_with_its_install_command(
 ) -> None:
     monkeypatch.setitem(sys.modules, "gtsam", None)
     with pytest.raises(UsageError, match=r"pip install 'crosscue\[gtsam\]'"):
-        smooth(start_belief(0, 0.0, 0.0, 0.0), straight(2, 0.1), NO_HEADINGS)
+        smooth_poses(start_belief(0, 0.0, 0.0, 0.0), straight(2, 0.1), NO_HEADINGS)

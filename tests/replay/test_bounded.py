@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from crosscue.datasets.truth import truth
 from crosscue.detectors.catalog.card import read_card
-from crosscue.eval.fit.ranges.pairs import pairs_of_table
+from crosscue.eval.fit.ranges.pairs import range_pairs
 from crosscue.eval.scoring.gates import load_gates
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.files.bounded import read_at_most
@@ -31,7 +31,9 @@ def test_file_over_limit_is_not_read(content: bytes, max_count: int) -> None:
 
 
 @pytest.mark.skipif(not ENDLESS.exists(), reason="no /dev/zero here")
-@pytest.mark.parametrize("read", [vehicle.load, read_card, load_gates, truth.load, pairs_of_table])
+@pytest.mark.parametrize(
+    "read", [vehicle.load, read_card, load_gates, truth.read_truth, range_pairs]
+)
 def test_endless_file_is_refused(read: Callable[[Path], object]) -> None:
     with pytest.raises(CrosscueError, match=r"/dev/zero: over \d+ MiB"):
         read(ENDLESS)

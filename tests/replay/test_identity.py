@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from crosscue.replay.errors import LogError
-from crosscue.replay.files.identity import SHARE_BYTES, identity_of, identity_of_all
+from crosscue.replay.files.identity import SHARE_BYTES, identity_of_all, log_identity
 
 LARGE: int = 3 * SHARE_BYTES
 # Position between the last sample and the tail, where only an index is hashed.
@@ -28,17 +28,17 @@ def test_identity_depends_on_name_but_not_folder_or_age(tmp_path: Path) -> None:
     second = _log(tmp_path / "b" / "drive.mcap")
     os.utime(second, (0, 0))
 
-    assert identity_of(first) == identity_of(second) == identity_of(str(first))
-    assert identity_of(first).digest != identity_of(_log(tmp_path / "other.mcap")).digest
+    assert log_identity(first) == log_identity(second) == log_identity(str(first))
+    assert log_identity(first).digest != log_identity(_log(tmp_path / "other.mcap")).digest
 
 
 @pytest.mark.parametrize("at", [0, 1, SHARE_BYTES // 3, SHARE_BYTES // 2 + 7, SHARE_BYTES - 1])
 def test_any_byte_of_a_small_log_changes_identity(tmp_path: Path, at: int) -> None:
     content = bytearray(SHARE_BYTES)
-    before = identity_of(_log(tmp_path / "a.mcap", content))
+    before = log_identity(_log(tmp_path / "a.mcap", content))
     content[at] ^= 1
 
-    assert identity_of(_log(tmp_path / "a.mcap", content)).digest != before.digest
+    assert log_identity(_log(tmp_path / "a.mcap", content)).digest != before.digest
 
 
 @pytest.mark.parametrize(
@@ -46,11 +46,11 @@ def test_any_byte_of_a_small_log_changes_identity(tmp_path: Path, at: int) -> No
 )
 def test_head_tail_and_samples_of_large_log_change_identity(tmp_path: Path, at: int) -> None:
     content = bytearray(LARGE)
-    before = identity_of(_log(tmp_path / "a.mcap", content))
+    before = log_identity(_log(tmp_path / "a.mcap", content))
     content[at] ^= 1
 
-    assert identity_of(_log(tmp_path / "a.mcap", content)).digest != before.digest
-    assert identity_of(_log(tmp_path / "a.mcap", content + b"x")).digest != before.digest
+    assert log_identity(_log(tmp_path / "a.mcap", content)).digest != before.digest
+    assert log_identity(_log(tmp_path / "a.mcap", content + b"x")).digest != before.digest
 
 
 def _with_index(kind: str, start: int) -> bytearray:
@@ -70,18 +70,18 @@ def _with_index(kind: str, start: int) -> bytearray:
 def test_any_index_byte_of_large_log_changes_identity(tmp_path: Path, kind: str) -> None:
     for start, counts in ((BEFORE_TAIL - 10, True), (BEFORE_TAIL + 1, False)):
         content = _with_index(kind, start)
-        before = identity_of(_log(tmp_path / f"a.{kind}", content))
+        before = log_identity(_log(tmp_path / f"a.{kind}", content))
         content[BEFORE_TAIL] ^= 1
-        assert (identity_of(_log(tmp_path / f"a.{kind}", content)) != before) is counts
+        assert (log_identity(_log(tmp_path / f"a.{kind}", content)) != before) is counts
 
 
 @pytest.mark.parametrize("start", [0, 1 << 63, LARGE * 2])
 def test_identity_ignores_invalid_index_position(tmp_path: Path, start: int) -> None:
     for kind in ("mcap", "bag"):
         content = _with_index(kind, start)
-        before = identity_of(_log(tmp_path / f"a.{kind}", content))
+        before = log_identity(_log(tmp_path / f"a.{kind}", content))
         content[BEFORE_TAIL] ^= 1
-        assert identity_of(_log(tmp_path / f"a.{kind}", content)) == before
+        assert log_identity(_log(tmp_path / f"a.{kind}", content)) == before
 
 
 def test_folder_identity_covers_all_files_except_our_own(tmp_path: Path) -> None:
@@ -89,12 +89,12 @@ def test_folder_identity_covers_all_files_except_our_own(tmp_path: Path) -> None
     for i in range(5):
         _log(folder / f"{i}.png", bytes([i]))
     _log(folder / "deep" / "x.png")
-    before = identity_of(folder)
+    before = log_identity(folder)
 
     for name in ("truth.json", "vehicle.toml", ".DS_Store", "x.seal"):
         _log(folder / name)
-    assert identity_of(folder) == before
-    assert identity_of(shutil.copytree(folder, tmp_path / "b" / "images")) == before
+    assert log_identity(folder) == before
+    assert log_identity(shutil.copytree(folder, tmp_path / "b" / "images")) == before
 
     changed = []
     for change in (
@@ -104,7 +104,7 @@ def test_folder_identity_covers_all_files_except_our_own(tmp_path: Path) -> None
         lambda: _log(folder.with_name("images.csv"), b"0.1"),
     ):
         change()
-        changed.append(identity_of(folder).digest)
+        changed.append(log_identity(folder).digest)
     assert len({before.digest, *changed}) == 5
 
 
@@ -116,13 +116,13 @@ def test_companion_files_change_identity(tmp_path: Path) -> None:
         ("v.mp4", "v.txt"),
     ):
         path = _log(tmp_path / log)
-        before = identity_of(path)
+        before = log_identity(path)
         _log(tmp_path / companion, b"more")
-        assert identity_of(path) != before
+        assert log_identity(path) != before
 
 
 def test_drive_identity_is_independent_of_log_order(tmp_path: Path) -> None:
-    logs = [identity_of(_log(tmp_path / name, name.encode())) for name in ("a.mcap", "b.blf")]
+    logs = [log_identity(_log(tmp_path / name, name.encode())) for name in ("a.mcap", "b.blf")]
 
     assert identity_of_all(logs) == identity_of_all(logs[::-1])
     assert identity_of_all(logs[:1]) == logs[0]
@@ -135,10 +135,10 @@ def test_identity_of_100_gib_log_is_fast(tmp_path: Path) -> None:
         file.truncate(100 << 30)
     began = time.process_time()
 
-    assert identity_of(path).size == 100 << 30
+    assert log_identity(path).size == 100 << 30
     assert time.process_time() - began < 5.0
 
 
 def test_identity_of_missing_log_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="gone"):
-        identity_of(tmp_path / "gone.mcap")
+        log_identity(tmp_path / "gone.mcap")

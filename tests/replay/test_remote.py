@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from crosscue.replay.errors import LogError, LogTooLargeError, OutputError, UsageError
-from crosscue.replay.files.identity import SHARE_BYTES, identity_of
+from crosscue.replay.files.identity import SHARE_BYTES, log_identity
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.remote.address import is_remote
-from crosscue.replay.remote.logs import Store, fetch, matches
+from crosscue.replay.remote.logs import Store, fetch_log, matches
 from support.can_files import candump, random_frames
 from support.can_files import read_back as read_file
 
@@ -63,13 +63,13 @@ def test_log_is_fetched_once_until_it_changes(bucket: str, monkeypatch: pytest.M
     monkeypatch.setattr(remote, "_download", counted)
     url = _put(f"{bucket}/a.log", b"one")
     for _ in range(2):
-        with fetch(url) as fetched:
+        with fetch_log(url) as fetched:
             assert fetched.path.read_bytes() == b"one"
     assert len(fetches) == 1
 
     _put(url, b"two")
 
-    with fetch(url) as fetched:
+    with fetch_log(url) as fetched:
         assert fetched.path.read_bytes() == b"two"
     assert len(fetches) == 2
 
@@ -78,7 +78,7 @@ def test_folder_and_companion_files_are_fetched(bucket: str) -> None:
     for name in ("bag/metadata.yaml", "bag/part/a.db3", "v.mp4", "v.csv", "v.mp4.txt", "vv.csv"):
         _put(f"{bucket}/{name}", name.encode())
 
-    with fetch(f"{bucket}/bag/") as folder, fetch(f"{bucket}/v.mp4") as video:
+    with fetch_log(f"{bucket}/bag/") as folder, fetch_log(f"{bucket}/v.mp4") as video:
         assert folder.path.name == "bag"
         assert (folder.path / "part" / "a.db3").read_bytes() == b"bag/part/a.db3"
         assert sorted(p.name for p in video.path.parent.iterdir()) == [
@@ -105,12 +105,12 @@ def test_identity_of_several_remote_files_needs_no_download(
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(content)
         _put(f"{bucket}/drive/{name}", content)
-    here = identity_of(tmp_path / log)
+    here = log_identity(tmp_path / log)
 
-    with fetch(f"{bucket}/drive/{log}") as fetched:
-        assert identity_of(fetched.path) == here
+    with fetch_log(f"{bucket}/drive/{log}") as fetched:
+        assert log_identity(fetched.path) == here
     monkeypatch.setenv(remote.STORE_VARIABLE, str(tmp_path / "empty"))
-    assert identity_of(f"{bucket}/drive/{log}") == here
+    assert log_identity(f"{bucket}/drive/{log}") == here
     assert not list((tmp_path / "empty").glob("*/log"))
 
 
@@ -118,17 +118,17 @@ def test_store_evicts_least_recently_used_log_not_in_use(bucket: str, tmp_path: 
     store = Store(tmp_path / "small", max_bytes=250)
     urls = [_put(f"{bucket}/{name}.log", name.encode() * 100) for name in "abcd"]
 
-    with fetch(urls[0], store) as in_use:
-        fetch(urls[1], store).close()
-        fetch(urls[2], store).close()
+    with fetch_log(urls[0], store) as in_use:
+        fetch_log(urls[1], store).close()
+        fetch_log(urls[2], store).close()
         assert in_use.path.exists()
-        with fetch(urls[3], store), pytest.raises(OutputError, match="full of logs in use"):
-            fetch(urls[1], store)
+        with fetch_log(urls[3], store), pytest.raises(OutputError, match="full of logs in use"):
+            fetch_log(urls[1], store)
 
     kept = {path.name for path in store.folder.rglob("*.log")}
     assert kept == {"a.log", "d.log"}
     with pytest.raises(LogTooLargeError, match=r"the store may hold.*CROSSCUE_STORE_GIB"):
-        fetch(_put(f"{bucket}/large.log", bytes(300)), store)
+        fetch_log(_put(f"{bucket}/large.log", bytes(300)), store)
 
 
 def test_failed_fetch_leaves_no_file(
@@ -139,7 +139,7 @@ def test_failed_fetch_leaves_no_file(
     monkeypatch.setattr(remote, "_objects", lambda *_: [short])
 
     with pytest.raises(LogError, match=r"a\.log is not as long as its store reports"):
-        fetch(url)
+        fetch_log(url)
 
     assert not list((tmp_path / "store").rglob("a.log"))
 
@@ -157,7 +157,7 @@ def test_log_that_changes_during_fetch_is_refused(
     monkeypatch.setattr(remote, "_chunks", grow_after_reading)
 
     with pytest.raises(LogError, match="changed while it was fetched"):
-        fetch(url)
+        fetch_log(url)
 
 
 @pytest.mark.slow

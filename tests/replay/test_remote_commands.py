@@ -16,7 +16,7 @@ from mcap.writer import Writer
 from crosscue.eval.cli import run as crosscue
 from crosscue.replay.base import Selection
 from crosscue.replay.columns import Block, Images, Messages, Topic
-from crosscue.replay.files.identity import SHARE_BYTES, identity_of
+from crosscue.replay.files.identity import SHARE_BYTES, log_identity
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
@@ -193,15 +193,15 @@ def test_remote_identity_equals_local_identity(
         path.write_bytes(candump(random_frames(300)))
     web.files[f"deep/{path.name}"] = path.read_bytes()
 
-    there = identity_of(f"{web.base}/deep/{path.name}")
+    there = log_identity(f"{web.base}/deep/{path.name}")
     sent = web.sent
 
-    assert there == identity_of(path)
+    assert there == log_identity(path)
     if kind != "log":
         assert path.stat().st_size > 4 << 20
         assert sent < 128 * 1024 + 0.1 * path.stat().st_size
     web.files[f"deep/{path.name}"] += b"x"
-    assert identity_of(f"{web.base}/deep/{path.name}") != there
+    assert log_identity(f"{web.base}/deep/{path.name}") != there
 
 
 @pytest.mark.parametrize("name", ["can.log", "can.blf", "can.MF4", "drive.db3", "front.mp4"])
@@ -212,7 +212,7 @@ def test_identity_of_large_remote_log_transfers_a_fraction(
     path.write_bytes(np.random.default_rng(3).bytes(3 * SHARE_BYTES))
     web.files[f"deep/{name}"] = path.read_bytes()
 
-    assert identity_of(f"{web.base}/deep/{name}") == identity_of(path)
+    assert log_identity(f"{web.base}/deep/{name}") == log_identity(path)
     assert web.sent <= 1.02 * SHARE_BYTES
     assert not list((tmp_path / "store").glob("*/log"))
 
@@ -270,7 +270,7 @@ def test_run_of_remote_log_can_be_resumed(
 
     assert crosscue([*call, "--no-cache", "--resume"]) == 0
     logs = json.loads((tmp_path / "out" / "manifest.json").read_text())["logs"]
-    assert logs[0]["identity"]["digest"] == identity_of(drive).digest
+    assert logs[0]["identity"]["digest"] == log_identity(drive).digest
     assert web.sent < 0.5 * drive.stat().st_size
 
     web.files["drive.mcap"] = drive.read_bytes()[:-9] + b"x" + drive.read_bytes()[-8:]

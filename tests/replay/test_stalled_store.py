@@ -11,12 +11,12 @@ import pytest
 
 from crosscue.eval.cli import run as crosscue
 from crosscue.replay.errors import LogError, UnknownFormatError
-from crosscue.replay.files.identity import identity_of
+from crosscue.replay.files.identity import log_identity
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.remote import ranges as remote_ranges
 from crosscue.replay.remote import waiting
-from crosscue.replay.remote.logs import fetch
+from crosscue.replay.remote.logs import fetch_log
 from support.can_files import candump, random_frames
 from support.every_format import EVERY_FORMAT
 from support.range_server import Served, serving
@@ -47,16 +47,16 @@ def test_presigned_log_is_read_like_a_local_one(
 
 def test_new_signature_of_the_same_log_does_not_fetch_it_again(web: Served) -> None:
     web.files["a.log"] = candump(random_frames(50))
-    with fetch(f"{web.base}/a.log{SIGNED}") as first:
+    with fetch_log(f"{web.base}/a.log{SIGNED}") as first:
         sent = web.sent
-        with fetch(f"{web.base}/a.log?X-Amz-Signature=other") as second:
+        with fetch_log(f"{web.base}/a.log?X-Amz-Signature=other") as second:
             assert second.path == first.path
 
     assert web.sent == sent > 0
 
 
 @pytest.mark.parametrize("name", ["a.xyz", "download", "bag/", "a.log.gz", "a"])
-@pytest.mark.parametrize("use", [open_log, fetch, identity_of])
+@pytest.mark.parametrize("use", [open_log, fetch_log, log_identity])
 def test_unknown_suffix_sends_no_request(name: str, use: object, web: Served) -> None:
     web.files[name] = b"content"
     assert callable(use)

@@ -11,21 +11,21 @@ from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.extractor import SampleExtractor
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.signals.plan import plan
-from crosscue.replay.signals.windows import HORIZON_NS, Window, windows
+from crosscue.replay.signals.windows import HORIZON_NS, SampleWindow, windows
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
 
 SECOND = 1_000_000_000
 
 
-def _windows(logs: list[MemoryLog], ledgers: list[Ledger] | None = None) -> list[Window]:
+def _windows(logs: list[MemoryLog], ledgers: list[Ledger] | None = None) -> list[SampleWindow]:
     vehicle = Vehicle(version=1)
     planned = plan([(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle)
     ledgers = ledgers or [Ledger(str(i)) for i in range(len(logs))]
-    extractors = [Extractor(planned, vehicle, i, ledger) for i, ledger in enumerate(ledgers)]
+    extractors = [SampleExtractor(planned, vehicle, i, ledger) for i, ledger in enumerate(ledgers)]
     return list(windows(logs, extractors, [EVERYTHING] * len(logs), planned))
 
 
@@ -76,7 +76,7 @@ def test_silent_sensor_does_not_delay_other_sensors() -> None:
     vehicle = Vehicle(version=1)
     planned = plan([(0, WHEELS), (0, GYRO)], vehicle)
     first = next(
-        windows([log], [Extractor(planned, vehicle, 0, Ledger(""))], [EVERYTHING], planned)
+        windows([log], [SampleExtractor(planned, vehicle, 0, Ledger(""))], [EVERYTHING], planned)
     )
 
     assert first.start_ns == 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from crosscue.datasets.truth.truth import Approach, Features, Truth, save
-from crosscue.eval.pipeline.scene.stage import schemas
+from crosscue.eval.pipeline.scene.stage import scene_schemas
 from crosscue.eval.runs.folder import RunFolder, create, write_manifest
 from crosscue.eval.runs.tables import measurements
 from crosscue.eval.runs.tables.parquet import TableSink
@@ -53,9 +53,9 @@ def write_run(
     taken = list(evidence)
     steps = [loop(one) for one in taken]
     _write_steps(run, steps)
-    with TableSink(run, measurements.TABLE, measurements.schema()) as sink:
+    with TableSink(run, measurements.TABLE, measurements.measurement_schema()) as sink:
         empty: dict[str, list[object]] = {
-            field.name: [None] * len(taken) for field in measurements.schema()
+            field.name: [None] * len(taken) for field in measurements.measurement_schema()
         }
         sink.write(
             empty
@@ -85,7 +85,7 @@ def _write_steps(run: RunFolder, steps: list[Step]) -> None:
         if s.approach is not None
     ]
     for name, rows in (("cues", cues), ("range", ranges), ("belief", beliefs)):
-        schema = schemas()[name]
+        schema = scene_schemas()[name]
         with TableSink(run, name, schema) as sink:
             if rows:
                 sink.write(dict(zip(schema.names, zip(*rows, strict=True), strict=True)))

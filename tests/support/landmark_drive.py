@@ -9,17 +9,21 @@ from pathlib import Path
 import numpy as np
 
 from crosscue.localization.ekf import PoseBelief
-from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
-from crosscue.localization.landmarks.features import Features, Match
+from crosscue.localization.landmarks.database import (
+    LandmarkDatabase,
+    LandmarkPosition,
+    LandmarkWriter,
+)
+from crosscue.localization.landmarks.features import Keypoints, Match
 from crosscue.localization.landmarks.update import LandmarkSearch, LandmarkSettings
 from crosscue.replay.columns import Bytes, Floats
 from support.simulated_drive import Truth
 
 
-def features_at(xy_m: Floats) -> Features:
+def features_at(xy_m: Floats) -> Keypoints:
     """Features of the picture at a position, which encode the position itself."""
     where = np.ascontiguousarray(xy_m, np.float64).view(np.uint8).reshape(1, 16)
-    return Features(640, 480, np.zeros((1, 2), np.float32), where)
+    return Keypoints(640, 480, np.zeros((1, 2), np.float32), where)
 
 
 class NearnessMatcher:
@@ -31,11 +35,11 @@ class NearnessMatcher:
         self.range_m = range_m
         self.compared = 0
 
-    def describe(self, grey: Bytes, /) -> Features:
+    def describe(self, grey: Bytes, /) -> Keypoints:
         """Fail, because pictures are positions here."""
         raise AssertionError("pictures are places in this simulation")
 
-    def match(self, seen: Features, known: Features, /) -> Match:
+    def match(self, seen: Keypoints, known: Keypoints, /) -> Match:
         """Score two pictures by their distance."""
         self.compared += 1
         here, other = (f.descriptors.reshape(-1).view(np.float64) for f in (seen, known))
@@ -66,7 +70,10 @@ def landmarks_along(
         for i, row in enumerate(at):
             xy = camera_m[row]
             off = rng.multivariate_normal([0.0, 0.0], cov_m2)
-            writer.add(Place(str(i), xy + off, cov_m2, float(truth.xyh[row, 2])), features_at(xy))
+            writer.add(
+                LandmarkPosition(str(i), xy + off, cov_m2, float(truth.xyh[row, 2])),
+                features_at(xy),
+            )
     return path
 
 

@@ -7,21 +7,25 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from crosscue.localization.landmarks.database import LandmarkWriter, Place
-from crosscue.localization.landmarks.features import CameraGeometry, Features, Match
+from crosscue.localization.landmarks.database import LandmarkPosition, LandmarkWriter
+from crosscue.localization.landmarks.features import CameraGeometry, Keypoints, Match
 from crosscue.replay.columns import Bytes, Floats
 
 
-def some_features(seed: int, count: int = 20) -> Features:
+def some_features(seed: int, count: int = 20) -> Keypoints:
     """Random descriptors of the size of ORB's."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(0.0, 640.0, (count, 2)).astype(np.float32)
-    return Features(640, 480, points, rng.integers(0, 256, (count, 32), dtype=np.uint8))
+    return Keypoints(640, 480, points, rng.integers(0, 256, (count, 32), dtype=np.uint8))
 
 
-def place_at(x_m: float, y_m: float, name: str | None = None, sd_m: float = 2.0) -> Place:
+def place_at(
+    x_m: float, y_m: float, name: str | None = None, sd_m: float = 2.0
+) -> LandmarkPosition:
     """A landmark with an isotropic covariance."""
-    return Place(name or f"at {x_m} {y_m}", np.array([x_m, y_m]), sd_m**2 * np.eye(2), 0.5, "made")
+    return LandmarkPosition(
+        name or f"at {x_m} {y_m}", np.array([x_m, y_m]), sd_m**2 * np.eye(2), 0.5, "made"
+    )
 
 
 def database_of(path: Path, xy_m: Floats, sd_m: float = 2.0, kind: str = "orb") -> Path:
@@ -67,13 +71,13 @@ class ShadeMatcher:
 
     kind = "shade"
 
-    def describe(self, grey: Bytes, /) -> Features:
+    def describe(self, grey: Bytes, /) -> Keypoints:
         """Return the mean brightness as 25 equal descriptors."""
         height, width = grey.shape
         shade = np.full((25, 1), round(float(grey.mean())), np.uint8)
-        return Features(width, height, np.zeros((25, 2), np.float32), shade)
+        return Keypoints(width, height, np.zeros((25, 2), np.float32), shade)
 
-    def match(self, seen: Features, known: Features, /) -> Match:
+    def match(self, seen: Keypoints, known: Keypoints, /) -> Match:
         """Return 100 minus the difference in brightness."""
         difference = abs(float(seen.descriptors[0, 0]) - float(known.descriptors[0, 0]))
         return Match(100.0 - difference, 25, 25)

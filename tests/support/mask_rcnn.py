@@ -13,16 +13,16 @@ import torch
 
 from crosscue.detectors.base import Frame
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Checkpoint, Facts
-from crosscue.detectors.networks.mask_rcnn.network import Plan, build_network
+from crosscue.detectors.networks.mask_rcnn.network import NetworkPlan, build_network
 from crosscue.replay.columns import Bytes
 
 CLASSES: Final = ("car", "stop sign", "traffic light")
 CPU: Final = torch.device("cpu")
 
 
-def plan_of(width_px: int = 128, **changes: Any) -> Plan:
+def plan_of(width_px: int = 128, **changes: Any) -> NetworkPlan:
     plan = {"architecture": "compact", "classes": CLASSES, "width_px": width_px}
-    return Plan.model_validate({**plan, **changes})
+    return NetworkPlan.model_validate({**plan, **changes})
 
 
 @cache

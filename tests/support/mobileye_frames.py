@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table
-from crosscue.replay.mobileye.bits import Words, payloads_of, place
-from crosscue.replay.mobileye.layout import Field, Message, layout
+from crosscue.replay.mobileye.bits import Words, payloads_of, place_bits
+from crosscue.replay.mobileye.layout import BitField, Message, layout
 
 MS = 1_000_000
 
@@ -85,11 +85,11 @@ def random_words(message: Message, n: int, rng: np.random.Generator, variant: st
         raw = raws[f.name]
         if f.needs:
             raw = np.where(raws[f.needs] == 0, f.default, raw)
-        words |= place(raw, f.start, f.width, f.order == "big")
+        words |= place_bits(raw, f.start, f.width, f.order == "big")
     return words
 
 
-def _random_present(f: Field, n: int, rng: np.random.Generator) -> Int64s:
+def _random_present(f: BitField, n: int, rng: np.random.Generator) -> Int64s:
     lowest, highest = f.raw_range
     raw = rng.integers(lowest, highest + 1, n)
     ends = rng.integers(0, 8, n)
@@ -97,7 +97,7 @@ def _random_present(f: Field, n: int, rng: np.random.Generator) -> Int64s:
     return np.where(np.isin(raw, f.missing), f.default, raw)
 
 
-def _random_raw(f: Field, n: int, rng: np.random.Generator) -> Int64s:
+def _random_raw(f: BitField, n: int, rng: np.random.Generator) -> Int64s:
     raw = _random_present(f, n, rng)
     if not f.missing:
         return raw

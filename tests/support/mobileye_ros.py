@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from crosscue.replay.columns import Block, CanFrames, Floats, Int64s, Table, Topic
-from crosscue.replay.mobileye.bits import extract, words_of
-from crosscue.replay.mobileye.layout import Field, Message, layout
+from crosscue.replay.mobileye.bits import extract, leading_words
+from crosscue.replay.mobileye.layout import BitField, Message, layout
 from crosscue.replay.mobileye.wire import from_raw
 from support.ros_messages import messages_of as messages_of_bytes
 
@@ -76,7 +76,7 @@ def messages_of(block: Block, only: str = "") -> list[Block]:
         for name in names:
             message = layout()[name]
             rows = frames.arbitration_id == message.ids[instance]
-            columns |= _fields(message, words_of(frames.data[rows]))
+            columns |= _fields(message, leading_words(frames.data[rows]))
             log_ns = log_ns if len(log_ns) else block.log_ns[rows]
         if len(log_ns) and only in ("", topic):
             made.setdefault(f"/parsed_tx/{topic}", []).append(_block(topic, log_ns, columns))
@@ -94,7 +94,7 @@ def _fields(message: Message, words: NDArray[np.uint64]) -> dict[str, NDArray[np
     return columns
 
 
-def _as_sent(f: Field, raw: Int64s) -> NDArray[np.generic]:
+def _as_sent(f: BitField, raw: Int64s) -> NDArray[np.generic]:
     value: Floats = from_raw(replace(f, missing=()), raw)
     if f.kind == "flag":
         return value > 0

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from crosscue.detectors import rle
-from crosscue.eval.pipeline.detect import schemas
+from crosscue.eval.pipeline.detect import detect_schemas
 from crosscue.eval.runs.account import account, line
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import ClockRow
@@ -59,7 +59,7 @@ def detections(frames: int = FRAMES) -> pa.Table:
     rows: list[dict[str, Any]] = []
     for frame in range(frames):
         x = 20.0 + frame
-        mask = rle.encode(np.ones((12, 40), np.bool_), (int(x), 40), SIZE)
+        mask = rle.encode_mask(np.ones((12, 40), np.bool_), (int(x), 40), SIZE)
         for label, score, box, runs in (
             ("car", 0.97, (x, 40.0, x + 40.0, 52.0), mask),
             (LABEL, 0.5, (5.0, 5.0, 15.0, 15.0), None),
@@ -83,12 +83,12 @@ def detections(frames: int = FRAMES) -> pa.Table:
                     "picture_height_px": SIZE[1],
                 }
             )
-    return pa.Table.from_pylist(rows, schema=schemas()["detections"])
+    return pa.Table.from_pylist(rows, schema=detect_schemas()["detections"])
 
 
 def road(frames: int = FRAMES) -> pa.Table:
     """Road table in which the lower half of every picture is road."""
-    mask = rle.encode(np.ones((5, 16), np.bool_), (0, 4), (16, 9))
+    mask = rle.encode_mask(np.ones((5, 16), np.bool_), (0, 4), (16, 9))
     rows = [
         {
             "frame": frame,
@@ -103,7 +103,7 @@ def road(frames: int = FRAMES) -> pa.Table:
         }
         for frame in range(frames)
     ]
-    return pa.Table.from_pylist(rows, schema=schemas()["road"])
+    return pa.Table.from_pylist(rows, schema=detect_schemas()["road"])
 
 
 def frames_seen(frames: int = FRAMES) -> pa.Table:
@@ -113,7 +113,7 @@ def frames_seen(frames: int = FRAMES) -> pa.Table:
         {"frame": i, "t_ns": t, "camera": TOPIC, "width_px": SIZE[0], "height_px": SIZE[1]}
         for i, t in enumerate(times)
     ]
-    return pa.Table.from_pylist(rows, schema=schemas()["frames"])
+    return pa.Table.from_pylist(rows, schema=detect_schemas()["frames"])
 
 
 def poses(frames: int = FRAMES) -> pa.Table:

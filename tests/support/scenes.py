@@ -12,20 +12,20 @@ import pytest
 from crosscue.datasets.scenes import drive
 from crosscue.datasets.scenes.conditions import conditions_of
 from crosscue.datasets.scenes.layout import layout_named
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.rendering.ground import Ground
 from crosscue.datasets.scenes.rendering.mesh import Mesh
-from crosscue.datasets.scenes.rendering.render import Picture, PictureSettings, Renderer
+from crosscue.datasets.scenes.rendering.render import PictureSettings, RenderedFrame, Renderer
 from crosscue.datasets.scenes.settings import world_of
-from crosscue.datasets.scenes.world import Thing, World, build
+from crosscue.datasets.scenes.world import SceneObject, World, build_world
 
-SMALL: Final = Camera(width_px=384, height_px=216)
+SMALL: Final = SceneCamera(width_px=384, height_px=216)
 
 
 @cache
 def world(layout: str = "D", run: int = 1, seed: int = 0) -> World:
     plan = layout_named(layout)
-    return build(plan, conditions_of(plan, run, seed))
+    return build_world(plan, conditions_of(plan, run, seed))
 
 
 def shorten(patch: pytest.MonkeyPatch, pictures: int = 15) -> None:
@@ -35,7 +35,7 @@ def shorten(patch: pytest.MonkeyPatch, pictures: int = 15) -> None:
     patch.setattr(drive, "world_of", cache(world_of))
 
 
-def renderer(of: World, camera: Camera = SMALL) -> Renderer:
+def renderer(of: World, camera: SceneCamera = SMALL) -> Renderer:
     return Renderer(of, camera, PictureSettings())
 
 
@@ -44,7 +44,7 @@ def when_at(of: World, x_m: float) -> float:
     return float(np.argmax(of.approach.motion.x_m >= x_m)) / 100.0
 
 
-def picture_at(of: World, x_m: float, camera: Camera = SMALL) -> Picture:
+def picture_at(of: World, x_m: float, camera: SceneCamera = SMALL) -> RenderedFrame:
     return renderer(of, camera).picture(when_at(of, x_m))
 
 
@@ -80,7 +80,7 @@ def _mesh(mesh: Mesh) -> Mesh:
     return replace(mesh, corners=corners, uv=np.ascontiguousarray(mesh.uv[:, order]))
 
 
-def _thing(thing: Thing) -> Thing:
+def _thing(thing: SceneObject) -> SceneObject:
     x, y, z = thing.at
     return replace(
         thing,

@@ -16,7 +16,7 @@ from crosscue.eval.runs.manifest import LogRow
 from crosscue.eval.scoring.columns import RunTables
 from crosscue.eval.scoring.run_tables import run_tables
 from crosscue.eval.scoring.truth import DriveTruth, TrueRanges
-from crosscue.replay.files.identity import identity_of
+from crosscue.replay.files.identity import log_identity
 from crosscue.replay.files.log_identity import Identity
 from crosscue.replay.files.whole_file import write_text
 
@@ -202,7 +202,7 @@ def good_truth(drive: str = "made up") -> DriveTruth:
 
 def log_row(log: Path, run: RunFolder, sha256: str = "00", *cameras: str) -> LogRow:
     """Manifest row of a log; a missing log gets a made-up identity."""
-    found = identity_of(log) if log.exists() else Identity(log.name, 0, "0" * 64)
+    found = log_identity(log) if log.exists() else Identity(log.name, 0, "0" * 64)
     return LogRow(
         name=log.name,
         path=run.relative(log),

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from crosscue.detectors.signs.templates import MARGIN_PX, Kind, draw
+from crosscue.detectors.signs.templates import MARGIN_PX, Kind, draw_sign_template
 from crosscue.replay.columns import Bytes, Floats
 
 
@@ -37,7 +37,7 @@ def scene(kind: Kind, seed: int, height_px: int | None = None) -> Scene:
     """One sign at a random position in clutter, 44 to 110 pixels high (one-way signs half that)."""
     rng = np.random.default_rng(seed)
     height = int(rng.integers(44, 110)) if height_px is None else height_px
-    drawing = draw(kind, height)
+    drawing = draw_sign_template(kind, height)
     inner = drawing.grey[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX].astype(np.float64)
     inner = inner * rng.uniform(0.6, 1.0) + rng.uniform(0.0, 20.0)
     grey = clutter(seed + 1000)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crosscue.localization.angles import wrap_all
-from crosscue.localization.odometry import OdometrySettings, TurnSignal, WheelSpeeds
+from crosscue.localization.odometry import OdometrySettings, TurnSignal, WheelSamples
 from crosscue.localization.pose_track import Headings
 from crosscue.replay.columns import Floats, Int64s
 
@@ -53,7 +53,7 @@ def drive(rng: np.random.Generator, seconds: float = 60.0, rate_hz: float = 20.0
 
 def wheels(
     truth: Truth, settings: OdometrySettings, rng: np.random.Generator | None = None
-) -> WheelSpeeds:
+) -> WheelSamples:
     """Rear wheel speeds, with slip and rounding of the settings; exact without ``rng``."""
     speed = truth.speed_mps.copy()
     if rng is not None:
@@ -64,7 +64,7 @@ def wheels(
     both = np.column_stack([speed - half, speed + half])
     if rng is not None and settings.wheel_step_mps:
         both = np.round(both / settings.wheel_step_mps) * settings.wheel_step_mps
-    return WheelSpeeds(truth.t_ns, both)
+    return WheelSamples(truth.t_ns, both)
 
 
 def gyro(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.datasets.adapters.pandaset import read_poses
+from crosscue.datasets.adapters.pandaset import read_pandaset_poses
 from crosscue.datasets.real import recordings
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
 from crosscue.detectors.catalog import entries, places
@@ -107,7 +107,7 @@ def _write_bundled(kept: Path, drive: Path, network: Path) -> None:
     (kept / "vehicle.toml").write_text(
         'version = 1\n[detectors.bright]\nkind = "model"\ncard = "card.toml"\n'
     )
-    times = read_poses(drive).t_ns.tolist()
+    times = read_pandaset_poses(drive).t_ns.tolist()
     approach = Approach(
         id=1,
         intersection="made up",

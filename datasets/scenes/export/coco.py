@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.datasets.scenes.cues import MIN_PIXELS
-from crosscue.datasets.scenes.rendering.render import Picture
+from crosscue.datasets.scenes.rendering.render import RenderedFrame
 from crosscue.datasets.scenes.world import CATEGORIES
-from crosscue.detectors.rle import encode
+from crosscue.detectors.rle import encode_mask
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
 
@@ -22,13 +22,15 @@ COCO_IDS: Final = {
 
 
 @dataclass(slots=True)
-class Objects:
+class DriveAnnotations:
     """Annotations of a drive, picture by picture."""
 
     images: list[dict[str, Any]] = field(default_factory=list)
     annotations: list[dict[str, Any]] = field(default_factory=list)
 
-    def add(self, t_ns: int, picture: Picture, tags: tuple[str, ...], distance_m: float) -> None:
+    def add(
+        self, t_ns: int, picture: RenderedFrame, tags: tuple[str, ...], distance_m: float
+    ) -> None:
         """Add all objects of a picture that have enough pixels."""
         high, wide = picture.owner.shape
         number = len(self.images) + 1
@@ -48,7 +50,7 @@ class Objects:
             if area < MIN_PIXELS:
                 continue
             x0, y0, x1, y1 = seen.box_px
-            counts = encode(seen.mask, (x0, y0), (wide, high)).decode("ascii")
+            counts = encode_mask(seen.mask, (x0, y0), (wide, high)).decode("ascii")
             self.annotations.append(
                 {
                     "id": len(self.annotations) + 1,

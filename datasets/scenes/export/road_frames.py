@@ -28,14 +28,14 @@ class RoadFrames:
         return len(self.pixels)
 
 
-def joined(parts: Sequence[RoadFrames]) -> RoadFrames:
+def concatenate_frames(parts: Sequence[RoadFrames]) -> RoadFrames:
     """Concatenate frames."""
     return RoadFrames(
         np.concatenate([p.pixels for p in parts]), np.concatenate([p.road for p in parts])
     )
 
 
-def frames_of(settings: SceneSettings, count: int, size_px: tuple[int, int]) -> RoadFrames:
+def render_road_frames(settings: SceneSettings, count: int, size_px: tuple[int, int]) -> RoadFrames:
     """Render pictures of one run, evenly along the path, a few of them within the intersection.
 
     Args:
@@ -63,9 +63,9 @@ def frames_of(settings: SceneSettings, count: int, size_px: tuple[int, int]) -> 
 def rendered(
     runs: Sequence[SceneSettings], count: int, size_px: tuple[int, int]
 ) -> Iterator[RoadFrames]:
-    """Yield ``frames_of`` for each run."""
+    """Yield ``render_road_frames`` for each run."""
     for settings in runs:
-        yield frames_of(settings, count, size_px)
+        yield render_road_frames(settings, count, size_px)
 
 
 def shrunk(picture: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:

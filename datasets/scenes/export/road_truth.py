@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.datasets.scenes.rendering.camera import View
+from crosscue.datasets.scenes.rendering.camera import CameraView
 from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M
 
 # Vertical component of a ray above which it does not meet the ground.
@@ -18,14 +18,14 @@ SKY_UP = -0.002
 
 
 def road_seen(
-    road: NDArray[np.uint8], depth: NDArray[np.float32], samples: int, view: View
+    road: NDArray[np.uint8], depth: NDArray[np.float32], samples: int, view: CameraView
 ) -> NDArray[np.bool_]:
     """Return a mask of road pixels, shape (H, W); ``road`` is ``Ground.road``, 0 or 1."""
     return np.asarray(ground_seen(road, depth, samples, view) > 0)
 
 
 def ground_seen(
-    codes: NDArray[np.uint8], depth: NDArray[np.float32], samples: int, view: View
+    codes: NDArray[np.uint8], depth: NDArray[np.float32], samples: int, view: CameraView
 ) -> NDArray[np.uint8]:
     """Return the code of the ground that each pixel shows, shape (H, W); 0 behind objects.
 
@@ -62,7 +62,7 @@ def ground_seen(
     return seen
 
 
-def _rays(view: View) -> NDArray[np.float64]:
+def _rays(view: CameraView) -> NDArray[np.float64]:
     """Return the matrix from a pixel's (column, row, 1) to its ray in the local frame, (3, 3)."""
     f, (cx, cy) = view.camera.focal, view.camera.centre_px
     lens = np.array([[1 / f, 0.0, (0.5 - cx) / f], [0.0, 1 / f, (0.5 - cy) / f], [0.0, 0.0, 1.0]])

@@ -22,7 +22,7 @@ from crosscue.replay.columns import Floats
 from crosscue.replay.files.whole_file import write_bytes
 from crosscue.replay.processes import in_processes
 
-from .coco import Objects
+from .coco import DriveAnnotations
 
 # Fraction of the pictures before the intersection; the others are within it.
 BEFORE_ENTRY: Final = 0.9
@@ -44,7 +44,7 @@ def times_s(world: World, count: int, rng: np.random.Generator) -> Floats:
     return np.sort(np.where(rng.random(count) < 0.5, by_way, fraction * until_s))
 
 
-def frames_of(settings: SceneSettings, count: int, folder: Path) -> Objects:
+def render_frames(settings: SceneSettings, count: int, folder: Path) -> DriveAnnotations:
     """Render and write ``count`` pictures of one run to ``folder``, and return their annotations.
 
     Raises:
@@ -53,7 +53,7 @@ def frames_of(settings: SceneSettings, count: int, folder: Path) -> Objects:
     layout, conditions, world = world_of(settings)
     renderer = Renderer(world, settings.camera, settings.picture)
     rng = np.random.default_rng([conditions.seed, 12])
-    objects = Objects()
+    objects = DriveAnnotations()
     for number, t_s in enumerate(times_s(world, count, rng).tolist()):
         picture = renderer.picture(t_s, number)
         t_ns = START_NS + round(t_s * 1e9)
@@ -67,14 +67,14 @@ def frames_of(settings: SceneSettings, count: int, folder: Path) -> Objects:
 
 def frames(
     runs: Sequence[SceneSettings], count: int, folder: Path, workers: int = 1
-) -> Iterator[Objects]:
-    """Yield ``frames_of`` for each run, in order; several runs are rendered in parallel."""
-    return in_processes(partial(frames_of, count=count, folder=folder), runs, workers)
+) -> Iterator[DriveAnnotations]:
+    """Yield ``render_frames`` for each run, in order; several runs are rendered in parallel."""
+    return in_processes(partial(render_frames, count=count, folder=folder), runs, workers)
 
 
-def joined(parts: Sequence[Objects]) -> Objects:
+def merge_annotations(parts: Sequence[DriveAnnotations]) -> DriveAnnotations:
     """Merge the annotations of many runs, with new numbers."""
-    whole = Objects()
+    whole = DriveAnnotations()
     for part in parts:
         images, annotations = len(whole.images), len(whole.annotations)
         whole.images += [{**image, "id": image["id"] + images} for image in part.images]

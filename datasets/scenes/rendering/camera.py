@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crosscue.datasets.scenes.motion import Approach
+from crosscue.datasets.scenes.motion import ApproachMotion
 
 from .mesh import Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Camera:
+class SceneCamera:
     """Size, lens and mounting of a camera.
 
     Attributes:
@@ -43,7 +43,7 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class CameraView:
     """A camera at one time.
 
     Attributes:
@@ -55,7 +55,7 @@ class View:
         yaw_rate_radps: Yaw rate of the car.
     """
 
-    camera: Camera
+    camera: SceneCamera
     eye_axes: Floats
     at_m: Floats
     rear_axle: tuple[float, float, float]
@@ -72,7 +72,7 @@ class View:
         return np.column_stack([x, y, eye[:, 2]])
 
 
-def view_at(camera: Camera, approach: Approach, t_s: float) -> View:
+def view_at(camera: SceneCamera, approach: ApproachMotion, t_s: float) -> CameraView:
     """Return the view at a time; the body pitches with acceleration and shakes slightly."""
     motion = approach.motion
     at = np.arange(len(motion)) * 0.01
@@ -94,12 +94,16 @@ def view_at(camera: Camera, approach: Approach, t_s: float) -> View:
 
 
 def _view(
-    camera: Camera, rear_axle: tuple[float, float, float], pitch: float, speed: float, rate: float
-) -> View:
+    camera: SceneCamera,
+    rear_axle: tuple[float, float, float],
+    pitch: float,
+    speed: float,
+    rate: float,
+) -> CameraView:
     x, y, heading = rear_axle
     c, s = np.cos(heading), np.sin(heading)
     ahead = np.array([c * np.cos(pitch), s * np.cos(pitch), -np.sin(pitch)])
     right = np.array([s, -c, 0.0])
     down = np.cross(ahead, right)
     at = np.array([x + camera.x_m * c, y + camera.x_m * s, camera.z_m])
-    return View(camera, np.stack([right, down, ahead]), at, rear_axle, speed, rate)
+    return CameraView(camera, np.stack([right, down, ahead]), at, rear_axle, speed, rate)

@@ -41,12 +41,12 @@ class Kernels(NamedTuple):
 
 
 @cache
-def compiled() -> Kernels:
+def compile_kernels() -> Kernels:
     """Compile the loops, or load them from the cache of an earlier process."""
-    return Kernels(kept(draw), kept(cover), kept(compose), kept(develop))
+    return Kernels(kept(draw_triangles), kept(cover), kept(compose), kept(develop))
 
 
-def draw(
+def draw_triangles(
     order: Int64s,
     corners: Float32s,
     uv: Float32s,

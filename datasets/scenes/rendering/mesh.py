@@ -77,7 +77,7 @@ def nothing() -> Mesh:
     )
 
 
-def joined(parts: Sequence[Mesh]) -> Mesh:
+def merge_meshes(parts: Sequence[Mesh]) -> Mesh:
     """Return one mesh with the triangles of all parts."""
     if not parts:
         return nothing()
@@ -159,7 +159,7 @@ def box(
         for (a, b), times in sides
     ]
     parts.append(quad([(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)], rgb, glow=glow))
-    return joined(parts)
+    return merge_meshes(parts)
 
 
 def tube(a: Sequence[float], b: Sequence[float], radius_m: float, rgb: Rgb, sides: int = 6) -> Mesh:
@@ -172,7 +172,7 @@ def tube(a: Sequence[float], b: Sequence[float], radius_m: float, rgb: Rgb, side
     e2 = np.cross(along, e1)
     angle = np.arange(sides + 1) * 2 * np.pi / sides
     ring = radius_m * (np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2)
-    return joined(
+    return merge_meshes(
         [
             quad([start + ring[k], start + ring[k + 1], stop + ring[k + 1], stop + ring[k]], rgb)
             for k in range(sides)

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.datasets.scenes.export.road_truth import ground_seen, road_seen
-from crosscue.datasets.scenes.world import Thing, World
+from crosscue.datasets.scenes.world import SceneObject, World
 
-from .camera import Camera, View, view_at
+from .camera import CameraView, SceneCamera, view_at
 from .ground import TEXELS_PER_M, X_M, Y_M
-from .kernels import compiled
+from .kernels import compile_kernels
 from .mesh import Floats, Mesh
 from .textures import smooth_noise
 
@@ -42,7 +42,7 @@ DEFAULTS: Final = PictureSettings()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class RenderedObject:
     """One object in one picture.
 
     Attributes:
@@ -54,7 +54,7 @@ class Seen:
         distance_m: Distance from the rear axle along the car's axis.
     """
 
-    thing: Thing
+    thing: SceneObject
     mask: NDArray[np.bool_]
     box_px: tuple[int, int, int, int]
     visible: float
@@ -63,7 +63,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
+class RenderedFrame:
     """One camera frame with its truth.
 
     Attributes:
@@ -77,9 +77,9 @@ class Picture:
 
     t_s: float
     rgb: NDArray[np.uint8]
-    view: View
+    view: CameraView
     owner: NDArray[np.int16]
-    seen: tuple[Seen, ...]
+    seen: tuple[RenderedObject, ...]
     road: NDArray[np.bool_] | None = None
 
 
@@ -87,13 +87,13 @@ class Renderer:
     """Renderer of one world, with the data shared by all pictures."""
 
     def __init__(
-        self, world: World, camera: Camera | None = None, settings: PictureSettings = DEFAULTS
+        self, world: World, camera: SceneCamera | None = None, settings: PictureSettings = DEFAULTS
     ) -> None:
         """Compute the light on the scenery, and allocate the buffers."""
         self.world = world
-        self.camera = Camera() if camera is None else camera
+        self.camera = SceneCamera() if camera is None else camera
         self.settings = settings
-        self._kernels = compiled()
+        self._kernels = compile_kernels()
         self._atlas, self._places = world.atlas.packed()
         self._scenery = (world.scenery, world.light.on(world.scenery))
         self._movers = [
@@ -116,7 +116,7 @@ class Renderer:
         )
         self._noise = np.clip(rng.normal(0.0, 32.0, (512, 512)), -127, 127).astype(np.int8)
 
-    def picture(self, t_s: float, number: int = 0, *, with_road: bool = False) -> Picture:
+    def picture(self, t_s: float, number: int = 0, *, with_road: bool = False) -> RenderedFrame:
         """Return the camera's picture at a time; ``number`` seeds its noise."""
         view = self._drawn(t_s)
         rgb, owner = self._composed(view, t_s)
@@ -125,9 +125,11 @@ class Renderer:
         if with_road:
             on_map = self.world.ground.road.view(np.uint8)
             road = road_seen(on_map, self._depth, self.settings.samples, view)
-        return Picture(t_s, rgb, view, owner, self._seen(owner, view, t_s), road)
+        return RenderedFrame(t_s, rgb, view, owner, self._seen(owner, view, t_s), road)
 
-    def owners(self, t_s: float, codes: NDArray[np.uint8]) -> tuple[Picture, NDArray[np.uint8]]:
+    def owners(
+        self, t_s: float, codes: NDArray[np.uint8]
+    ) -> tuple[RenderedFrame, NDArray[np.uint8]]:
         """Return a picture without colours, and the codes of the ground in its pixels.
 
         The camera must have one sample per pixel. The world need not be painted.
@@ -140,9 +142,9 @@ class Renderer:
         owner = self._owner.copy()
         black = np.zeros((*owner.shape, 3), np.uint8)
         ground = ground_seen(codes, self._depth, self.settings.samples, view)
-        return Picture(t_s, black, view, owner, self._seen(owner, view, t_s)), ground
+        return RenderedFrame(t_s, black, view, owner, self._seen(owner, view, t_s)), ground
 
-    def _drawn(self, t_s: float) -> View:
+    def _drawn(self, t_s: float) -> CameraView:
         """Draw all static and moving objects into the buffers, and return the view."""
         view = view_at(self.camera, self.world.approach, t_s)
         self._depth.fill(0.0)
@@ -159,7 +161,7 @@ class Renderer:
         cx, cy = self.camera.centre_px
         return self.camera.focal * scale, cx * scale, cy * scale
 
-    def _draw(self, mesh: Mesh, tint: NDArray[np.float32], shift: Floats, view: View) -> None:
+    def _draw(self, mesh: Mesh, tint: NDArray[np.float32], shift: Floats, view: CameraView) -> None:
         light = self.world.light
         ahead = mesh.corners.mean(axis=1) @ view.eye_axes[2].astype(np.float32)
         self._kernels.draw(
@@ -182,7 +184,9 @@ class Renderer:
             self._owner,
         )
 
-    def _composed(self, view: View, t_s: float) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
+    def _composed(
+        self, view: CameraView, t_s: float
+    ) -> tuple[NDArray[np.uint8], NDArray[np.int16]]:
         light, ground = self.world.light, self.world.ground
         high, wide = self.camera.height_px, self.camera.width_px
         rgb = np.zeros((high, wide, 3), np.uint8)
@@ -212,7 +216,7 @@ class Renderer:
         )
         return rgb, owner
 
-    def _shadows(self, view: View, t_s: float) -> NDArray[np.uint8]:
+    def _shadows(self, view: CameraView, t_s: float) -> NDArray[np.uint8]:
         """Return the shadows of moving cars, directly below them and away from the sun."""
         import cv2
 
@@ -236,7 +240,7 @@ class Renderer:
                 cv2.fillConvexPoly(shade, np.rint(hull * 16).astype(np.int32), dark, cv2.LINE_AA, 4)
         return shade
 
-    def _finish(self, rgb: NDArray[np.uint8], view: View, number: int) -> None:
+    def _finish(self, rgb: NDArray[np.uint8], view: CameraView, number: int) -> None:
         """Apply rain, lens and sensor effects in place."""
         import cv2
 
@@ -272,7 +276,9 @@ class Renderer:
             light.contrast,
         )
 
-    def _seen(self, owner: NDArray[np.int16], view: View, t_s: float) -> tuple[Seen, ...]:
+    def _seen(
+        self, owner: NDArray[np.int16], view: CameraView, t_s: float
+    ) -> tuple[RenderedObject, ...]:
         counts = np.bincount(owner.ravel().astype(np.int64) + 1, minlength=1)[1:]
         seen = []
         for number in np.flatnonzero(counts):
@@ -280,11 +286,13 @@ class Renderer:
             corners = view.project(_corners(thing, t_s))
             mask, box = _cut_out(owner, int(number), corners)
             visible, inside = self._fractions(thing, t_s, view, int(counts[number]), corners)
-            seen.append(Seen(thing, mask, box, visible, inside, distance_m(thing, t_s, view)))
+            seen.append(
+                RenderedObject(thing, mask, box, visible, inside, distance_m(thing, t_s, view))
+            )
         return tuple(seen)
 
     def _fractions(
-        self, thing: Thing, t_s: float, view: View, pixels: int, corners: Floats
+        self, thing: SceneObject, t_s: float, view: CameraView, pixels: int, corners: Floats
     ) -> tuple[float, float]:
         """Return the visible fraction of the part in the picture, and that part's fraction."""
         wide, high = self.camera.width_px, self.camera.height_px
@@ -312,14 +320,14 @@ class Renderer:
         return min(1.0, pixels / max(within, 1)), within / max(total, 1)
 
 
-def distance_m(thing: Thing, t_s: float, view: View) -> float:
+def distance_m(thing: SceneObject, t_s: float, view: CameraView) -> float:
     """Return the distance from the rear axle to an object's centre, along the car's axis."""
     x, y, heading = view.rear_axle
     middle = np.array(thing.at) + thing.shift(t_s)
     return float((middle[0] - x) * np.cos(heading) + (middle[1] - y) * np.sin(heading))
 
 
-def _corners(thing: Thing, t_s: float) -> Floats:
+def _corners(thing: SceneObject, t_s: float) -> Floats:
     points: Floats = thing.mesh_at(t_s).corners.reshape(-1, 3).astype(np.float64)
     low, high = points.min(0) + thing.shift(t_s), points.max(0) + thing.shift(t_s)
     return np.array(

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.random import Generator
 
-from .mesh import Floats, Mesh, Rgb, box, disc, joined, quad, triangles, tube
+from .mesh import Floats, Mesh, Rgb, box, disc, merge_meshes, quad, triangles, tube
 from .signs import WIDTH_M
 from .textures import FRONT_M, Atlas
 
@@ -68,8 +68,8 @@ def building(
             (high, high + 0.35),
             (0.5, 0.47, 0.44),
         )
-        return joined([walls, lip]), high
-    return joined([walls, _gable(x, y, high, atlas, rng)]), high + 1.5
+        return merge_meshes([walls, lip]), high
+    return merge_meshes([walls, _gable(x, y, high, atlas, rng)]), high + 1.5
 
 
 def _gable(
@@ -99,7 +99,7 @@ def _gable(
             [(x1, y1, high), (x0, y1, high), (m, y1, ridge)],
         ]
     wall: Rgb = (0.62, 0.58, 0.52)
-    return joined(
+    return merge_meshes(
         [
             *(quad(s, repeat=(5.0, 2.5), texture=tile) for s in slopes),
             triangles(np.array(ends), wall),
@@ -113,7 +113,7 @@ def tree(x: float, y: float, atlas: Atlas, rng: Generator) -> tuple[Mesh, float,
     middle = float(rng.uniform(4.2, 5.6))
     trunk = tube((x, y, 0.0), (x + rng.normal(0, 0.15), y, middle), 0.16, WOOD)
     return (
-        joined([trunk, crown(x, y, middle, radius, radius * 0.95, 12, atlas, rng)]),
+        merge_meshes([trunk, crown(x, y, middle, radius, radius * 0.95, 12, atlas, rng)]),
         radius,
         middle,
     )
@@ -163,7 +163,7 @@ def crown(
                 [corners[i] for i in (1, 0, 3, 2)], (light,) * 3, texture=int(bunch.texture[0])
             )
         parts.append(bunch)
-    return joined(parts)
+    return merge_meshes(parts)
 
 
 def sign_face(kind: str, atlas: Atlas, width_m: float | None = None) -> Mesh:
@@ -225,12 +225,12 @@ def light_head(state: str) -> Mesh:
                 case,
             )
         )
-    return joined(parts)
+    return merge_meshes(parts)
 
 
 def mast(x: float, y: float, arm_to_y: float, high: float = 6.3) -> Mesh:
     """Return a pole with an arm over the road."""
-    return joined(
+    return merge_meshes(
         [
             tube((x + 0.3, y, 0.0), (x + 0.3, y, high + 0.3), 0.13, STEEL, 8),
             tube((x + 0.3, y, high), (x + 0.3, arm_to_y, high + 0.25), 0.07, STEEL),
@@ -240,7 +240,7 @@ def mast(x: float, y: float, arm_to_y: float, high: float = 6.3) -> Mesh:
 
 def utility_pole(x: float, y: float) -> Mesh:
     """Return a wooden pole with a cross-arm."""
-    return joined(
+    return merge_meshes(
         [
             tube((x, y, 0.0), (x, y, 9.5), 0.15, WOOD),
             box((x - 0.06, x + 0.06), (y - 1.1, y + 1.1), (8.7, 8.85), WOOD),
@@ -254,4 +254,4 @@ def wire(a: tuple[float, float, float], b: tuple[float, float, float]) -> Mesh:
     fraction = np.linspace(0, 1, 9)[:, None]
     points = start + fraction * (stop - start)
     points[:, 2] -= 0.7 * 4 * (fraction * (1 - fraction))[:, 0]
-    return joined([tube(p, q, 0.018, (0.08, 0.08, 0.09), 3) for p, q in pairwise(points)])
+    return merge_meshes([tube(p, q, 0.018, (0.08, 0.08, 0.09), 3) for p, q in pairwise(points)])

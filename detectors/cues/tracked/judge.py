@@ -24,7 +24,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from crosscue.detectors.cues.observed import Judged, Place, Sides, Ways
+from crosscue.detectors.cues.observed import CarCounts, Place, Sides, Ways
 from crosscue.detectors.cues.tracked.motion import HEIGHT_FRACTION, CarMotion
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
@@ -82,14 +82,14 @@ def parked(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
     ]
 
 
-def judge(
+def count_cars(
     cars: Sequence[CarMotion],
     standing: Sequence[CarMotion],
     seen: int,
     camera: Camera,
     settings: Cars,
     place: Place | None,
-) -> Judged:
+) -> CarCounts:
     """Count cars by behaviour, at the intersection and elsewhere.
 
     Args:
@@ -109,7 +109,7 @@ def judge(
     )
     crossing_here, crossing_all = _by_motion(moving_here), _by_motion(moving)
     parked_here, parked_all = _by_nose(still_here), _by_nose(still)
-    return Judged(
+    return CarCounts(
         crossing_here,
         parked_here,
         _less(crossing_all, crossing_here),

@@ -28,7 +28,7 @@ from crosscue.detectors.cues.tracked.motion import (
     place_of_end,
 )
 from crosscue.detectors.ranging.ground_plane import GroundPlane
-from crosscue.detectors.ranging.object_tracks import Motion, iou
+from crosscue.detectors.ranging.object_tracks import CarStep, iou
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
 # Constant part of the standard deviation of a box's height.
@@ -104,7 +104,7 @@ class CarTracks:
         """Forget all cars."""
         self._tracks.clear()
 
-    def __call__(self, found: Sequence[Detections], ego: Motion) -> list[CarMotion]:
+    def __call__(self, found: Sequence[Detections], ego: CarStep) -> list[CarMotion]:
         """Update the tracks with the next frame.
 
         Args:
@@ -253,7 +253,7 @@ def _motion(track: _Track, frames: int, aside_mps: float = USUAL_MPS) -> CarMoti
     return found._replace(number=track.number, box_px=(x0, y0, x1, y1), step_px=track.step_px)
 
 
-def _moved(axle: tuple[float, float, float], motion: Motion) -> tuple[float, float, float]:
+def _moved(axle: tuple[float, float, float], motion: CarStep) -> tuple[float, float, float]:
     """Pose of the rear axle after an arc."""
     x, y, heading = axle
     middle, way_m = heading + 0.5 * motion.turned_rad, motion.way_m or 0.0

@@ -17,12 +17,12 @@ from pydantic import Field, ValidationError
 from torch import Tensor
 
 from crosscue.detectors.settings import Settings
-from crosscue.detectors.weights_file import embedded, packed, unpacked
+from crosscue.detectors.weights_file import embedded, pack_weights, unpack_weights
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.whole_file import write_bytes
 
-from .network import Plan, build_network
+from .network import NetworkPlan, build_network
 
 KEY: Final = "crosscue"
 VERSION: Final = 1
@@ -57,7 +57,7 @@ class Facts(Settings):
     """
 
     version: Annotated[int, Field(ge=1, le=VERSION)] = VERSION
-    plan: Plan
+    plan: NetworkPlan
     calibration: dict[str, Calibration] = Field(default_factory=dict)
     measured: dict[str, Finite | None] = Field(default_factory=dict)
     recipe: dict[str, str | int | Finite] = Field(default_factory=dict)
@@ -92,7 +92,7 @@ def save_checkpoint(path: Path, network: Any, facts: Facts, *, halve: bool = Tru
         OutputError: The file cannot be written.
     """
     tensors = {name: _stored(value, halve) for name, value in network.state_dict().items()}
-    content = packed(tensors, KEY, json.dumps(facts.model_dump(mode="json"), sort_keys=True))
+    content = pack_weights(tensors, KEY, json.dumps(facts.model_dump(mode="json"), sort_keys=True))
     write_bytes(path, content)
 
 
@@ -101,7 +101,7 @@ def _stored(value: Tensor, halve: bool) -> Tensor:
     return kept.half() if halve and kept.dtype == torch.float32 else kept
 
 
-def embedded_path() -> Path:
+def embedded_mask_rcnn() -> Path:
     """Path of the checkpoint that is part of crosscue."""
     return embedded("compact_simulated.safetensors")
 
@@ -114,7 +114,7 @@ def load_checkpoint(path: Path) -> Checkpoint:
             description and weights do not match.
     """
     content = _content(path)
-    description, tensors = unpacked(content, KEY, path)
+    description, tensors = unpack_weights(content, KEY, path)
     facts = _facts(description, path)
     network = build_network(facts.plan)
     fill(network, tensors, path)

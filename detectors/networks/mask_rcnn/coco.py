@@ -18,7 +18,7 @@ from torch import nn
 from crosscue.replay.errors import VehicleError, one_line
 
 from .checkpoint import Checkpoint, Facts
-from .network import Plan, build_network
+from .network import NetworkPlan, build_network
 
 # Names of networks and of torchvision's weights for them.
 COCO_NETWORKS: Final[Mapping[str, str]] = {
@@ -75,7 +75,9 @@ def _verify_hash(path: Path) -> None:
 def coco_checkpoint(name: str, weights: Any, tensors: Mapping[str, Any]) -> Checkpoint:
     """Load torchvision's weights into their network, with the names of COCO's classes."""
     classes = tuple(None if c == "N/A" else str(c) for c in weights.meta["categories"][1:])
-    plan = Plan.model_validate({"architecture": name, "classes": classes, "width_px": WIDTH_PX})
+    plan = NetworkPlan.model_validate(
+        {"architecture": name, "classes": classes, "width_px": WIDTH_PX}
+    )
     network = build_network(plan)
     network.load_state_dict(tensors)
     if name in NO_EPSILON:

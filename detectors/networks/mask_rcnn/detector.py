@@ -31,12 +31,12 @@ from crosscue.detectors.settings import Proportion, Settings, identity_of, setti
 from crosscue.replay.columns import Bytes, Floats
 from crosscue.replay.errors import CrosscueError, VehicleError
 
-from .checkpoint import Calibration, Checkpoint, embedded_path, load_checkpoint
+from .checkpoint import Calibration, Checkpoint, embedded_mask_rcnn, load_checkpoint
 from .coco import COCO_NETWORKS, load_coco
 from .cpu import for_cpu
-from .network import MEAN, STRIDE, Plan, set_limits
+from .network import MEAN, STRIDE, NetworkPlan, set_limits
 from .openvino import OpenVinoParts
-from .parts import Parts, TorchParts, detected
+from .parts import MaskRcnnLayers, TorchParts, detected
 from .screening import MIN_PROPOSALS, ScreenedParts, can_screen
 
 # Incremented when the same pixels, weights and settings yield different numbers than before.
@@ -93,7 +93,7 @@ def checkpoint_named(name: str) -> Checkpoint:
         VehicleError: As ``build``.
     """
     if name == EMBEDDED:
-        return load_checkpoint(embedded_path())
+        return load_checkpoint(embedded_mask_rcnn())
     if name in COCO_NETWORKS:
         return load_coco(name)
     if "." not in Path(name).name:
@@ -132,7 +132,7 @@ def detector_of(
     return MaskRcnnDetector(checkpoint, settings, device, parts, _Batch(batch))
 
 
-def _parts(network: Any, settings: MaskRcnnSettings, device: torch.device) -> Parts:
+def _parts(network: Any, settings: MaskRcnnSettings, device: torch.device) -> MaskRcnnLayers:
     if settings.backend == "openvino":
         return OpenVinoParts(network, settings.threads)
     if device.type == "cpu":
@@ -157,7 +157,7 @@ class MaskRcnnDetector:
     checkpoint: Checkpoint
     settings: MaskRcnnSettings
     device: torch.device
-    parts: Parts
+    parts: MaskRcnnLayers
     _batch: _Batch = field(repr=False)
 
     @property
@@ -219,7 +219,7 @@ class MaskRcnnDetector:
 
     def _detect(self, frames: Sequence[Frame]) -> list[Found]:
         plan = self.checkpoint.facts.plan
-        placed = [place(frame.pixels, plan) for frame in frames]
+        placed = [place_picture(frame.pixels, plan) for frame in frames]
         with torch.inference_mode(), threads_of(self.settings.threads, self.device):
             pictures = np.stack([one.pixels for one in placed])
             is_halved = self.settings.halve and self.device.type == "cuda"
@@ -230,7 +230,9 @@ class MaskRcnnDetector:
                 for frame, one, tensors in zip(frames, placed, raw, strict=True)
             ]
 
-    def _detections(self, frame: Frame, placed: Placed, raw: dict[str, Tensor]) -> Detections:
+    def _detections(
+        self, frame: Frame, placed: PlacedPicture, raw: dict[str, Tensor]
+    ) -> Detections:
         facts = self.checkpoint.facts
         names = [facts.plan.classes[int(label) - 1] for label in raw["labels"].tolist()]
         boxes, raw_scores, masks = (
@@ -272,7 +274,7 @@ def _of_one_size(frames: Sequence[Frame]) -> Sequence[Frame]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placed:
+class PlacedPicture:
     """A picture as the network's input.
 
     Attributes:
@@ -286,7 +288,7 @@ class Placed:
     corner_px: tuple[int, int]
 
 
-def place(pixels: Bytes, plan: Plan) -> Placed:
+def place_picture(pixels: Bytes, plan: NetworkPlan) -> PlacedPicture:
     """Scale a picture to the plan's width, crop top and bottom, and pad to the stride."""
     import cv2
 
@@ -303,7 +305,7 @@ def place(pixels: Bytes, plan: Plan) -> Placed:
     padded = np.empty((_padded(size[1]), _padded(size[0]), 3), np.uint8)
     padded[: size[1], : size[0]] = scaled
     padded[size[1] :] = padded[: size[1], size[0] :] = _PAD
-    return Placed(padded, scale, (0, round(first * scale[1])))
+    return PlacedPicture(padded, scale, (0, round(first * scale[1])))
 
 
 def _padded(side: int) -> int:
@@ -353,4 +355,4 @@ def laid_in(mask: NDArray[np.float32], box_px: Floats, size_px: tuple[int, int])
     rows = (np.arange(y0, y1) + 0.5 - box_px[1]) / step[1] + 0.5
     grid = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
     fine = cv2.remap(rim, grid[0], grid[1], cv2.INTER_LINEAR)
-    return rle.encode(np.asarray(fine) > 0.5, (x0, y0), (width, height))
+    return rle.encode_mask(np.asarray(fine) > 0.5, (x0, y0), (width, height))

@@ -32,7 +32,7 @@ ASPECTS: Final = (0.45, 1.0, 2.6)
 MAX_BEFORE_SUPPRESSION: Final = 1000
 
 
-class Plan(Settings):
+class NetworkPlan(Settings):
     """Architecture and input of a network.
 
     Attributes:
@@ -50,13 +50,13 @@ class Plan(Settings):
     bottom: Proportion = 0.0
 
     @model_validator(mode="after")
-    def _something_is_left(self) -> Plan:
+    def _something_is_left(self) -> NetworkPlan:
         if self.top + self.bottom > 0.9:
             raise ValueError("top and bottom leave less than a tenth of the picture")
         return self
 
 
-def build_network(plan: Plan) -> Any:
+def build_network(plan: NetworkPlan) -> Any:
     """Build a torchvision ``MaskRCNN`` with random weights.
 
     Nothing is fetched. ``set_limits`` sets the number of proposals and the minimum score.

@@ -35,7 +35,7 @@ class Body(NamedTuple):
     shifts: Sequence[Tensor]
 
 
-class Parts(Protocol):
+class MaskRcnnLayers(Protocol):
     """The layers of a Mask R-CNN in a back end."""
 
     def body(self, pictures: NDArray[np.uint8], /) -> Body:
@@ -51,7 +51,9 @@ class Parts(Protocol):
         ...
 
 
-def detected(network: Any, parts: Parts, pictures: NDArray[np.uint8]) -> list[dict[str, Tensor]]:
+def detected(
+    network: Any, parts: MaskRcnnLayers, pictures: NDArray[np.uint8]
+) -> list[dict[str, Tensor]]:
     """Detect objects: boxes in pixels of the input, labels, scores and masks (M, 1, 28, 28).
 
     Masks cover their box only.
@@ -152,20 +154,20 @@ class TorchParts:
         self._device = device
 
     def body(self, pictures: NDArray[np.uint8], /) -> Body:
-        """As ``Parts``."""
+        """As ``MaskRcnnLayers``."""
         given = as_input(pictures, self._device)
         levels = list(self._network.backbone(given).values())
         objectness, shifts = self._network.rpn.head(levels)
         return Body(levels, objectness, shifts)
 
     def boxes(self, pooled: Tensor, /) -> tuple[Tensor, Tensor]:
-        """As ``Parts``."""
+        """As ``MaskRcnnLayers``."""
         heads = self._network.roi_heads
         found: tuple[Tensor, Tensor] = heads.box_predictor(heads.box_head(pooled))
         return found
 
     def masks(self, pooled: Tensor, /) -> Tensor:
-        """As ``Parts``."""
+        """As ``MaskRcnnLayers``."""
         heads = self._network.roi_heads
         logits: Tensor = heads.mask_predictor(heads.mask_head(pooled))
         return logits

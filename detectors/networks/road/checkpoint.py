@@ -12,7 +12,7 @@ import torch
 from pydantic import Field, ValidationError
 
 from crosscue.detectors.settings import Settings
-from crosscue.detectors.weights_file import packed, unpacked
+from crosscue.detectors.weights_file import pack_weights, unpack_weights
 from crosscue.replay.errors import VehicleError, one_line
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.whole_file import write_bytes
@@ -58,7 +58,7 @@ def save_road(path: Path, network: RoadNetwork, facts: RoadFacts) -> None:
         name: value.detach().cpu().contiguous().half() if value.is_floating_point() else value.cpu()
         for name, value in network.state_dict().items()
     }
-    content = packed(kept, KEY, json.dumps(facts.model_dump(mode="json"), sort_keys=True))
+    content = pack_weights(kept, KEY, json.dumps(facts.model_dump(mode="json"), sort_keys=True))
     write_bytes(path, content)
 
 
@@ -76,7 +76,7 @@ def load_road(path: Path) -> RoadCheckpoint:
             raise VehicleError(f"{path}: more than {MAX_BYTES:,} bytes; expected a road network")
     except OSError as error:
         raise VehicleError(f"{path}: {error.strerror}; check the file name") from None
-    description, tensors = unpacked(content, KEY, path)
+    description, tensors = unpack_weights(content, KEY, path)
     if description is None:
         raise VehicleError(f"{path}: expected a file written by crosscue train road")
     try:

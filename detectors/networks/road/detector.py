@@ -23,7 +23,7 @@ from crosscue.detectors.networks.devices import chosen_device
 from crosscue.detectors.settings import Settings, identity_of, settings_of
 
 from .checkpoint import RoadCheckpoint, load_road
-from .network import embedded_path, logits_of
+from .network import embedded_road, logits_of
 
 # Incremented when the same pixels, weights and settings yield a different mask than before.
 VERSION: Final = 1
@@ -46,7 +46,7 @@ def build(**given: Any) -> RoadNetworkDetector:
         VehicleError: The settings or the checkpoint are invalid.
     """
     settings = settings_of(RoadSettings, given, "detector road")
-    path = embedded_path() if settings.checkpoint is None else Path(settings.checkpoint)
+    path = embedded_road() if settings.checkpoint is None else Path(settings.checkpoint)
     device = chosen_device(settings.device, "detector road")
     checkpoint = load_road(path)
     checkpoint.network.to(device)
@@ -82,18 +82,18 @@ class RoadNetworkDetector:
         if not frames:
             return []
         size = (self.checkpoint.facts.width_px, self.checkpoint.facts.height_px)
-        given = np.stack([resized(frame.pixels, size) for frame in frames])
+        given = np.stack([resize_picture(frame.pixels, size) for frame in frames])
         min_logit = float(np.log(self.settings.probability / (1.0 - self.settings.probability)))
         with torch.inference_mode():
             logits = logits_of(self.checkpoint.network, torch.from_numpy(given).to(self.device))
             road = (logits > min_logit).cpu().numpy()
         return [
-            RoadMask(frame.t_ns, frame.size_px, rle.encode(mask, (0, 0), size), size)
+            RoadMask(frame.t_ns, frame.size_px, rle.encode_mask(mask, (0, 0), size), size)
             for frame, mask in zip(frames, road, strict=True)
         ]
 
 
-def resized(pixels: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
+def resize_picture(pixels: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
     """Resize a picture to the network's size; grey pictures get three equal channels."""
     import cv2
 

@@ -85,7 +85,7 @@ def _grown(small: Tensor, like: Tensor) -> Tensor:
     return functional.interpolate(small, like.shape[-2:], mode="bilinear", align_corners=False)
 
 
-def embedded_path() -> Path:
+def embedded_road() -> Path:
     """Path of the checkpoint that is part of crosscue."""
     return embedded("road.safetensors")
 

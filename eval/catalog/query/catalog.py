@@ -166,23 +166,23 @@ class Catalog:
     @cached_property
     def _names(self) -> set[str]:
         files = {name for names in self._listed("tables") for name in names}
-        return {*INDEXED, *OWN, *parts.tables_of(files)}
+        return {*INDEXED, *OWN, *parts.table_names(files)}
 
-    def _parts(self, table: str) -> parts.Parts:
+    def _parts(self, table: str) -> parts.RunsTable:
         file = parts.file_of(table)
         places = {
             run: self._places.place(run, file)
             for run, files in zip(self._listed("run"), self._listed("tables"), strict=True)
             if file in files
         }
-        return parts.Parts(table, places, self._places.filesystem)
+        return parts.RunsTable(table, places, self._places.filesystem)
 
     def __repr__(self) -> str:
         counts = f"{len(self._listed('run'))} runs, {len(self.left_out)} left out"
         return f"{self._places.name}: {counts}; tables: {', '.join(sorted(self._names))}"
 
 
-def _views(table: str, found: parts.Parts) -> dict[str, Any]:
+def _views(table: str, found: parts.RunsTable) -> dict[str, Any]:
     """Return the data set and, if the table is computed, the SQL of its view, by name."""
     if table not in VIEWS:
         return {table: found.dataset}

@@ -20,9 +20,9 @@ from crosscue.replay.files.tree_text import spelled
 from crosscue.replay.remote.address import is_remote
 
 from .columns import INDEXED, arrow_schema
-from .local import CUT_SHORT, Found
-from .records import RunRows, rows_of
-from .stored import Stored, write
+from .local import CUT_SHORT, FoundRun
+from .records import RunRows, run_rows
+from .stored import StoredIndex, write_index
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -57,7 +57,7 @@ class Runs(Protocol):
         """Arrow's view of the storage."""
         ...
 
-    def find(self) -> Iterator[Found]:
+    def find(self) -> Iterator[FoundRun]:
         """Yield every run folder."""
         ...
 
@@ -157,7 +157,7 @@ def _read_index(path: Path | None) -> _Earlier:
     if path is None:
         return _Earlier({}, {}, {})
     try:
-        stored = Stored(door.read(path, MAX_BYTES), _MARK)
+        stored = StoredIndex(door.read(path, MAX_BYTES), _MARK)
         entries = stored.table(ENTRIES).to_table()
         columns = [entries[name].to_pylist() for name in ("run", *_STAMP, "reason")]
         tables = {name: stored.table(name) for name in KEPT}
@@ -171,7 +171,7 @@ def _read_index(path: Path | None) -> _Earlier:
 _STAMP: Final = ("stamp_0", "stamp_1", "stamp_2", "stamp_3")
 
 
-def _entries(complete: Mapping[str, Found], unreadable: Mapping[str, str]) -> pa.Table:
+def _entries(complete: Mapping[str, FoundRun], unreadable: Mapping[str, str]) -> pa.Table:
     import pyarrow as pa
 
     stamps = zip(*(one.stamp for one in complete.values()), strict=True) if complete else [()] * 4
@@ -182,14 +182,14 @@ def _entries(complete: Mapping[str, Found], unreadable: Mapping[str, str]) -> pa
     return pa.table(columns)
 
 
-def _read_run(runs: Runs, found: Found) -> RunRows | None:
+def _read_run(runs: Runs, found: FoundRun) -> RunRows | None:
     head = runs.read(found.run, found.file)
     if len(head) > MAX_BYTES:
         raise ValueError(f"{found.file}: over {MAX_BYTES >> 20} MiB; replay again")
     files = runs.files(found.run)
     run = spelled(str(Path(runs.name).resolve())) if found.run == "." else found.run
     name = run.rpartition("/")[2]
-    return rows_of(found, name, head, files, lambda file: runs.read(found.run, file))
+    return run_rows(found, name, head, files, lambda file: runs.read(found.run, file))
 
 
 def _why(error: Exception) -> str:
@@ -215,7 +215,7 @@ def _save(path: Path | None, tables: Mapping[str, pa.Table]) -> str:
     """Save the index; return the reason if it could not be saved, else an empty text."""
     try:
         if path is not None:
-            write(path, _MARK, tables)
+            write_index(path, _MARK, tables)
     except OutputError as error:
         return f"the index was not saved, so the runs are read again next time: {error}"
     return ""

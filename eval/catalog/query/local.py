@@ -26,7 +26,7 @@ Stamp: TypeAlias = tuple[int, int, int, int]
 CUT_SHORT: Final[Stamp] = (0, 0, 0, 0)
 
 
-class Found(NamedTuple):
+class FoundRun(NamedTuple):
     """A run folder.
 
     Attributes:
@@ -59,7 +59,7 @@ class LocalRuns:
         """The folder, if an index can be written to it; None if it is read-only."""
         return self.folder if os.access(self.folder, os.W_OK) else None
 
-    def find(self) -> Iterator[Found]:
+    def find(self) -> Iterator[FoundRun]:
         """Yield every run folder, complete or interrupted; only the folder itself if it is a run.
 
         Raises:
@@ -113,7 +113,7 @@ class LocalRuns:
         return pyarrow.fs.LocalFileSystem()
 
 
-def _below(folder: str, prefix: str, depth: int) -> Iterator[Found]:
+def _below(folder: str, prefix: str, depth: int) -> Iterator[FoundRun]:
     try:
         with os.scandir(folder) as listed:
             entries = [entry for entry in listed if not entry.name.startswith(".")]
@@ -122,9 +122,9 @@ def _below(folder: str, prefix: str, depth: int) -> Iterator[Found]:
     names = {entry.name for entry in entries}
     if prefix and FAILURE in names:
         made_ns = _time(f"{folder}/{FAILURE}")
-        yield Found(prefix[:-1], (made_ns, 0, _time(folder), 0), made_ns, FAILURE)
+        yield FoundRun(prefix[:-1], (made_ns, 0, _time(folder), 0), made_ns, FAILURE)
     elif prefix and is_cut_short(names):
-        yield Found(prefix[:-1], CUT_SHORT, 0)
+        yield FoundRun(prefix[:-1], CUT_SHORT, 0)
         return
     if not depth:
         return
@@ -139,7 +139,7 @@ def _below(folder: str, prefix: str, depth: int) -> Iterator[Found]:
             yield from _below(entry.path, f"{name}/", depth - 1)
 
 
-def _found(folder: str, run: str) -> Found | None:
+def _found(folder: str, run: str) -> FoundRun | None:
     try:
         manifest = os.stat(f"{folder}/{MANIFEST}")  # noqa: PTH116 (there may be 100,000)
     except (FileNotFoundError, NotADirectoryError):
@@ -149,7 +149,7 @@ def _found(folder: str, run: str) -> Found | None:
     made_ns = manifest.st_mtime_ns
     # Replacing a file changes the modification time of its folder.
     stamp = (made_ns, manifest.st_size, _time(folder), _time(f"{folder}/{SCORE}"))
-    return Found(run, stamp, made_ns)
+    return FoundRun(run, stamp, made_ns)
 
 
 def _time(path: str) -> int:

@@ -31,14 +31,14 @@ def file_of(table: str) -> str:
     return FILES.get(table, f"{table}.parquet")
 
 
-def tables_of(files: Iterable[str]) -> set[str]:
+def table_names(files: Iterable[str]) -> set[str]:
     """Return the names of the tables that these files contain."""
     inside = {name: table for table, name in FILES.items()}
     plain = {name.removesuffix(".parquet") for name in files if not name.startswith(SCORE)}
     return plain | {inside[name] for name in files if name in inside}
 
 
-class Parts:
+class RunsTable:
     """One table over many runs.
 
     Attributes:

@@ -26,7 +26,7 @@ from crosscue.eval.runs.tags import parse_tags
 from crosscue.replay.errors import one_line
 from crosscue.replay.files.identity import identity_of_all
 
-from .local import BESIDE, Found
+from .local import BESIDE, FoundRun
 
 Row: TypeAlias = dict[str, Any]
 M = TypeVar("M", bound=BaseModel)
@@ -82,8 +82,8 @@ class RunRows:
         return {"runs": [self.run], "approaches": self.approaches, "dropped": self.dropped}[name]
 
 
-def rows_of(
-    found: Found, name: str, head: bytes, files: Sequence[str], read: Callable[[str], bytes]
+def run_rows(
+    found: FoundRun, name: str, head: bytes, files: Sequence[str], read: Callable[[str], bytes]
 ) -> RunRows | None:
     """Return the rows of one run; None for a folder that is not a run, such as merged tables.
 
@@ -137,7 +137,7 @@ def _results(content: bytes) -> list[Row]:
 
 
 def _run_row(
-    found: Found,
+    found: FoundRun,
     name: str,
     manifest: _Manifest,
     detect: _Detect | None,
@@ -188,7 +188,7 @@ def _run_row(
     }
 
 
-def _made_at(found: Found) -> datetime | None:
+def _made_at(found: FoundRun) -> datetime | None:
     made_us = found.made_ns // 1000
     return _EPOCH + timedelta(microseconds=made_us) if made_us else None
 
@@ -208,7 +208,7 @@ def _failure(content: bytes) -> dict[str, str]:
     return fields if {"drive", "error"} <= fields.keys() else {}
 
 
-def _failed_row(found: Found, name: str, content: bytes, tags: Mapping[str, str]) -> Row | None:
+def _failed_row(found: FoundRun, name: str, content: bytes, tags: Mapping[str, str]) -> Row | None:
     """Return the row of a failed run, of which only the reason is known."""
     fields = _failure(content)
     if not fields:

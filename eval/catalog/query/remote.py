@@ -14,7 +14,7 @@ from crosscue.eval.runs.folder import FAILURE, MANIFEST
 from crosscue.replay.errors import LogError, UnreadableRunError, UsageError
 from crosscue.replay.remote.logs import guarded, opened_store
 
-from .local import BESIDE, CUT_SHORT, DEPTH, SCORE, Found, Stamp, is_cut_short
+from .local import BESIDE, CUT_SHORT, DEPTH, SCORE, FoundRun, Stamp, is_cut_short
 
 if TYPE_CHECKING:
     import pyarrow.fs
@@ -45,7 +45,7 @@ class RemoteRuns:
         self._root: Final = root.rstrip("/")
         self._objects: dict[str, dict[str, Mapping[str, Any]]] = {}
 
-    def find(self) -> Iterator[Found]:
+    def find(self) -> Iterator[FoundRun]:
         """Yield every run folder, complete or interrupted.
 
         Raises:
@@ -69,13 +69,13 @@ class RemoteRuns:
                 continue
             if MANIFEST in names:
                 found.append(folder)
-                yield Found(folder, self._stamp(folder, MANIFEST), _time_ns(names[MANIFEST]))
+                yield FoundRun(folder, self._stamp(folder, MANIFEST), _time_ns(names[MANIFEST]))
             elif folder != "." and FAILURE in names:
                 made_ns = _time_ns(names[FAILURE])
-                yield Found(folder, self._stamp(folder, FAILURE), made_ns, FAILURE)
+                yield FoundRun(folder, self._stamp(folder, FAILURE), made_ns, FAILURE)
             elif folder != "." and is_cut_short({*names}):
                 found.append(folder)
-                yield Found(folder, CUT_SHORT, 0)
+                yield FoundRun(folder, CUT_SHORT, 0)
 
     def files(self, run: str) -> list[str]:
         """Return the names of a run's tables, then of its score's tables, tags and failure log."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FORMAT: Final = "format"
 
 
-class Stored:
+class StoredIndex:
     """An index in memory; its tables are opened when they are used."""
 
     def __init__(self, content: bytes, mark: str) -> None:
@@ -59,7 +59,7 @@ class Stored:
             raise ValueError(f"damaged ({one_line(error)})") from None
 
 
-def write(path: Path, mark: str, tables: Mapping[str, pa.Table]) -> None:
+def write_index(path: Path, mark: str, tables: Mapping[str, pa.Table]) -> None:
     """Write an index atomically.
 
     Raises:

@@ -114,7 +114,7 @@ def _checked(tree: object) -> ModelCard:
         raise VehicleError(f"the card with the fit: {one_line(error, 200)}; report it") from None
 
 
-def check_place(card: ModelCard, source: Path, output: Path, *, overwrite: bool) -> None:
+def check_card_place(card: ModelCard, source: Path, output: Path, *, overwrite: bool) -> None:
     """Check before any work that a card can be written to a path and will find its weights there.
 
     Raises:

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from crosscue.detectors.catalog.class_scores import ClassScores, Isotonic, Platt
 from crosscue.detectors.training.platt import fit_isotonic, fit_platt
-from crosscue.eval.scoring.boxes.reliability import reliability
+from crosscue.eval.scoring.boxes.reliability import class_calibration
 from crosscue.eval.scoring.intervals import Interval, wilson
 
-from .threshold import best_bound, fewest_detections, lower_bound, round_between, threshold_for
+from .threshold import best_bound, bounded_threshold, fewest_detections, lower_bound, round_between
 
 CalibrationKind: TypeAlias = Literal["platt", "isotonic", "none"]
 CALIBRATIONS: Final[tuple[CalibrationKind, ...]] = ("platt", "isotonic", "none")
@@ -26,7 +26,7 @@ MIN_EACH: Final = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
+class ClassDetections:
     """Detections of one class in some pictures.
 
     Attributes:
@@ -105,8 +105,8 @@ class ClassFit:
 def fit_class(
     name: str,
     members: tuple[str, ...],
-    chosen_on: Judged,
-    held_out: Judged,
+    chosen_on: ClassDetections,
+    held_out: ClassDetections,
     precision: float,
     confidence: float,
     kind: CalibrationKind,
@@ -135,7 +135,7 @@ def fit_class(
             f"scores not calibrated: {right} right and {n - right} wrong detections, {MIN_EACH} of "
             "each needed"
         )
-    found = threshold_for(chosen_on.scores, chosen_on.is_right, precision, confidence)
+    found = bounded_threshold(chosen_on.scores, chosen_on.is_right, precision, confidence)
     if found is None:
         notes.append(_why_none(chosen_on, precision, confidence))
         scores = None if calibration is None else ClassScores(calibration=calibration)
@@ -158,7 +158,7 @@ def fit_class(
     )
 
 
-def _calibration(judged: Judged, kind: CalibrationKind) -> Platt | Isotonic | None:
+def _calibration(judged: ClassDetections, kind: CalibrationKind) -> Platt | Isotonic | None:
     right = int(judged.is_right.sum())
     if kind == "none" or min(right, len(judged.is_right) - right) < MIN_EACH:
         return None
@@ -171,7 +171,7 @@ def _applied(
     return scores if calibration is None else calibration.probabilities(scores)
 
 
-def _why_none(judged: Judged, precision: float, confidence: float) -> str:
+def _why_none(judged: ClassDetections, precision: float, confidence: float) -> str:
     fewest = fewest_detections(precision, confidence)
     if len(judged.scores) < fewest:
         return f"no threshold: {len(judged.scores)} detections, at least {fewest} needed"
@@ -179,7 +179,7 @@ def _why_none(judged: Judged, precision: float, confidence: float) -> str:
     return f"no threshold reaches {precision:g}: the best lower bound is {best:.3f}"
 
 
-def _held_out(judged: Judged, by: ClassScores, confidence: float) -> HeldOut:
+def _held_out(judged: ClassDetections, by: ClassScores, confidence: float) -> HeldOut:
     after = _applied(by.calibration, judged.scores)
     sure = after > (math.inf if by.threshold is None else by.threshold)
     right, of = int((judged.is_right & sure).sum()), int(sure.sum())
@@ -189,7 +189,7 @@ def _held_out(judged: Judged, by: ClassScores, confidence: float) -> HeldOut:
         judged.labels,
         wilson(right, of),
         lower_bound(right, of, confidence),
-        reliability("", judged.scores, judged.is_right).error,
-        reliability("", after, judged.is_right).error,
+        class_calibration("", judged.scores, judged.is_right).error,
+        class_calibration("", after, judged.is_right).error,
         len(after),
     )

@@ -20,13 +20,13 @@ from crosscue.datasets.truth.box_labels import (
 )
 from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.places import card_path, names
-from crosscue.eval.fit.detector.card_text import check_place, with_fit
+from crosscue.eval.fit.detector.card_text import check_card_place, with_fit
 from crosscue.eval.fit.detector.class_fit import (
     CALIBRATIONS,
     NOT_LABELLED,
     CalibrationKind,
+    ClassDetections,
     ClassFit,
-    Judged,
     fit_class,
 )
 from crosscue.eval.pipeline.run import Run, open_run
@@ -290,7 +290,7 @@ def fit_detector(
     row = _one_detector(whole)
     source = _card_of(row, card, is_needed=output is not None)
     if output is not None and source is not None:
-        check_place(read_card(source), source, Path(output), overwrite=settings.overwrite)
+        check_card_place(read_card(source), source, Path(output), overwrite=settings.overwrite)
     fitted, held = _split(whole[: len(given)], whole[len(given) :], settings.hold_out)
     fits = tuple(
         fit_class(
@@ -366,7 +366,7 @@ class _Pictures:
     def __len__(self) -> int:
         return sum(int(one.sum()) for one in self.chosen)
 
-    def judged(self, name: str, overlap: float) -> Judged:
+    def judged(self, name: str, overlap: float) -> ClassDetections:
         """Match the detections of one class to labels."""
         scores, right, labels = [np.empty(0)], [np.empty(0, np.bool_)], 0
         for run, chosen in zip(self.runs, self.chosen, strict=True):
@@ -377,7 +377,7 @@ class _Pictures:
             scores.append(matched.scores[judged])
             right.append(matched.is_right[0][judged])
             labels += len(matched.labels)
-        return Judged(np.concatenate(scores), np.concatenate(right), labels)
+        return ClassDetections(np.concatenate(scores), np.concatenate(right), labels)
 
 
 def _split(

@@ -68,7 +68,7 @@ def best_bound(
     return max((one.bound for one in found), default=math.nan)
 
 
-def threshold_for(
+def bounded_threshold(
     scores: NDArray[np.float64], is_right: NDArray[np.bool_], precision: float, confidence: float
 ) -> Threshold | None:
     """Return the lowest candidate whose bound is high enough, or None.

@@ -17,18 +17,18 @@ from crosscue.datasets.truth.tum import heading_rad
 from crosscue.detectors.images import Encoded, lose
 from crosscue.eval.logs.log import Log as Drive
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.scoring.pose.score import load_truth, mounting_of
+from crosscue.eval.scoring.pose.score import load_truth, track_mounting
 from crosscue.localization.angles import interpolate_angle
-from crosscue.localization.landmarks.database import LandmarkWriter, Place
+from crosscue.localization.landmarks.database import LandmarkPosition, LandmarkWriter
 from crosscue.localization.landmarks.features import Matcher
-from crosscue.localization.landmarks.images import grey_of, picture_of, read_picture
+from crosscue.localization.landmarks.images import copy_picture, grey_of, read_encoded
 from crosscue.replay.base import Log, Selection
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import AnnotationError, LogError, MissingTopicError, UsageError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.signals.extractor import pictures_of
-from crosscue.replay.signals.plan import camera_of
+from crosscue.replay.signals.plan import chosen_camera
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 # Min number of points of a landmark; pictures of a blank wall or at night have fewer.
@@ -75,7 +75,7 @@ class AddCounts:
     blank: int = 0
 
 
-class Frame(NamedTuple):
+class LogPicture(NamedTuple):
     """One picture of a log."""
 
     t_ns: int
@@ -101,7 +101,7 @@ def read_poses(path: Path, vehicle: Vehicle) -> CameraPoses:
     lever = (vehicle.camera.x_m, vehicle.camera.y_m)
     xy_m = track.xyz_m[:, :2]
     if truth.pose_point != "camera":
-        body = mounting_of(truth, vehicle)
+        body = track_mounting(truth, vehicle)
         heading = heading - body.yaw_rad
         xy_m = xy_m + _turned((lever[0] - body.x_m, lever[1] - body.y_m), heading)
     return CameraPoses(track.t_ns, xy_m, heading, np.zeros((len(xy_m), 2, 2)))
@@ -125,25 +125,27 @@ def _turned(lever_m: tuple[float, float], heading: Floats) -> Floats:
 
 def camera_frames(
     logs: Sequence[Log], vehicle: Vehicle, selection: Selection, ledgers: Sequence[Ledger]
-) -> Iterator[Frame]:
+) -> Iterator[LogPicture]:
     """Yield the camera's pictures of a drive, on the clock that a replay would choose.
 
     Raises:
         VehicleError: The logs have no camera, or several.
     """
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
-    camera = camera_of(topics, vehicle)
+    camera = chosen_camera(topics, vehicle)
     if camera is None:
         raise MissingTopicError("the logs have no camera; use a log with pictures")
     log, topic = logs[camera[0]], camera[1]
     ledger = ledgers[camera[0]]
     for block, pictures in pictures_of(log, camera[0], topic, vehicle, ledger, selection):
         for row, t_ns in enumerate(block.log_ns.tolist()):
-            yield Frame(t_ns, topic.name, picture_of(pictures, row))
+            yield LogPicture(t_ns, topic.name, copy_picture(pictures, row))
 
 
 @contextmanager
-def frames_of(drive: Drive, vehicle: Vehicle) -> Iterator[tuple[Iterator[Frame], list[Ledger]]]:
+def frames_of(
+    drive: Drive, vehicle: Vehicle
+) -> Iterator[tuple[Iterator[LogPicture], list[Ledger]]]:
     """Yield the camera's pictures; warn about missing ones at the end."""
     ledgers = [Ledger(str(log.path)) for log in drive.logs]
     yield camera_frames(drive.logs, vehicle, drive.selection, ledgers), ledgers
@@ -151,7 +153,7 @@ def frames_of(drive: Drive, vehicle: Vehicle) -> Iterator[tuple[Iterator[Frame],
         warn_of(ledger)
 
 
-def drop_picture(ledgers: Sequence[Ledger], frame: Frame, error: LogError) -> None:
+def drop_picture(ledgers: Sequence[Ledger], frame: LogPicture, error: LogError) -> None:
     """Drop a picture that cannot be used, in the one ledger that has counted its topic."""
     ledger = next(one for one in ledgers if frame.topic in one.accounts)
     lose(ledger, frame.topic, frame.t_ns, error)
@@ -160,7 +162,7 @@ def drop_picture(ledgers: Sequence[Ledger], frame: Frame, error: LogError) -> No
 def add_from_log(
     writer: LandmarkWriter,
     matcher: Matcher,
-    frames: Iterator[Frame],
+    frames: Iterator[LogPicture],
     poses: CameraPoses,
     every_m: float,
     sd_m: float,
@@ -209,7 +211,7 @@ def add_from_log(
     return counts
 
 
-def place_at(t_ns: int, poses: CameraPoses, sd_m: float, source: str) -> Place | None:
+def place_at(t_ns: int, poses: CameraPoses, sd_m: float, source: str) -> LandmarkPosition | None:
     """Return the camera's place at a time, named ``source/time``; None if no pose is near."""
     after = int(np.searchsorted(poses.t_ns, t_ns))
     if after == len(poses.t_ns) or (after == 0 and poses.t_ns[0] != t_ns):
@@ -224,7 +226,7 @@ def place_at(t_ns: int, poses: CameraPoses, sd_m: float, source: str) -> Place |
     at = np.array([t_ns], np.int64)
     heading = interpolate_angle(at, poses.t_ns[two], poses.heading_rad[two])
     cov = poses.cov_m2[after] + sd_m**2 * np.eye(2)
-    return Place(f"{source}/{t_ns}", xy_m, cov, float(heading[0]), source)
+    return LandmarkPosition(f"{source}/{t_ns}", xy_m, cov, float(heading[0]), source)
 
 
 def add_from_images(
@@ -244,7 +246,7 @@ def add_from_images(
         counts.pictures += 1
         path = folder / name
         try:
-            features = matcher.describe(grey_of(read_picture(path)))
+            features = matcher.describe(grey_of(read_encoded(path)))
         except LogError as error:
             text = str(error)
             raise type(error)(text if text.startswith(str(path)) else f"{path}: {text}") from None
@@ -260,7 +262,7 @@ _PLACE_COLUMNS: Final = {"image", "x_m", "y_m"}
 _COV_COLUMNS: Final = ("var_x_m2", "cov_xy_m2", "var_y_m2")
 
 
-def read_coordinates(path: Path, source: str) -> Iterator[tuple[str, Place]]:
+def read_coordinates(path: Path, source: str) -> Iterator[tuple[str, LandmarkPosition]]:
     """Yield the picture names and places of a table, as described in ``add_from_images``.
 
     Raises:
@@ -287,7 +289,7 @@ def read_coordinates(path: Path, source: str) -> Iterator[tuple[str, Place]]:
         raise AnnotationError(f"{path}: {why}; give a CSV file in UTF-8") from None
 
 
-def _place_of(row: dict[str, str], where: str, source: str) -> Place:
+def _place_of(row: dict[str, str], where: str, source: str) -> LandmarkPosition:
     def number(column: str) -> float:
         text = row.get(column)
         try:
@@ -311,7 +313,7 @@ def _place_of(row: dict[str, str], where: str, source: str) -> Place:
         cov = np.array([[xx, xy], [xy, yy]])
     heading = number("heading_rad") if row.get("heading_rad") else None
     try:
-        return Place(f"{source}/{row['image']}", xy_m, cov, heading, source)
+        return LandmarkPosition(f"{source}/{row['image']}", xy_m, cov, heading, source)
     except ValueError as error:
         raise AnnotationError(f"{where}: {error}; correct it") from None
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from crosscue.eval.fit.landmarks.database import frames_of, metres, read_poses
-from crosscue.eval.fit.landmarks.pairs import pairs_of_drive, pairs_of_table, with_min_score
+from crosscue.eval.fit.landmarks.pairs import landmark_pairs, pairs_of_drive, with_min_score
 from crosscue.eval.fit.vehicle_output import check_output, write_fit
 from crosscue.eval.logs.log import DriveIfGiven, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
@@ -150,7 +150,7 @@ def fit_landmarks(log: DriveIfGiven, settings: LandmarkFitSettings) -> FittedLan
     comparing = matcher_for(car, settings.matcher)
     pairs, database, poses = settings.pairs, settings.database, settings.poses
     if pairs is not None and log is None and database is None and poses is None:
-        scored = pairs_of_table(Path(pairs), comparing)
+        scored = landmark_pairs(Path(pairs), comparing)
     elif pairs is None and log is not None and database is not None and poses is not None:
         known = read_poses(Path(poses), car)
         with (

@@ -13,12 +13,12 @@ from typing import Final
 import numpy as np
 import tomlkit
 
-from crosscue.eval.fit.landmarks.database import CameraPoses, Frame, drop_picture, place_at
+from crosscue.eval.fit.landmarks.database import CameraPoses, LogPicture, drop_picture, place_at
 from crosscue.localization.angles import wrap
 from crosscue.localization.landmarks.database import LandmarkDatabase, Nearby
-from crosscue.localization.landmarks.features import Features, Matcher
+from crosscue.localization.landmarks.features import Keypoints, Matcher
 from crosscue.localization.landmarks.fit import ScoredPairs
-from crosscue.localization.landmarks.images import grey_of, read_picture
+from crosscue.localization.landmarks.images import grey_of, read_encoded
 from crosscue.replay.errors import AnnotationError, LogError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import toml_document
@@ -32,7 +32,7 @@ SAME_TURN_RAD: Final = math.pi / 4
 _LABELS: Final = {"1": True, "0": False, "true": True, "false": False}
 
 
-def pairs_of_table(path: Path, matcher: Matcher) -> ScoredPairs:
+def landmark_pairs(path: Path, matcher: Matcher) -> ScoredPairs:
     """Score the pairs of a CSV file ``query,known,same``; picture names are relative to its folder.
 
     Raises:
@@ -41,9 +41,9 @@ def pairs_of_table(path: Path, matcher: Matcher) -> ScoredPairs:
     """
 
     @lru_cache(maxsize=256)
-    def features(name: str) -> Features:
+    def features(name: str) -> Keypoints:
         try:
-            return matcher.describe(grey_of(read_picture(path.parent / name)))
+            return matcher.describe(grey_of(read_encoded(path.parent / name)))
         except LogError as error:
             raise type(error)(f"{path.parent / name}: {error}") from None
 
@@ -80,7 +80,7 @@ def _labelled(path: Path) -> Iterator[tuple[str, str, bool]]:
 
 
 def pairs_of_drive(
-    frames: Iterator[Frame],
+    frames: Iterator[LogPicture],
     poses: CameraPoses,
     database: LandmarkDatabase,
     matcher: Matcher,

@@ -13,7 +13,7 @@ from crosscue.replay.files.whole_file import write_whole
 COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c")
 
 
-def draw(
+def draw_range_fits(
     path: Path, cue: str, pairs: RangePairs, fits: list[RangeFit], tested: RangeFit | None
 ) -> None:
     """Write the figure as PNG.

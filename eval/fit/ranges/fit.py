@@ -17,10 +17,10 @@ from crosscue.detectors.ranging.height_to_range import (
 )
 from crosscue.eval.fit.ranges.pairs import (
     RangePairs,
+    concatenate_pairs,
     pairs_of_run,
-    pairs_of_table,
     pairs_of_truth,
-    together,
+    range_pairs,
 )
 from crosscue.replay.errors import EmptyResultError, OutputError, UsageError
 from crosscue.results import HIDDEN, Result
@@ -196,26 +196,26 @@ def fit_ranges(
     names = [name for name in FAMILIES if settings.family in (None, name)]
     found = FittedRanges(cue, tuple(fit_range(*pairs, name, bin_m) for name in names), None)
     if others:
-        tested = together(others)
+        tested = concatenate_pairs(others)
         if not len(tested.range_m):
             raise EmptyResultError(f"test: the drives contain no {cue}; use others")
         found = replace(found, tested=residuals(*tested, found.best.curve, bin_m))
     if picture is not None:
-        from crosscue.eval.fit.ranges.figure import draw
+        from crosscue.eval.fit.ranges.figure import draw_range_fits
 
-        draw(picture, cue, pairs, list(found.fits), found.tested)
+        draw_range_fits(picture, cue, pairs, list(found.fits), found.tested)
     return found
 
 
 def _pairs(cue: str, settings: RangeFitSettings) -> RangePairs:
     if settings.table is not None:
-        return pairs_of_table(Path(settings.table))
+        return range_pairs(Path(settings.table))
     truth = [Path(one) for one in settings.truth]
     if settings.runs:
         given = zip(map(Path, settings.runs), truth, strict=True)
-        pairs = together([pairs_of_run(r, t, cue, settings.min_score) for r, t in given])
+        pairs = concatenate_pairs([pairs_of_run(r, t, cue, settings.min_score) for r, t in given])
     else:
-        pairs = together([pairs_of_truth(path, cue) for path in truth])
+        pairs = concatenate_pairs([pairs_of_truth(path, cue) for path in truth])
     if not len(pairs.range_m):
         raise EmptyResultError(f"truth: the drives contain no {cue} with a range; use others")
     return pairs

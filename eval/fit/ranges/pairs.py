@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from crosscue.datasets.truth.truth import FILE, load
+from crosscue.datasets.truth.truth import FILE, read_truth
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import AnnotationError, SchemaError
@@ -35,13 +35,13 @@ class RangePairs(NamedTuple):
     range_m: Floats
 
 
-def together(parts: Iterable[RangePairs]) -> RangePairs:
+def concatenate_pairs(parts: Iterable[RangePairs]) -> RangePairs:
     """Concatenate sets of pairs."""
     heights, ranges = zip(*parts, strict=True)
     return RangePairs(np.concatenate(heights), np.concatenate(ranges))
 
 
-def pairs_of_table(path: Path) -> RangePairs:
+def range_pairs(path: Path) -> RangePairs:
     """Read pairs from a CSV or Parquet file with the columns ``height_px`` and ``range_m``.
 
     Raises:
@@ -131,7 +131,7 @@ def _paired(rows: list[tuple[int, float]], t_ns: Int64s, range_m: Floats) -> Ran
 
 def _true_ranges(truth: Path, cue: str) -> tuple[Int64s, Floats]:
     """Return the times and true ranges of a drive's pictures, sorted by time."""
-    name = load(truth).ranges
+    name = read_truth(truth).ranges
     if name is None:
         raise SchemaError(f"{truth}: has no ranges; name a file with them as ranges")
     path = _folder(truth) / name
@@ -144,7 +144,7 @@ def _true_ranges(truth: Path, cue: str) -> tuple[Int64s, Floats]:
 
 
 def _objects(truth: Path) -> Any:
-    name = load(truth).objects
+    name = read_truth(truth).objects
     if name is None:
         raise SchemaError(f"{truth}: has no objects; name a COCO file with them as objects")
     path = _folder(truth) / name

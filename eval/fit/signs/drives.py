@@ -10,20 +10,20 @@ from typing import Final
 from crosscue.datasets.truth.objects import OBJECTS_FILE
 from crosscue.detectors.images import encoded, lose
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
-from crosscue.eval.fit.signs.labels import Boxes, Labelled, coco_boxes, read_text
+from crosscue.eval.fit.signs.labels import Boxes, SignPicture, coco_boxes, read_text
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.errors import AnnotationError, MissingTopicError
 from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.limits import DEFAULT_LIMITS, MIB, Limits
 from crosscue.replay.logs.opening import open_log, unless_damaged
 from crosscue.replay.signals.extractor import pictures_of
-from crosscue.replay.signals.plan import camera_of
+from crosscue.replay.signals.plan import chosen_camera
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 MAX_BYTES: Final = 512 * MIB
 
 
-def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[Labelled]:
+def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[SignPicture]:
     """Yield all annotated pictures of a drive's folder, in the order of the log.
 
     Raises:
@@ -46,11 +46,11 @@ def _boxes(path: Path) -> dict[int, Boxes]:
     return found
 
 
-def _pictures(drive: DriveInput, boxes: dict[int, Boxes], limits: Limits) -> Iterator[Labelled]:
+def _pictures(drive: DriveInput, boxes: dict[int, Boxes], limits: Limits) -> Iterator[SignPicture]:
     vehicle = load(drive.vehicle) if drive.vehicle else Vehicle(version=1)
     with open_log(Path(drive.logs[0]), limits) as log:
         with unless_damaged([log]):
-            camera = camera_of([(0, topic) for topic in log.topics], vehicle)
+            camera = chosen_camera([(0, topic) for topic in log.topics], vehicle)
             if camera is None:
                 raise MissingTopicError(
                     f"{log.path}: no camera in the log; signs need its pictures"
@@ -61,5 +61,5 @@ def _pictures(drive: DriveInput, boxes: dict[int, Boxes], limits: Limits) -> Ite
                 if t_ns in boxes:
                     name, picture = f"{log.path} at {t_ns}", encoded(pictures, i)
                     drop = partial(lose, ledger, block.topic, t_ns)
-                    yield Labelled(name, picture, boxes[t_ns], drop)
+                    yield SignPicture(name, picture, boxes[t_ns], drop)
         warn_of(ledger)

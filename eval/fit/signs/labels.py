@@ -24,7 +24,7 @@ Boxes = dict[str, list[tuple[float, float, float, float]]]
 
 
 @dataclass(frozen=True, slots=True)
-class Labelled:
+class SignPicture:
     """One picture and its true signs.
 
     Attributes:
@@ -40,7 +40,7 @@ class Labelled:
     lose: Callable[[LogError], None] | None = None
 
 
-def read_labels(path: Path) -> list[Labelled]:
+def read_sign_labels(path: Path) -> list[SignPicture]:
     """Read a COCO file (.json) or a CSV file; an empty CSV label marks a picture without signs.
 
     Raises:
@@ -67,7 +67,7 @@ def read_text(path: Path, max_bytes: int = MAX_BYTES) -> str:
         raise AnnotationError(f"{path}: is not text; {_WANTED}") from None
 
 
-def _of_coco(text: str, path: Path) -> list[Labelled]:
+def _of_coco(text: str, path: Path) -> list[SignPicture]:
     """Read a COCO file whose pictures are next to it or in a folder ``images`` next to it."""
     found = []
     for image, boxes in coco_boxes(text, path):
@@ -76,7 +76,7 @@ def _of_coco(text: str, path: Path) -> list[Labelled]:
             place = place if place.exists() else path.parent / "images" / image["file_name"]
         except (KeyError, TypeError) as error:
             raise AnnotationError(f"{path}: no COCO file ({error!r}); correct it") from None
-        found.append(Labelled(str(place), place, boxes))
+        found.append(SignPicture(str(place), place, boxes))
     return found
 
 
@@ -107,16 +107,16 @@ def coco_boxes(text: str, path: Path) -> list[tuple[dict[str, Any], Boxes]]:
     return [found[number] for number in sorted(found)]
 
 
-def _of_csv(text: str, path: Path) -> list[Labelled]:
+def _of_csv(text: str, path: Path) -> list[SignPicture]:
     reader = csv.DictReader(text.splitlines())
     if reader.fieldnames is None or set(COLUMNS) - set(reader.fieldnames):
         raise AnnotationError(f"{path}:1: expected the columns {','.join(COLUMNS)}")
-    found: dict[str, Labelled] = {}
+    found: dict[str, SignPicture] = {}
     for row in reader:
         where = f"{path}:{reader.line_num}"
         name = row["picture"] or ""
         place = path.parent / name
-        one = found.setdefault(name, Labelled(str(place), place, {}))
+        one = found.setdefault(name, SignPicture(str(place), place, {}))
         if row["label"]:
             one.boxes.setdefault(row["label"], []).append(_box(row, where))
     if not found:

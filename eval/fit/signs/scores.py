@@ -11,16 +11,16 @@ import numpy as np
 
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.images import decode, read_file
-from crosscue.detectors.training.operating_point import Judged, judge, together
+from crosscue.detectors.training.operating_point import Verdicts, concatenate_verdicts, match_signs
 from crosscue.eval.fit.signs.drives import drive_pictures
-from crosscue.eval.fit.signs.labels import Labelled, read_labels
+from crosscue.eval.fit.signs.labels import SignPicture, read_sign_labels
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 
 @dataclass(frozen=True, slots=True)
-class Rules:
+class ScoringRules:
     """Rules by which detections are scored.
 
     Attributes:
@@ -35,13 +35,17 @@ class Rules:
 
     @property
     def of_judge(self) -> tuple[float, float]:
-        """Arguments of ``judge``."""
+        """Arguments of ``match_signs``."""
         return self.min_overlap, self.min_height_px
 
 
 def judged_pictures(
-    path: Path, detector: Detector, rules: Rules, every: slice, limits: Limits = DEFAULT_LIMITS
-) -> Judged:
+    path: Path,
+    detector: Detector,
+    rules: ScoringRules,
+    every: slice,
+    limits: Limits = DEFAULT_LIMITS,
+) -> Verdicts:
     """Return a detector's detections in pictures of a file or drive, judged by the labels.
 
     Args:
@@ -57,14 +61,14 @@ def judged_pictures(
         SchemaError: A drive has no truth, or its truth is invalid.
     """
     chosen = islice(_labelled(path, limits), every.start, every.stop, every.step)
-    return together([_judged(one, detector, rules) for one in chosen])
+    return concatenate_verdicts([_judged(one, detector, rules) for one in chosen])
 
 
-def _labelled(path: Path, limits: Limits) -> Iterator[Labelled]:
-    yield from drive_pictures(path, limits) if path.is_dir() else read_labels(path)
+def _labelled(path: Path, limits: Limits) -> Iterator[SignPicture]:
+    yield from drive_pictures(path, limits) if path.is_dir() else read_sign_labels(path)
 
 
-def _judged(one: Labelled, detector: Detector, rules: Rules) -> Judged:
+def _judged(one: SignPicture, detector: Detector, rules: ScoringRules) -> Verdicts:
     try:
         picture = read_file(one.picture) if isinstance(one.picture, Path) else one.picture
         pixels, size = decode(picture, detector.view)
@@ -73,7 +77,7 @@ def _judged(one: Labelled, detector: Detector, rules: Rules) -> Judged:
     except LogError as error:
         if one.lose is not None:
             one.lose(error)
-            return together([])
+            return concatenate_verdicts([])
         raise type(error)(f"{one.name}: {error}; repair the picture or leave it out") from None
     width, height = size
     found = detector([Frame(0, one.name, pixels, size)])[0]
@@ -87,5 +91,7 @@ def _judged(one: Labelled, detector: Detector, rules: Rules) -> Judged:
                 f"{one.name}: a box lies outside its {width} x {height} px; correct it"
             )
         which = np.array([name == label for name in found.labels], np.bool_)
-        parts.append(judge(found.boxes_px[which], found.scores[which], truth, *rules.of_judge))
-    return together(parts)
+        parts.append(
+            match_signs(found.boxes_px[which], found.scores[which], truth, *rules.of_judge)
+        )
+    return concatenate_verdicts(parts)

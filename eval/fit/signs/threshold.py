@@ -12,8 +12,13 @@ import numpy as np
 
 from crosscue.detectors.signs.detector import build
 from crosscue.detectors.signs.templates import AMERICAN, KINDS, Kind
-from crosscue.detectors.training.operating_point import Judged, rates_at, threshold_for, together
-from crosscue.eval.fit.signs.scores import Rules, judged_pictures
+from crosscue.detectors.training.operating_point import (
+    Verdicts,
+    concatenate_verdicts,
+    rates_at,
+    threshold_at_precision,
+)
+from crosscue.eval.fit.signs.scores import ScoringRules, judged_pictures
 from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, fraction
 from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
@@ -43,8 +48,8 @@ class SignFit(Result):
     """
 
     threshold: float | None = field(metadata=json_key("min_score"))
-    chosen_on: Sequence[Judged] = field(metadata=HIDDEN)
-    others: Sequence[Judged] = field(metadata=HIDDEN)
+    chosen_on: Sequence[Verdicts] = field(metadata=HIDDEN)
+    others: Sequence[Verdicts] = field(metadata=HIDDEN)
 
     also: ClassVar = {"chosen_on": "chosen_rates", "other_frames": "other_rates"}
 
@@ -181,12 +186,12 @@ def fit_signs(labels: Sequence[Path | str], settings: SignFitSettings) -> SignFi
         levels=settings.levels,
         points=settings.points,
     )
-    rules = Rules(settings.label, settings.overlap, settings.min_height_px)
+    rules = ScoringRules(settings.label, settings.overlap, settings.min_height_px)
     fit = slice(0, None, 1 if test else 2)
     rest = slice(0 if test else 1, None, settings.test_every * fit.step)
     work = [(Path(path), fit) for path in labels]
     work += [(Path(path), rest) for path in test or labels]
-    parts: list[Judged] = []
+    parts: list[Verdicts] = []
     for path, which in work:
         parts.append(judged_pictures(path, detector, rules, which, settings.limits))
         emit(Progress("looking", len(parts), len(work), "sets"))
@@ -195,7 +200,9 @@ def fit_signs(labels: Sequence[Path | str], settings: SignFitSettings) -> SignFi
         wanted = " or ".join(settings.label)
         raise EmptyResultError(f"{labels[0]}: no {wanted} in the pictures to choose on; add some")
     if threshold is None:
-        threshold = _shown(threshold_for(together(chosen_on), settings.precision))
+        threshold = _shown(
+            threshold_at_precision(concatenate_verdicts(chosen_on), settings.precision)
+        )
     return SignFit(threshold, chosen_on, others)
 
 

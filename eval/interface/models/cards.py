@@ -12,14 +12,14 @@ from typing import Final
 from crosscue.datasets.truth.box_labels import class_names_given
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.catalog.architectures import WEIGHTS_SUFFIXES
-from crosscue.detectors.catalog.draft import Draft, draft
+from crosscue.detectors.catalog.draft import Draft, draft_card_text
 from crosscue.detectors.catalog.places import card_named
 from crosscue.detectors.catalog.recognise import closed, guesses, plausible, read_interface
 from crosscue.detectors.decoders.base import Guess, Interface
 from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.networks.trial import fault_seen
-from crosscue.detectors.overlay import picture_of
+from crosscue.detectors.overlay import encode_overlay
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import LogError, UsageError, VehicleError
 from crosscue.replay.files.whole_file import write_bytes, write_text
@@ -151,7 +151,7 @@ def draft_card(
     else:
         model = read_interface(path)
         guess = _guess(path, closed(path, model, size), kind)
-    written = draft(
+    written = draft_card_text(
         path, model, guess, () if class_names is None else class_names_given(class_names), size
     )
     if picture is None:
@@ -294,5 +294,5 @@ def _look(detector: Detector, picture: Path, output: Path) -> Detections | None:
     """
     pixels, size = _pixels_of(picture)
     (found,) = detector([Frame(0, "", pixels, size)])
-    write_bytes(output, picture_of(pixels, found))
+    write_bytes(output, encode_overlay(pixels, found))
     return found if isinstance(found, Detections) else None

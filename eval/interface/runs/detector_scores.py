@@ -16,8 +16,8 @@ from crosscue.eval.report.detector_page import write_detector_page
 from crosscue.eval.report.worst_boxes import worst_pictures
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
-from crosscue.eval.scoring.boxes.reliability import Reliability, reliability
-from crosscue.eval.scoring.boxes.scores import SEED, Measured, PartScore, score_parts
+from crosscue.eval.scoring.boxes.reliability import Reliability, class_calibration
+from crosscue.eval.scoring.boxes.scores import SEED, IntervalEstimate, PartScore, score_parts
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.tree_text import strict_json
@@ -157,7 +157,7 @@ def _number(value: float) -> str:
     return "-" if np.isnan(value) else f"{value:.3f}"
 
 
-def _span(one: Measured) -> str:
+def _span(one: IntervalEstimate) -> str:
     if np.isnan(one.value):
         return "-"
     ends = "" if np.isnan(one.low) else f" ({one.low:.2f}-{one.high:.2f})"
@@ -174,7 +174,7 @@ def _row(one: PartScore) -> dict[str, object]:
         "threshold": one.threshold,
     }
     for name in MEASURES:
-        found: Measured = getattr(one, name)
+        found: IntervalEstimate = getattr(one, name)
         row |= {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
     return row
 
@@ -276,5 +276,5 @@ def calibration_of(of: LabelledRun, overlap: float) -> tuple[Reliability, ...]:
     for k, name in enumerate(of.classes):
         matched = match(of.truth, of.found, k, overlaps=np.array([overlap]))
         judged = ~matched.is_out[0] & bool(len(matched.labels))
-        found.append(reliability(name, matched.scores[judged], matched.is_right[0][judged]))
+        found.append(class_calibration(name, matched.scores[judged], matched.is_right[0][judged]))
     return tuple(found)

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence, Set
 from types import MappingProxyType
 from typing import Final
 
-from crosscue.detectors.cues.observed import Role, all_labels
+from crosscue.detectors.cues.observed import DetectorRole, all_labels
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.replay.vehicle.cue_table import CUES
 
@@ -53,7 +53,7 @@ def not_looked_for(
         without: Cues that ``needing_masks`` returned.
     """
     roles = {one.role for one in detectors}
-    finders = [one for one in detectors if one.role in (Role.OBJECTS, Role.SIGNS)]
+    finders = [one for one in detectors if one.role in (DetectorRole.OBJECTS, DetectorRole.SIGNS)]
     labels = all_labels(one.labels for one in finders)
 
     def why(cue: str) -> str:
@@ -61,14 +61,14 @@ def not_looked_for(
         if observed_by == "mobileye":
             return NO_MOBILEYE
         if observed_by == "road":
-            return NEVER if Role.ROAD in roles else NO_ROAD
+            return NEVER if DetectorRole.ROAD in roles else NO_ROAD
         if cue in without:
             return NO_MASKS
         wanted = cue_labels[cue]
         if labels is not None and finders and wanted and labels.isdisjoint(wanted):
             return NO_LABEL
         can_be_signs = observed_by == "signs" or cue not in CUES
-        has_any = bool(finders) if can_be_signs else Role.OBJECTS in roles
+        has_any = bool(finders) if can_be_signs else DetectorRole.OBJECTS in roles
         if has_any and observed_by == "car pairs" and not_followed:
             return max(not_followed, key=lambda why: not_followed[why])
         if has_any and cue in CUES and CUES[cue].group == "cars_past":

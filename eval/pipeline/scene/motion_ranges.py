@@ -29,10 +29,10 @@ from numpy.typing import NDArray
 from crosscue.detectors.base import Detections
 from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.detectors.ranging.object_tracks import (
+    CarStep,
     Facing,
-    Motion,
+    ObjectTrack,
     ObjectTracks,
-    Track,
     difference_var_m2,
 )
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
@@ -115,7 +115,7 @@ class MotionRanges:
         # The variance of slip_per_sqrt_m is not used: the tracks have scale_sd of the distance.
         slip_m2 = self.vehicle.odometry.slip_per_sqrt_m**2 * abs(evidence.travelled_m or 0.0)
         var_m2 = max(evidence.travelled_var_m2 - slip_m2, 0.0)
-        motion = Motion(evidence.travelled_m, var_m2, turned_rad, seconds)
+        motion = CarStep(evidence.travelled_m, var_m2, turned_rad, seconds)
         ranges: dict[Reference, RangePosterior] = {}
         objects: list[RangedObject] = []
         for row, (cue, _) in enumerate(MEASURED):
@@ -159,7 +159,7 @@ class _Chain:
     counts: Counter[str]
     choices: dict[Reference, _Choice]
 
-    def __call__(self, motion: Motion, boxes: Usable) -> list[RangePosterior]:
+    def __call__(self, motion: CarStep, boxes: Usable) -> list[RangePosterior]:
         tracks = self.tracks(motion, boxes.boxes_px, boxes.heights_px, boxes.lenses)
         for choice in self.choices.values():
             choice.go_on(motion)
@@ -190,7 +190,7 @@ class _Chain:
             if one.is_seen
         ]
 
-    def _posteriors(self, chosen: dict[Reference, Track | None]) -> list[RangePosterior]:
+    def _posteriors(self, chosen: dict[Reference, ObjectTrack | None]) -> list[RangePosterior]:
         """Return the ranges of the chosen objects that were observed in this frame."""
         camera, ranges = self.vehicle.camera, self.vehicle.ranges
         found = []
@@ -214,13 +214,13 @@ class _Chain:
         return found
 
 
-def _end_candidates(tracks: Sequence[Track]) -> list[Track]:
+def _end_candidates(tracks: Sequence[ObjectTrack]) -> list[ObjectTrack]:
     """Return the lights facing the vehicle, or, if none does, those of unknown facing."""
     facing = [one for one in tracks if one.facing is Facing.EGO]
     return facing or [one for one in tracks if one.facing is Facing.UNKNOWN]
 
 
-def _start_candidates(tracks: Sequence[Track], end: Track | None) -> list[Track]:
+def _start_candidates(tracks: Sequence[ObjectTrack], end: ObjectTrack | None) -> list[ObjectTrack]:
     """Return the lights that may mark the start.
 
     These are lights facing away or, if the end is known, of known facing and clearly nearer.
@@ -255,7 +255,7 @@ class _Choice:
     chosen: int | None = None
     _held: _Held | None = None
 
-    def go_on(self, motion: Motion) -> None:
+    def go_on(self, motion: CarStep) -> None:
         """Predict the held range to the next frame."""
         if self._held is not None:
             self._held.range_m -= motion.way_m or 0.0
@@ -263,7 +263,7 @@ class _Choice:
             if motion.way_m is None or self._held.range_m <= 0.0:
                 self._held = None
 
-    def __call__(self, tracks: Sequence[Track]) -> Track | None:
+    def __call__(self, tracks: Sequence[ObjectTrack]) -> ObjectTrack | None:
         """Choose among the tracks that may mark the reference."""
         best = self._best(tracks)
         if best is None:
@@ -276,7 +276,7 @@ class _Choice:
         self._held = _Held(best.range_m, best.var_m2, best.seen)
         return best
 
-    def _best(self, tracks: Sequence[Track]) -> Track | None:
+    def _best(self, tracks: Sequence[ObjectTrack]) -> ObjectTrack | None:
         eligible = [one for one in tracks if self._is_eligible(one)]
         if not eligible:
             return None
@@ -294,7 +294,7 @@ class _Choice:
         often = 0.5 * max(one.seen for one in group)
         return max((one for one in group if one.seen >= often), key=lambda one: sign * one.range_m)
 
-    def _is_eligible(self, one: Track) -> bool:
+    def _is_eligible(self, one: ObjectTrack) -> bool:
         settings = self.vehicle.range_filter
         sd_m = math.sqrt(one.var_m2)
         if one.seen < settings.begin_after or sd_m > settings.max_sd_m:
@@ -308,6 +308,6 @@ class _Choice:
         return off_m <= CLEARLY * math.sqrt(one.var_m2 + held.var_m2)
 
 
-def _is_apart(one: Track, other: Track) -> bool:
+def _is_apart(one: ObjectTrack, other: ObjectTrack) -> bool:
     """Return whether two tracks are clearly at different ranges."""
     return abs(one.range_m - other.range_m) > CLEARLY * math.sqrt(difference_var_m2(one, other))

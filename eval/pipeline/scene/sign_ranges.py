@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.cues.candidates import Candidates, scores_of, thresholds_met
+from crosscue.detectors.cues.candidates import Candidates, label_scores, thresholds_met
 from crosscue.detectors.ranging.height_to_range import range_of
 from crosscue.eval.pipeline.scene.usable import MEASURED, source_of, why_not
 from crosscue.fusion.evidence import SignRange
@@ -67,5 +67,5 @@ class SignRanges:
                     ranges.append(SignRange(reference, range_m, curve.residual_sd_m**2))
         counted = self.by_cue.setdefault(cue.name, Candidates("detections", setting, threshold))
         counted.meet(thresholds_met(found, labels, threshold))
-        counted.take(scores_of(found, labels), skipped)
+        counted.take(label_scores(found, labels), skipped)
         return ranges

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import Place, Seen
+from crosscue.detectors.cues.observed import FrameDetections, Place
 from crosscue.detectors.cues.tally import CueTally
-from crosscue.detectors.ranging.object_tracks import Motion
+from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.eval.pipeline.progress import report_time
 from crosscue.eval.pipeline.scene.looked_for import needing_masks, not_looked_for
 from crosscue.eval.pipeline.scene.motion_ranges import MotionRanges, RangedObject
@@ -155,7 +155,7 @@ class EgoMotion:
     without_odometry: int = 0
     _last_ns: int | None = None
 
-    def __call__(self, t_ns: int) -> tuple[FrameEvidence, Motion]:
+    def __call__(self, t_ns: int) -> tuple[FrameEvidence, CarStep]:
         """Return the motion since the previous frame, as evidence and in the trackers' form."""
         way = self.odometer.until(t_ns)
         gap_ns = 0 if self._last_ns is None else t_ns - self._last_ns
@@ -173,7 +173,7 @@ class EgoMotion:
             turned_rad=turned_rad,
             assumed_m=way.assumed_m,
         )
-        return evidence, Motion(travelled_m, way.var_m2, turned_rad or 0.0, max(gap_ns, 0) * 1e-9)
+        return evidence, CarStep(travelled_m, way.var_m2, turned_rad or 0.0, max(gap_ns, 0) * 1e-9)
 
     def restart(self, t_ns: int) -> None:
         """Ignore the odometry before ``t_ns``."""
@@ -196,7 +196,7 @@ class _Scene:
     positive: Counter[str] = field(default_factory=Counter)
     looked: set[str] = field(default_factory=set)
     summaries: dict[int, ApproachSummary] = field(default_factory=dict)
-    _before: Seen | None = None
+    _before: FrameDetections | None = None
     _ranges: tuple[RangeRow, ...] = ()
 
     def __post_init__(self) -> None:
@@ -233,13 +233,13 @@ class _Scene:
         self.rows.add(step)
         self._sum_up(step)
 
-    def _place(self, ego: Motion) -> Place | None:
+    def _place(self, ego: CarStep) -> Place | None:
         """Return the intersection's place in this frame, predicted from the previous frame."""
         if ego.way_m is None:
             return None
-        return place_of(self._ranges, ego.way_m, self.vehicle.fusion.length_m)
+        return intersection_place(self._ranges, ego.way_m, self.vehicle.fusion.length_m)
 
-    def _is_new(self, seen: Seen) -> bool:
+    def _is_new(self, seen: FrameDetections) -> bool:
         """Return False for a repeated picture, recognized by bit-identical detections.
 
         Only beliefs that depend on successive frames need this.
@@ -279,7 +279,7 @@ class _Scene:
             one.reference = str(step.ranges[0].reference)
 
 
-def place_of(ranges: Sequence[RangeRow], way_m: float, length_m: float) -> Place | None:
+def intersection_place(ranges: Sequence[RangeRow], way_m: float, length_m: float) -> Place | None:
     """Return an intersection's place after ``way_m`` of travel; None without any range.
 
     Args:
@@ -300,7 +300,7 @@ def place_of(ranges: Sequence[RangeRow], way_m: float, length_m: float) -> Place
     return Place(start_m, end_m, max(one.var_m2 for one in ranges) ** 0.5)
 
 
-def _is_repeated(before: Seen, now: Seen) -> bool:
+def _is_repeated(before: FrameDetections, now: FrameDetections) -> bool:
     """Return whether both frames have the same results and at least one detection."""
     if len(before.boxes) != len(now.boxes) or not any(map(len, now.boxes)):
         return False
@@ -412,7 +412,7 @@ def gives_reasons(vehicle: Vehicle) -> bool:
     return vehicle.fusion.kind == "persistent"
 
 
-def schemas(
+def scene_schemas(
     features: Sequence[str] = FEATURES, *, gives_reasons: bool = False
 ) -> dict[str, pa.Schema]:
     """Return the schemas of the tables that this stage writes."""

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from crosscue.eval.pipeline.scene.stage import estimate_scene, features_of, gives_reasons, schemas
+from crosscue.eval.pipeline.scene.stage import (
+    estimate_scene,
+    features_of,
+    gives_reasons,
+    scene_schemas,
+)
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.labelled import with_labels
 from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
@@ -35,7 +40,7 @@ def scene_tables(
     if detected is None:
         raise RunError(f"{run.path}: no detector ran on its camera; replay with detectors")
     settings = manifest.settings if vehicle is None else vehicle
-    wanted = schemas(features_of(settings), gives_reasons=gives_reasons(settings))
+    wanted = scene_schemas(features_of(settings), gives_reasons=gives_reasons(settings))
     parts: dict[str, list[pa.Table]] = {
         name: [schema.empty_table()] for name, schema in wanted.items()
     }

@@ -26,7 +26,7 @@ LABELS: Final = frozenset({"segment", "log_t_ns"})
 
 
 @dataclass(frozen=True, slots=True)
-class Gap:
+class ClockGap:
     """A span of the log's clock without measurements, or one that occurs twice.
 
     Attributes:
@@ -45,7 +45,7 @@ class Gap:
         return (self.start_ns + self.end_ns) // 2
 
 
-def gaps_of(timeline: Timeline) -> tuple[Gap, ...]:
+def gaps_of(timeline: Timeline) -> tuple[ClockGap, ...]:
     """Return the gaps of a drive on its log's clock, in order, for charts over time."""
     ordered = sorted(timeline.segments, key=lambda one: one.log_start_ns)
     found = []
@@ -53,11 +53,11 @@ def gaps_of(timeline: Timeline) -> tuple[Gap, ...]:
         start_ns, end_ns = sorted((one.log_end_ns, other.log_start_ns))
         is_silence = other.cause is Cause.SILENCE and other.number == one.number + 1
         what = f"gap of {(end_ns - start_ns) * 1e-9:.1f} s" if is_silence else Cause.SET_BACK.value
-        found.append(Gap(start_ns, end_ns, what))
+        found.append(ClockGap(start_ns, end_ns, what))
     return tuple(found)
 
 
-def broken_at(gaps: Sequence[Gap], t_ns: Int64s) -> Int64s:
+def broken_at(gaps: Sequence[ClockGap], t_ns: Int64s) -> Int64s:
     """Return the sorted indices of the rows before which a line is interrupted, shape (K,)."""
     rows = np.searchsorted(t_ns, [one.middle_ns for one in gaps]).astype(np.int64)
     return np.unique(rows[(rows > 0) & (rows < len(t_ns))])

@@ -40,7 +40,7 @@ NUMBERS: Final = (
 )
 
 
-def schema() -> pa.Schema:
+def measurement_schema() -> pa.Schema:
     """Return the schema of ``measurements.parquet``."""
     import pyarrow as pa
 

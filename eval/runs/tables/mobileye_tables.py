@@ -39,7 +39,7 @@ TABLES: Final[Mapping[Signal, tuple[str, tuple[str, ...]]]] = {
 }
 
 
-def schema(signal: Signal) -> pa.Schema:
+def mobileye_schema(signal: Signal) -> pa.Schema:
     """Return the schema of one of the two tables."""
     import pyarrow as pa
 
@@ -52,7 +52,7 @@ class MobileyeSink:
     def __init__(self, run: TableFolder, timeline: Timeline, clock: LogClock) -> None:
         self._stack: Final = ExitStack()
         self._sinks: Final = {
-            signal: LabelledSink(run, name, schema(signal), timeline, clock)
+            signal: LabelledSink(run, name, mobileye_schema(signal), timeline, clock)
             for signal, (name, _) in TABLES.items()
         }
 

@@ -11,7 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections, Found, RoadMask
-from crosscue.detectors.cues.observed import RoadFractions, Role, Seen, all_labels
+from crosscue.detectors.cues.observed import (
+    DetectorRole,
+    FrameDetections,
+    RoadFractions,
+    all_labels,
+)
 from crosscue.eval.runs.manifest import DetectorRow
 
 from .parquet import TableFolder
@@ -29,7 +34,7 @@ class StoredFrame:
         heights_px: Number of rows that each mask spans, one array per item of ``seen.objects``.
     """
 
-    seen: Seen
+    seen: FrameDetections
     size_px: tuple[int, int]
     heights_px: tuple[NDArray[np.float64], ...]
 
@@ -105,10 +110,12 @@ def stored_frames(
         RunError: A table is missing or damaged.
     """
     scores_of = {d.name: d.min_scores for d in detectors}
-    objects = [d.name for d in detectors if d.role == Role.OBJECTS]
-    signs = [d.name for d in detectors if d.role == Role.SIGNS]
-    labels = all_labels(d.labels for d in detectors if d.role in (Role.OBJECTS, Role.SIGNS))
-    has_road = any(d.role == Role.ROAD for d in detectors)
+    objects = [d.name for d in detectors if d.role == DetectorRole.OBJECTS]
+    signs = [d.name for d in detectors if d.role == DetectorRole.SIGNS]
+    labels = all_labels(
+        d.labels for d in detectors if d.role in (DetectorRole.OBJECTS, DetectorRole.SIGNS)
+    )
+    has_road = any(d.role == DetectorRole.ROAD for d in detectors)
     found = _Rows(run.batches("detections", ["frame", *FOUND]), FOUND)
     columns = MASK if with_road_masks else SHARES
     road = _Rows(run.batches("road", ["frame", *columns]), columns)
@@ -130,7 +137,7 @@ def stored_frames(
                 for names in (objects, signs)
             )
             yield StoredFrame(
-                Seen(
+                FrameDetections(
                     t_ns,
                     some,
                     others,

@@ -20,8 +20,8 @@ from crosscue.datasets.truth.annotations import time_in_name
 from crosscue.datasets.truth.box_labels import BoxLabels, LabelPicture
 from crosscue.detectors.base import MIN_SCORE
 from crosscue.detectors.boxes import is_best_label
-from crosscue.detectors.catalog.class_names import meaning_of
-from crosscue.detectors.cues.observed import Role
+from crosscue.detectors.catalog.class_names import cue_label
+from crosscue.detectors.cues.observed import DetectorRole
 from crosscue.detectors.decoders.base import DEFAULT_OVERLAP
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.logs import reopened
@@ -30,7 +30,7 @@ from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import EmptyResultError, SchemaError, UsageError
 from crosscue.replay.readers.images.folder import picture_names
 
-from .matching import NOBODY, Boxes
+from .matching import NOBODY, LabelledBoxes
 
 OTHER_LOG: Final = "images that are not in the run"
 OTHER_CLASS: Final = "boxes of classes that the detector does not report"
@@ -65,8 +65,8 @@ class LabelledRun:
     detector: DetectorRow
     classes: tuple[str, ...]
     members: Mapping[str, tuple[str, ...]]
-    truth: Boxes
-    found: Boxes
+    truth: LabelledBoxes
+    found: LabelledBoxes
     t_ns: Int64s
     sizes_px: tuple[tuple[int, int], ...]
     names: tuple[str, ...]
@@ -91,7 +91,7 @@ class LabelledRun:
         thresholds = self.detector.min_scores
         return max(thresholds.get(label, MIN_SCORE) for label in self.members[name])
 
-    def part(self, is_chosen: np.typing.NDArray[np.bool_]) -> tuple[Boxes, Boxes]:
+    def part(self, is_chosen: np.typing.NDArray[np.bool_]) -> tuple[LabelledBoxes, LabelledBoxes]:
         """Return labels and detections of the chosen pictures, shape (P,), renumbered."""
         return (
             self.truth.taken(is_chosen[self.truth.picture]),
@@ -161,7 +161,9 @@ def labelled_run(
 
 
 def _detector(run: RunFolder, detected: DetectManifest, asked: str | None) -> DetectorRow:
-    some = [one for one in detected.detectors if one.role in (Role.OBJECTS, Role.SIGNS)]
+    some = [
+        one for one in detected.detectors if one.role in (DetectorRole.OBJECTS, DetectorRole.SIGNS)
+    ]
     named = [one for one in some if one.name == asked] if asked is not None else some
     if len(named) == 1:
         return named[0]
@@ -266,7 +268,7 @@ def _classes(
         if name in meanings:
             of_labels[name] = meanings[name] or None
             continue
-        same = plain.get(_plain(name)) or meaning_of(name)
+        same = plain.get(_plain(name)) or cue_label(name)
         if same in of_found and of_found[same] is not None:
             of_labels[name] = of_found[same]
     both = {one for one in of_labels.values() if one} & {one for one in of_found.values() if one}
@@ -325,10 +327,10 @@ def _truth(
 def _as_boxes(
     rows: Sequence[tuple[int, str | None, tuple[float, float, float, float], bool, float]],
     numbers: Mapping[str, int],
-) -> Boxes:
+) -> LabelledBoxes:
     picture, means, boxes, is_ignored, range_m = zip(*rows, strict=True)
     label = [NOBODY if one is None else numbers.get(one, NOBODY - 1) for one in means]
-    found = Boxes(
+    found = LabelledBoxes(
         np.array(picture, np.int64),
         np.array(label, np.int64),
         np.array(boxes, np.float64).reshape(-1, 4),
@@ -346,7 +348,7 @@ def _found(
     of_found: Mapping[str, str | None],
     numbers: Mapping[str, int],
     left_out: Counter[str],
-) -> tuple[Boxes, dict[str, int]]:
+) -> tuple[LabelledBoxes, dict[str, int]]:
     """Return the detector's boxes in labelled frames, and counts of unjudged ones by label.
 
     Boxes of objects for which another detector had priority are included. Of labels that count as
@@ -382,7 +384,7 @@ def _found(
         if count:
             left_out[f"detections of {name} {OTHER_LABEL}"] += count
     columns = columns[is_kept]
-    boxes = Boxes(
+    boxes = LabelledBoxes(
         columns[:, 0].astype(np.int64),
         columns[:, 1].astype(np.int64),
         columns[:, 3:7],

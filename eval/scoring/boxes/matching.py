@@ -28,7 +28,7 @@ NOBODY: Final = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Boxes:
+class LabelledBoxes:
     """N boxes in labelled pictures, as columns.
 
     Attributes:
@@ -64,9 +64,9 @@ class Boxes:
         """Areas, shape (N,)."""
         return np.asarray(np.prod(self.boxes_px[:, 2:] - self.boxes_px[:, :2], axis=1))
 
-    def taken(self, rows: Bools | Int64s) -> Boxes:
+    def taken(self, rows: Bools | Int64s) -> LabelledBoxes:
         """Return the boxes of some rows."""
-        return Boxes(
+        return LabelledBoxes(
             self.picture[rows],
             self.label[rows],
             self.boxes_px[rows],
@@ -77,7 +77,7 @@ class Boxes:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class BoxSelection:
     """Selection of the boxes to judge, by area and by range.
 
     Attributes:
@@ -90,7 +90,7 @@ class Part:
     areas_px2: tuple[float, float] = (0.0, 1e10)
     ranges_m: tuple[float, float] | None = None
 
-    def holds(self, boxes: Boxes) -> Bools:
+    def holds(self, boxes: LabelledBoxes) -> Bools:
         """Return True for boxes of this part, shape (N,)."""
         low, high = self.areas_px2
         areas = boxes.areas_px2
@@ -101,15 +101,17 @@ class Part:
         return np.asarray(inside)
 
 
-ALL: Final = Part("all")
+ALL: Final = BoxSelection("all")
 # COCO's sizes, in pixels of the camera's picture.
 SIZES: Final = (
-    Part("small", (0.0, 32.0**2)),
-    Part("medium", (32.0**2, 96.0**2)),
-    Part("large", (96.0**2, 1e10)),
+    BoxSelection("small", (0.0, 32.0**2)),
+    BoxSelection("medium", (32.0**2, 96.0**2)),
+    BoxSelection("large", (96.0**2, 1e10)),
 )
 RANGES: Final = tuple(
-    Part(f"{low:g} to {high:g} m" if np.isfinite(high) else f"over {low:g} m", ranges_m=(low, high))
+    BoxSelection(
+        f"{low:g} to {high:g} m" if np.isfinite(high) else f"over {low:g} m", ranges_m=(low, high)
+    )
     for low, high in ((0.0, 20.0), (20.0, 40.0), (40.0, 60.0), (60.0, np.inf))
 )
 
@@ -146,7 +148,11 @@ class Matched:
 
 
 def match(
-    truth: Boxes, found: Boxes, label: int, part: Part = ALL, overlaps: Floats = OVERLAPS
+    truth: LabelledBoxes,
+    found: LabelledBoxes,
+    label: int,
+    part: BoxSelection = ALL,
+    overlaps: Floats = OVERLAPS,
 ) -> Matched:
     """Match one class in all pictures.
 

@@ -63,7 +63,7 @@ class Reliability:
     detections: int
 
 
-def reliability(label: str, scores: NDArray[np.float64], is_right: Bools) -> Reliability:
+def class_calibration(label: str, scores: NDArray[np.float64], is_right: Bools) -> Reliability:
     """Return the calibration of one class.
 
     Args:

@@ -26,7 +26,7 @@ from crosscue.eval.scoring.intervals import (
     fraction_by_cluster,
 )
 
-from .matching import ALL, OVERLAPS, RANGES, SIZES, Boxes, Matched, Part, match
+from .matching import ALL, OVERLAPS, RANGES, SIZES, BoxSelection, LabelledBoxes, Matched, match
 
 RECALLS: Final = np.linspace(0.0, 1.0, 101)
 ROUNDS: Final = 1000
@@ -34,7 +34,7 @@ SEED: Final = 0
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class IntervalEstimate:
     """A number with its 95 % interval; NaN if undefined."""
 
     value: float
@@ -42,7 +42,7 @@ class Measured:
     high: float
 
 
-_UNKNOWN: Final = Measured(math.nan, math.nan, math.nan)
+_UNKNOWN: Final = IntervalEstimate(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,15 +69,15 @@ class PartScore:
     right: int
     wrong: int
     threshold: float
-    ap: Measured
-    ap50: Measured
-    precision: Measured
-    recall: Measured
+    ap: IntervalEstimate
+    ap50: IntervalEstimate
+    precision: IntervalEstimate
+    recall: IntervalEstimate
 
 
 def score_parts(
-    truth: Boxes,
-    found: Boxes,
+    truth: LabelledBoxes,
+    found: LabelledBoxes,
     classes: Sequence[str],
     thresholds: Mapping[str, float],
     blocks: NDArray[np.int64],
@@ -215,7 +215,7 @@ class _Row:
     def labels(self) -> int:
         return len(self.matched.labels)
 
-    def scored(self, label: str, part: Part, threshold: float) -> PartScore:
+    def scored(self, label: str, part: BoxSelection, threshold: float) -> PartScore:
         sure = self.matched.scores > threshold
         right = self.matched.picture[self.matched.is_right[-1] & sure]
         wrong = self.matched.picture[self.matched.is_wrong[-1] & sure]
@@ -236,7 +236,7 @@ class _Row:
 def _mean(rows: Sequence[_Row], some: Sequence[PartScore]) -> PartScore:
     """Return the mean over classes with labels, as in COCO; counts are summed."""
 
-    def over(name: str) -> Measured:
+    def over(name: str) -> IntervalEstimate:
         rounds = np.stack([getattr(row, f"{name}_rounds") for row in rows]).mean(axis=0)
         value = float(np.mean([getattr(row, name)[0] for row in rows]))
         return _measured(value, rounds, rows[0].blocks)
@@ -255,8 +255,10 @@ def _mean(rows: Sequence[_Row], some: Sequence[PartScore]) -> PartScore:
     )
 
 
-def _measured(value: float, rounds: NDArray[np.float64], blocks: NDArray[np.int64]) -> Measured:
-    return Measured(value, *interval_of(value, rounds, len(np.unique(blocks))))
+def _measured(
+    value: float, rounds: NDArray[np.float64], blocks: NDArray[np.int64]
+) -> IntervalEstimate:
+    return IntervalEstimate(value, *interval_of(value, rounds, len(np.unique(blocks))))
 
 
 def _less(of: NDArray[np.int64], right: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -268,10 +270,10 @@ def _less(of: NDArray[np.int64], right: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _fraction_of(
     right: NDArray[np.int64], wrong: NDArray[np.int64], blocks: NDArray[np.int64]
-) -> Measured:
+) -> IntervalEstimate:
     """Return the fraction that is right, from the pictures of right and wrong items."""
     is_right = np.repeat([True, False], [len(right), len(wrong)])
     if not len(is_right):
         return _UNKNOWN
     ends = fraction_by_cluster(is_right, blocks[np.concatenate([right, wrong])])
-    return Measured(len(right) / len(is_right), *ends)
+    return IntervalEstimate(len(right) / len(is_right), *ends)

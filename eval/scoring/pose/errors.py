@@ -67,7 +67,7 @@ class Paired:
 
 
 @dataclass(frozen=True, slots=True)
-class Statistics:
+class ErrorStatistics:
     """Statistics of N errors, with evo's names; all NaN without errors."""
 
     rmse: float
@@ -145,7 +145,7 @@ class RpeDelta(NamedTuple):
     tolerance: float = 0.1
 
 
-def pair(
+def pair_poses(
     truth: Trajectory,
     estimate: Trajectory,
     max_difference_ns: int,
@@ -260,12 +260,12 @@ def rpe_pairs(xyz_m: Floats, delta: RpeDelta) -> tuple[Indices, Indices]:
     return first, first + frames
 
 
-def statistics(errors: Floats) -> Statistics:
+def statistics(errors: Floats) -> ErrorStatistics:
     """Return root mean square, mean, median, population s.d., extremes and sum of squares."""
     if len(errors) == 0:
-        return Statistics(*[math.nan] * 7)
+        return ErrorStatistics(*[math.nan] * 7)
     squares = errors**2
-    return Statistics(
+    return ErrorStatistics(
         rmse=math.sqrt(squares.mean()),
         mean=float(errors.mean()),
         median=float(np.median(errors)),
@@ -276,7 +276,7 @@ def statistics(errors: Floats) -> Statistics:
     )
 
 
-def nees(paired: Paired, dimensions: Literal[2, 3]) -> Floats:
+def squared_errors(paired: Paired, dimensions: Literal[2, 3]) -> Floats:
     """Return the squared error of (x, y) or (x, y, heading), normalised by the covariance.
 
     Returns:

@@ -19,7 +19,7 @@ from crosscue.replay.errors import RunError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class RunMeasurements:
     """All measurements of a run.
 
     Attributes:
@@ -37,7 +37,7 @@ class Measured:
     is_gnss: NDArray[np.bool_]
 
 
-def read_measured(run: RunFolder) -> Measured:
+def read_measured(run: RunFolder) -> RunMeasurements:
     """Read the measurements of a finished run.
 
     Raises:
@@ -64,7 +64,7 @@ def read_measured(run: RunFolder) -> Measured:
     cov[:2, :2] = _matrices(start)[0]
     cov[2, 2], cov[3, 3] = start["heading_var_rad2"][0], start["speed_var_m2ps2"][0]
     mean = np.array([start[name][0] for name in ("x_m", "y_m", "heading_rad", "speed_mps")])
-    return Measured(
+    return RunMeasurements(
         PoseBelief(int(start["t_ns"][0]), mean, cov),
         Increments(
             start_ns=odometry["start_ns"].astype(np.int64),

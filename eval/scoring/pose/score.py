@@ -21,7 +21,7 @@ from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, read_tum, write_tum
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import OWN_FRAME
-from crosscue.eval.runs.tables.log_time import Gap, comes_twice, gaps_of, table_in_log_time
+from crosscue.eval.runs.tables.log_time import ClockGap, comes_twice, gaps_of, table_in_log_time
 from crosscue.localization.angles import wrap_all
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
@@ -31,15 +31,15 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .errors import (
     Alignment,
     Coverage,
+    ErrorStatistics,
     NeesSummary,
     Paired,
     RpeDelta,
-    Statistics,
     align,
     ape,
-    nees,
-    pair,
+    pair_poses,
     rpe,
+    squared_errors,
     statistics,
     summarise_nees,
 )
@@ -82,11 +82,11 @@ class PlaneMounting:
 
 
 @dataclass(frozen=True, slots=True)
-class Errors:
+class PoseErrorSummary:
     """Translation errors in metres and rotation errors in degrees, with evo's names."""
 
-    translation_m: Statistics
-    rotation_deg: Statistics
+    translation_m: ErrorStatistics
+    rotation_deg: ErrorStatistics
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +109,8 @@ class PoseScore:
 
     coverage: Coverage
     distance_m: float
-    ape: dict[str, Errors]
-    rpe: dict[str, Errors]
+    ape: dict[str, PoseErrorSummary]
+    rpe: dict[str, PoseErrorSummary]
     nees_xy: NeesSummary
     nees_xyh: NeesSummary
     major_axis_m: float
@@ -147,7 +147,7 @@ class ScoredPoses:
     major_axis_m: Floats
     lost_above_m: float
     title: str
-    gaps: tuple[Gap, ...] = ()
+    gaps: tuple[ClockGap, ...] = ()
 
     @property
     def seconds(self) -> Floats:
@@ -178,7 +178,7 @@ def load_truth(path: Path) -> tuple[Truth, Trajectory]:
         SchemaError: The file is not valid, or has no pose.
         LogError: The trajectory cannot be read.
     """
-    truth = truth_file.load(path)
+    truth = truth_file.read_truth(path)
     folder = path if path.is_dir() else path.parent
     if truth.pose is None:
         raise SchemaError(f"{path}: pose: missing; name a TUM file with the true track")
@@ -199,7 +199,7 @@ def truth_track(path: Path, run: RunFolder) -> TruthTrack:
     return TruthTrack(track.t_ns[inside], x_m, y_m)
 
 
-def measure(
+def measure_pose(
     run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.0)
 ) -> tuple[PoseScore, ScoredPoses]:
     """Score a run's pose; write both tracks to its ``score`` folder.
@@ -223,7 +223,7 @@ def measure(
     why_no_nees = NO_NEES if OWN_FRAME in run.drive_manifest().notices else ""
     # Errors between two frames cannot be compared with a covariance in one of them.
     nees_xy, values = (
-        np.full(len(paired.truth), np.nan) if why_no_nees else nees(paired, dimensions)
+        np.full(len(paired.truth), np.nan) if why_no_nees else squared_errors(paired, dimensions)
         for dimensions in PLANE
     )
     result = PoseScore(
@@ -235,7 +235,7 @@ def measure(
         nees_xyh=summarise_nees(values, 3),
         major_axis_m=float(table["major_axis_m"][-1].as_py()),
         lost_at_m=_lost_at(table, vehicle.lost_above_m),
-        compared_at=mounting_of(truth, vehicle),
+        compared_at=track_mounting(truth, vehicle),
         why_no_nees=why_no_nees,
     )
     folder = run.file("score")
@@ -251,10 +251,10 @@ def _paired(
 ) -> Paired:
     """Return pairs, without true poses at times that occur twice, which are counted."""
     if not twice.any():
-        return pair(truth, estimate, MAX_DIFFERENCE_NS, cov)
+        return pair_poses(truth, estimate, MAX_DIFFERENCE_NS, cov)
     once = ~twice
     kept = Trajectory(truth.t_ns[once], truth.xyz_m[once], truth.quat_wxyz[once])
-    paired = pair(kept, estimate, MAX_DIFFERENCE_NS, cov)
+    paired = pair_poses(kept, estimate, MAX_DIFFERENCE_NS, cov)
     counts = paired.coverage
     ambiguous = int(twice.sum())
     total = counts.truth_poses + ambiguous
@@ -286,7 +286,7 @@ def _estimate(table: pa.Table, vehicle: Vehicle, truth: Truth) -> tuple[Trajecto
     return at_truths_point(table["t_ns"].to_numpy(), xyh, cov, vehicle, truth)
 
 
-def mounting_of(truth: Truth, vehicle: Vehicle) -> PlaneMounting:
+def track_mounting(truth: Truth, vehicle: Vehicle) -> PlaneMounting:
     """Return the mounting from the truth file, or from the vehicle file where it is missing."""
     camera, gnss, body = vehicle.camera, vehicle.gnss, truth.pose_point
     of_vehicle = {
@@ -324,7 +324,7 @@ def at_truths_point(
     east_m, north_m = map_shift(vehicle, truth)
     x, y = x + east_m, y + north_m
     cov = cov_xyh
-    mounting = mounting_of(truth, vehicle)
+    mounting = track_mounting(truth, vehicle)
     ahead, left = mounting.x_m, mounting.y_m
     if ahead or left:
         cos, sin = np.cos(heading), np.sin(heading)
@@ -360,19 +360,21 @@ def map_shift(vehicle: Vehicle, truth: Truth) -> tuple[float, float]:
     return east_m, north_m
 
 
-def _ape(paired: Paired, how: Alignment) -> Errors:
+def _ape(paired: Paired, how: Alignment) -> PoseErrorSummary:
     errors = ape(paired.truth, align(paired.truth, paired.estimate, how))
-    return Errors(statistics(errors.translation_m), statistics(np.rad2deg(errors.rotation_rad)))
+    return PoseErrorSummary(
+        statistics(errors.translation_m), statistics(np.rad2deg(errors.rotation_rad))
+    )
 
 
-def _rpe(paired: Paired, sizes_m: Sequence[float]) -> dict[str, Errors]:
-    found: dict[str, Errors] = {}
+def _rpe(paired: Paired, sizes_m: Sequence[float]) -> dict[str, PoseErrorSummary]:
+    found: dict[str, PoseErrorSummary] = {}
     way_m = _length(paired.estimate.xyz_m)
     for size_m in sizes_m:
         if size_m >= way_m:
             continue
         errors = rpe(paired.truth, paired.estimate, RpeDelta(size_m, "metres"))
-        found[f"{size_m:g} m"] = Errors(
+        found[f"{size_m:g} m"] = PoseErrorSummary(
             statistics(errors.translation_m), statistics(np.rad2deg(errors.rotation_rad))
         )
     return found
@@ -393,7 +395,7 @@ def _scored(
     table: pa.Table,
     lost_above_m: float,
     title: str,
-    gaps: tuple[Gap, ...],
+    gaps: tuple[ClockGap, ...],
 ) -> ScoredPoses:
     assert paired.cov_xyh is not None
     at = np.searchsorted(table["t_ns"].to_numpy(), paired.truth.t_ns)

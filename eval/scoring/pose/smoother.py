@@ -13,13 +13,13 @@ import numpy as np
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.localization.angles import wrap_all
-from crosscue.localization.smoother import smooth
+from crosscue.localization.smoother import smooth_poses
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
 
-from .errors import FilterAndSmoother, NeesSummary, nees, pair, summarise_nees
+from .errors import FilterAndSmoother, NeesSummary, pair_poses, squared_errors, summarise_nees
 from .measured import read_measured
 from .score import COVARIANCES, MAX_DIFFERENCE_NS, at_truths_point, load_truth
 
@@ -83,7 +83,7 @@ def score_smoother(
         )
     camera, antenna = (np.array([at.x_m, at.y_m]) for at in (vehicle.camera, vehicle.gnss))
     lever_m = np.where(measured.is_gnss[:, None], antenna, camera)
-    found = smooth(
+    found = smooth_poses(
         measured.start, measured.increments, measured.headings, measured.fixes, wanted, lever_m
     )
     rows = np.searchsorted(track.t_ns, wanted)
@@ -127,12 +127,12 @@ def _compared(
     apart: list[tuple[float, float, float]] = []
     nees_of_tracks: list[NeesSummary] = []
     for track, cov in (filtered, smoothed):
-        paired = pair(true, track, MAX_DIFFERENCE_NS, cov)
+        paired = pair_poses(true, track, MAX_DIFFERENCE_NS, cov)
         errors = paired.estimate.xyz_m[:, :2] - paired.truth.xyz_m[:, :2]
         metres = np.hypot(*errors.T)
         turns = wrap_all(heading_rad(paired.estimate) - heading_rad(paired.truth))
         apart.append((_rms(metres), _rms(turns), float(metres[-1])))
-        nees_of_tracks.append(summarise_nees(nees(paired, 3), 3))
+        nees_of_tracks.append(summarise_nees(squared_errors(paired, 3), 3))
     (filter_m, filter_rad, filter_end), (smoother_m, smoother_rad, smoother_end) = apart
     return SmootherScore(
         len(true),

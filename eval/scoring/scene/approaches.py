@@ -122,7 +122,7 @@ class ApproachesJudged:
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class ApproachGroup:
     """Scores of the approaches to one intersection, or under one condition."""
 
     approaches: int
@@ -176,8 +176,8 @@ class ApproachScore:
     not_judged: int
     rows_not_numbers: int
     failures: dict[str, dict[str, int]]
-    by_intersection: dict[str, Group]
-    by_condition: dict[str, Group]
+    by_intersection: dict[str, ApproachGroup]
+    by_condition: dict[str, ApproachGroup]
     results: tuple[ApproachResult, ...]
 
 
@@ -501,11 +501,11 @@ def _groups(
     names: set[str],
     results: Sequence[ApproachResult],
     belongs: Callable[[str, ApproachResult], bool],
-) -> dict[str, Group]:
-    groups: dict[str, Group] = {}
+) -> dict[str, ApproachGroup]:
+    groups: dict[str, ApproachGroup] = {}
     for name in sorted(names):
         mine = [one for one in results if belongs(name, one)]
-        groups[name] = Group(
+        groups[name] = ApproachGroup(
             approaches=len(mine),
             detected=sum(one.detected_m is not None for one in mine),
             full=sum(one.full_m is not None for one in mine),

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from crosscue.eval.scoring.columns import AMBIGUOUS, NONE, RunTables
 from crosscue.eval.scoring.intervals import Mean, Proportion, fraction, mean
-from crosscue.eval.scoring.pooling import cluster_numbers, first_reasons, summed
+from crosscue.eval.scoring.pooling import cluster_numbers, first_reasons, sum_counts
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
 
 # Probabilities are clipped to this and one minus this for the log score.
@@ -178,7 +178,7 @@ def score_belief(judged: Sequence[BeliefJudged]) -> dict[str, BeliefScore]:
 
 def _score(rows: Sequence[BeliefJudged]) -> BeliefScore:
     probability, is_there, clusters = _pooled(rows)
-    left_out = summed(one.left_out for one in rows)
+    left_out = sum_counts(one.left_out for one in rows)
     base = float(is_there.mean()) if len(is_there) else math.nan
     return BeliefScore(
         steps=len(probability) + sum(left_out.values()),
@@ -190,7 +190,7 @@ def _score(rows: Sequence[BeliefJudged]) -> BeliefScore:
         log_score=mean(log_score(probability, is_there), clusters),
         clip=CLIP,
         clipped=int(((probability < CLIP) | (probability > 1.0 - CLIP)).sum()),
-        reliability=reliability(probability, is_there, clusters),
+        reliability=reliability_bins(probability, is_there, clusters),
     )
 
 
@@ -217,7 +217,7 @@ def log_score(
     return np.asarray(-np.log(np.clip(likelihood, clip, 1.0 - clip)))
 
 
-def reliability(
+def reliability_bins(
     probability: NDArray[np.float64],
     is_there: NDArray[np.bool_],
     clusters: NDArray[np.int64],

@@ -30,7 +30,7 @@ from crosscue.eval.scoring.pooling import (
     cluster_numbers,
     distance_bins,
     first_reasons,
-    summed,
+    sum_counts,
 )
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, cue_at, has_feature
 from crosscue.replay.vehicle.vehicle import CUES, Scoring
@@ -107,12 +107,12 @@ class CueMetrics:
     precision: Proportion
     recall: Proportion | None
     recall_seen: Proportion | None
-    by_distance: dict[str, Part]
-    by_condition: dict[str, Part]
+    by_distance: dict[str, CuePartMetrics]
+    by_condition: dict[str, CuePartMetrics]
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class CuePartMetrics:
     """Metrics of the frames in a distance bin or with a condition tag."""
 
     frames: int
@@ -356,7 +356,7 @@ def _score(cue: str, rows: Sequence[CueFrames], bins_m: Sequence[float]) -> CueS
 
 def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float]) -> CueMetrics:
     truth = pooled.ints("is_object" if reading == "object" else "is_feature")
-    left_out = summed(one.left_out[reading] for one in pooled.rows)
+    left_out = sum_counts(one.left_out[reading] for one in pooled.rows)
     frames = sum(one.frames for one in pooled.rows)
     known = truth != NONE
     cut = _Cut(truth, pooled.ints("count") > 0, pooled.cluster, reading == "object")
@@ -404,8 +404,8 @@ class _Cut:
         rows = rows & (self.truth == 1)
         return fraction(self.is_found[rows], self.cluster[rows])
 
-    def part(self, rows: NDArray[np.bool_]) -> Part:
-        return Part(int(rows.sum()), self.precision(rows), self.recall(rows))
+    def part(self, rows: NDArray[np.bool_]) -> CuePartMetrics:
+        return CuePartMetrics(int(rows.sum()), self.precision(rows), self.recall(rows))
 
 
 def _things(pooled: _Pooled) -> Things:

@@ -18,12 +18,12 @@ from crosscue.eval.scoring.pooling import (
     cluster_numbers,
     distance_bins,
     first_reasons,
-    summed,
+    sum_counts,
 )
 from crosscue.eval.scoring.pose.errors import FilterAndSmoother as FilterAndSmoother
 from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
 from crosscue.eval.scoring.truth import DriveTruth
-from crosscue.fusion.intersection_range import RangeBelief, predict, smooth
+from crosscue.fusion.intersection_range import RangeBelief, predict, smooth_ranges
 
 # Squared jump of a range, in units of its variance, above which the filter has restarted.
 RESTART_NIS: Final = 25.0
@@ -104,7 +104,7 @@ class _Way(Protocol):
     def covered_ns(self) -> int: ...
 
 
-class Odometer(Protocol):
+class MonotonicOdometer(Protocol):
     """Odometer that is read at non-decreasing times."""
 
     def until(self, t_ns: int, /) -> _Way:
@@ -157,7 +157,7 @@ def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
 
 
 def score_smoothed(
-    tables: RunTables, truth: DriveTruth, odometer: Odometer
+    tables: RunTables, truth: DriveTruth, odometer: MonotonicOdometer
 ) -> dict[str, FilterAndSmoother]:
     """Return errors of the range filter and of its smoother, by reference."""
     if tables.ranges is None:
@@ -173,7 +173,7 @@ def score_smoothed(
     }
 
 
-def smoothed_rows(rows: RangeRows, odometer: Odometer) -> RangeRows:
+def smoothed_rows(rows: RangeRows, odometer: MonotonicOdometer) -> RangeRows:
     """Return the rows smoothed backwards with the later measurements.
 
     Smoothing stops where odometry is missing or a range restarted.
@@ -206,7 +206,9 @@ def smoothed_rows(rows: RangeRows, odometer: Odometer) -> RangeRows:
         ends = [0, *(np.flatnonzero(~goes_on) + 1).tolist(), len(beliefs)]
         for first, stop in pairwise(ends):
             inside = slice(first, stop - 1)
-            found = smooth(beliefs[first:stop], steps_m[inside].tolist(), steps_m2[inside].tolist())
+            found = smooth_ranges(
+                beliefs[first:stop], steps_m[inside].tolist(), steps_m2[inside].tolist()
+            )
             range_m[mine[first:stop]] = [one.mean_m for one in found]
             range_var_m2[mine[first:stop]] = [one.var_m2 for one in found]
     return replace(rows, range_m=range_m, var_m2=range_var_m2)
@@ -234,7 +236,7 @@ def _score(rows: Sequence[RangeJudged], bins_m: Sequence[float]) -> RangeScore:
     nees = error**2 / np.concatenate([one.var_m2 for one in rows])
     true_m = np.concatenate([one.true_m for one in rows])
     clusters = cluster_numbers([one.drive for one in rows], [one.approach for one in rows])
-    left_out = summed(one.left_out for one in rows)
+    left_out = sum_counts(one.left_out for one in rows)
     return RangeScore(
         rows=len(error) + sum(left_out.values()),
         scored=len(error),

@@ -10,9 +10,9 @@ import numpy as np
 
 from crosscue.detectors.base import Found, RoadMask
 from crosscue.detectors.images import decode
-from crosscue.detectors.overlay import draw, write_label
+from crosscue.detectors.overlay import draw_detections, write_label
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.stored_images import StoredCamera, camera_of, picture_at
+from crosscue.eval.runs.stored_images import StoredCamera, picture_at, run_camera
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.columns import Bytes, Int64s
@@ -55,7 +55,7 @@ def write_sheet(
 def _tile(one: RunScored) -> Bytes:
     import cv2
 
-    camera = camera_of(one.run)
+    camera = run_camera(one.run)
     frame = _frame_near(one)
     picture = None if camera is None or frame is None else _picture(camera, frame, one.run)
     if picture is None:
@@ -95,7 +95,7 @@ def _picture(camera: StoredCamera, frame: StoredFrame, run: RunFolder) -> Bytes 
     if picture is None:
         return None
     pixels, _ = decode(picture)
-    return draw(pixels, found, _cues_at(run, t_ns), ENLARGE)
+    return draw_detections(pixels, found, _cues_at(run, t_ns), ENLARGE)
 
 
 def _cues_at(run: RunFolder, t_ns: int) -> dict[str, int]:

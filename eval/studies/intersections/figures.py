@@ -24,7 +24,7 @@ SPREAD: Final = 0.28
 FAR_M: Final = 120.0
 
 
-def draw_distances(results: Sequence[ApproachResult], path: Path) -> None:
+def draw_study_distances(results: Sequence[ApproachResult], path: Path) -> None:
     """Draw distances at detection and at full detection, one point per approach.
 
     Approaches that were never detected are at the bottom.
@@ -100,7 +100,7 @@ def draw_beliefs(curves: Sequence[Curve], path: Path) -> None:
     _save(figure, path)
 
 
-def draw_reliability(
+def draw_study_reliability(
     source: Mapping[str, BeliefScore], calibrated: Mapping[str, BeliefScore] | None, path: Path
 ) -> None:
     """Draw the frequency of features over their probability, for one or both fusions."""

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.eval.batch.jobs import Done
+from crosscue.eval.batch.jobs import JobOutcome
 from crosscue.eval.failures.causes import Finding, approach_findings, by_cause
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.report.html import write_page
@@ -25,7 +25,7 @@ from crosscue.replay.versions import versions
 
 from .conditions import condition_costs
 from .contact_sheet import write_sheet
-from .figures import draw_beliefs, draw_distances, draw_reliability
+from .figures import draw_beliefs, draw_study_distances, draw_study_reliability
 from .settings import IntersectionStudy
 from .tables import (
     StudyScores,
@@ -53,7 +53,7 @@ class StudyFiles:
 
 
 def write_study(
-    out: Path, settings: IntersectionStudy, done: Sequence[Done[Outcome]], scored: StudyScores
+    out: Path, settings: IntersectionStudy, done: Sequence[JobOutcome[Outcome]], scored: StudyScores
 ) -> StudyFiles:
     """Write metrics, tables, figures and page to ``out``.
 
@@ -90,7 +90,7 @@ def write_study(
 
 def _tables(
     settings: IntersectionStudy,
-    done: Sequence[Done[Outcome]],
+    done: Sequence[JobOutcome[Outcome]],
     scored: StudyScores,
     approaches: ApproachScore,
     found: Sequence[Finding],
@@ -126,7 +126,7 @@ def _tables(
 
 def _figures(out: Path, scored: StudyScores, approaches: ApproachScore) -> dict[str, str]:
     paths = {name: out / f"{name}.png" for name in ("distances", "beliefs", "reliability")}
-    draw_distances(approaches.results, paths["distances"])
+    draw_study_distances(approaches.results, paths["distances"])
     curves = [
         curve
         for one in scored.scored
@@ -135,7 +135,7 @@ def _figures(out: Path, scored: StudyScores, approaches: ApproachScore) -> dict[
     ]
     draw_beliefs(curves, paths["beliefs"])
     learned = None if scored.calibrated is None else scored.calibrated.belief
-    draw_reliability(scored.scores.belief, learned, paths["reliability"])
+    draw_study_reliability(scored.scores.belief, learned, paths["reliability"])
     return {
         name: f"data:image/png;base64,{base64.b64encode(door.read(path)).decode()}"
         for name, path in paths.items()
@@ -150,7 +150,9 @@ def _signed(value: float | None, digits: int = 0) -> str:
     return "-" if value is None or math.isnan(value) else f"{value:+.{digits}f}"
 
 
-def summary(done: Sequence[Done[Outcome]], scored: StudyScores, written: StudyFiles) -> str:
+def study_text(
+    done: Sequence[JobOutcome[Outcome]], scored: StudyScores, written: StudyFiles
+) -> str:
     """Return a text summary of the study, within 80 columns."""
     approaches = scored.scores.approaches
     assert approaches is not None

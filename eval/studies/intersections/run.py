@@ -9,7 +9,7 @@ from typing import Annotated
 
 from crosscue.detectors.registry import check, chosen
 from crosscue.eval.batch.engine import engine_of
-from crosscue.eval.batch.jobs import Done, exit_status_of
+from crosscue.eval.batch.jobs import JobOutcome, exit_status_of
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.studies.result import StoredResult
@@ -18,9 +18,9 @@ from crosscue.replay.errors import RunError
 from crosscue.replay.vehicle.vehicle import vehicle_given
 from crosscue.verb import Option
 
-from .report import StudyFiles, summary, write_study
+from .report import StudyFiles, study_text, write_study
 from .settings import IntersectionStudy
-from .study import score_study
+from .study import score_intersection_study
 from .tables import StudyScores
 
 
@@ -34,7 +34,7 @@ class IntersectionResult(StoredResult):
         files: The page, its tables as JSON, the metrics and a contact sheet.
     """
 
-    drives: tuple[Done[Outcome], ...]
+    drives: tuple[JobOutcome[Outcome], ...]
     scored: StudyScores
     files: StudyFiles
 
@@ -50,7 +50,7 @@ class IntersectionResult(StoredResult):
 
     def lines(self) -> Iterator[str]:
         """Yield the tables."""
-        yield summary(self.drives, self.scored, self.files)
+        yield study_text(self.drives, self.scored, self.files)
 
 
 def run_intersection_study(
@@ -97,5 +97,5 @@ def run_intersection_study(
     names = [one.job.name for one in done if one.error is None]
     if not names:
         raise RunError(f"{folder}: every drive failed; the first: {done[0].error}")
-    scored = score_study(folder, names, attribution=attribution)
+    scored = score_intersection_study(folder, names, attribution=attribution)
     return IntersectionResult(done, scored, write_study(folder, study, done, scored))

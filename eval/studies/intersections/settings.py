@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from crosscue.datasets.scenes.layout import SCORED
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.detectors.registry import EMBEDDED
 from crosscue.replay.errors import UsageError
@@ -62,7 +62,7 @@ class IntersectionStudy:
 
     def scenes(self) -> tuple[SceneSettings, ...]:
         """Return all drives, in the order of processing."""
-        camera = Camera(width_px=self.width_px, height_px=self.width_px * 9 // 16)
+        camera = SceneCamera(width_px=self.width_px, height_px=self.width_px * 9 // 16)
         return tuple(
             SceneSettings(layout=layout, run=run, seed=self.seed, camera=camera)
             for run in range(1, self.runs + 1)

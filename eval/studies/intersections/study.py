@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.datasets.truth.truth import FILE
-from crosscue.eval.fit.annotated_runs import AnnotatedRuns, annotate, graph_of_runs
+from crosscue.eval.fit.annotated_runs import AnnotatedRuns, add_approaches, graph_of_runs
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.scoring.drives import ScoreSettings, judge, score
+from crosscue.eval.scoring.drives import ScoreSettings, score, score_drive
 from crosscue.eval.scoring.runs import RunScored, judge_run
 from crosscue.eval.scoring.scene.belief import compare_belief
-from crosscue.eval.studies.attribution import Drive, attribute
+from crosscue.eval.studies.attribution import AttributedDrive, attribute
 from crosscue.eval.studies.estimated_again import estimate_of
 from crosscue.fusion.fit.message_fit import fit_messages
 from crosscue.replay.errors import RunError
@@ -28,7 +28,9 @@ AS_PUBLISHED: Final = ScoreSettings(detection="published")
 MIN_PLACES: Final = 3
 
 
-def score_study(out: Path, names: Sequence[str], *, attribution: bool = True) -> StudyScores:
+def score_intersection_study(
+    out: Path, names: Sequence[str], *, attribution: bool = True
+) -> StudyScores:
     """Score the finished drives of a study.
 
     Raises:
@@ -42,14 +44,14 @@ def score_study(out: Path, names: Sequence[str], *, attribution: bool = True) ->
         raise RunError(f"{out}: no drive is finished, so there is nothing to score")
     worth = {}
     if attribution:
-        drives = [Drive(one.judged, one.truth, estimate_of(one.run)) for one in scored]
+        drives = [AttributedDrive(one.judged, one.truth, estimate_of(one.run)) for one in scored]
         worth = attribute(drives, settings=AS_PUBLISHED)
     first = [one.judged for one in scored]
     learned = calibrated_vehicles(scored)
     if learned is None:
         return StudyScores(scored, score(first, AS_PUBLISHED), worth, None, {})
     second = [
-        judge(estimate_of(one.run, vehicle)(frozenset()), one.truth, AS_PUBLISHED)
+        score_drive(estimate_of(one.run, vehicle)(frozenset()), one.truth, AS_PUBLISHED)
         for one, vehicle in zip(scored, learned, strict=True)
     ]
     return StudyScores(
@@ -90,7 +92,7 @@ def _learned(scored: Sequence[RunScored]) -> Calibrated:
     graph, vehicle = graph_of_runs([one.run for one in scored])
     found = AnnotatedRuns([], Counter())
     for one in scored:
-        annotate(one.run, one.truth.truth, vehicle, found)
+        add_approaches(one.run, one.truth.truth, vehicle, found)
     return fit_messages(found.approaches, graph).calibrated
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from crosscue.eval.scoring.drives import Scores
+from crosscue.eval.scoring.drives import PooledScores
 from crosscue.eval.scoring.intervals import TOO_FEW, Mean, Proportion, wilson
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.eval.scoring.scene.approaches import ApproachResult
@@ -31,9 +31,9 @@ class StudyScores:
     """
 
     scored: tuple[RunScored, ...]
-    scores: Scores
+    scores: PooledScores
     worth: dict[str, Attribution]
-    calibrated: Scores | None
+    calibrated: PooledScores | None
     difference: dict[str, BeliefDifference]
 
 

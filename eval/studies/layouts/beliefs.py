@@ -13,7 +13,7 @@ from crosscue.eval.pipeline.scene.variants import scene_tables
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit, filtered
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .drives import StudyDrive
+from .drives import LayoutDrive
 from .score import FEATURES, THRESHOLD, DriveBelief
 
 # Kinds of beliefs that are compared. The fourth is the third with the training layouts' frequencies
@@ -36,7 +36,7 @@ RULES: Final[Mapping[str, tuple[str, str]]] = {
 
 
 def believed(
-    drive: StudyDrive,
+    drive: LayoutDrive,
     vehicle: Vehicle,
     base_rates: Mapping[str, float],
 ) -> DriveBelief:
@@ -72,7 +72,7 @@ def believed(
 
 
 def believed_everywhere(
-    drive: StudyDrive,
+    drive: LayoutDrive,
     parts: Sequence[AnnotatedDrive],
     learned: TemporalFit,
     without: frozenset[str] = frozenset(),
@@ -103,14 +103,14 @@ def believed_everywhere(
     )
 
 
-def with_fusion(drive: StudyDrive, changes: Mapping[str, Any]) -> Vehicle:
+def with_fusion(drive: LayoutDrive, changes: Mapping[str, Any]) -> Vehicle:
     """Return the run's settings with another belief."""
     vehicle = drive.run.drive_manifest().settings
     fusion = vehicle.fusion.model_copy(update=dict(changes))
     return vehicle.model_copy(update={"fusion": fusion})
 
 
-def with_rules(drive: StudyDrive, without: str | None = None) -> Vehicle:
+def with_rules(drive: LayoutDrive, without: str | None = None) -> Vehicle:
     """Return the run's settings with all rules for real roads, or all but one."""
     vehicle = drive.run.drive_manifest().settings
     rules = {name: dict(changes) for name, changes in REAL_ROADS.items()}

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from crosscue.eval.runs.folder import RunFolder, open_run
-from crosscue.eval.scoring.truth import DriveTruth, load
+from crosscue.eval.scoring.truth import DriveTruth, read_scored_truth
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StudyDrive:
+class LayoutDrive:
     """A drive of the study with its truth.
 
     Attributes:
@@ -31,14 +31,14 @@ class StudyDrive:
     truth: DriveTruth
 
 
-def open_drive(
+def open_study_drive(
     out: Path, name: str, layout: str, fold: int, features: Mapping[str, bool]
-) -> StudyDrive:
+) -> LayoutDrive:
     """Open a drive whose run is finished.
 
     Raises:
         RunError: The run is missing or damaged.
         AnnotationError: The truth does not fit.
     """
-    truth = load(out / "drives" / name, name)
-    return StudyDrive(name, layout, fold, features, open_run(out / "runs" / name), truth)
+    truth = read_scored_truth(out / "drives" / name, name)
+    return LayoutDrive(name, layout, fold, features, open_run(out / "runs" / name), truth)

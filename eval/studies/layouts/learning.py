@@ -11,20 +11,20 @@ import numpy as np
 
 from crosscue.eval.fit.annotated_runs import (
     AnnotatedRuns,
-    annotate,
+    add_approaches,
     annotated_drives,
     graph_of_runs,
 )
 from crosscue.fusion.fit.message_fit import fit_messages
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit, fit_temporal
 
-from .drives import StudyDrive
+from .drives import LayoutDrive
 
 # Annotated approaches by drive.
 Annotations = Mapping[str, Sequence[Any]]
 
 
-class Learned(NamedTuple):
+class FoldFits(NamedTuple):
     """Fits for the drives of one fold.
 
     Attributes:
@@ -46,13 +46,13 @@ class Lessons:
     drives: Mapping[str, Sequence[AnnotatedDrive]]
 
 
-def lessons_of(drives: Sequence[StudyDrive]) -> Lessons:
+def lessons_of(drives: Sequence[LayoutDrive]) -> Lessons:
     """Read annotated approaches and drives, by drive; all drives of a layout are one place."""
     approaches, parts = {}, {}
     for drive in drives:
         vehicle = drive.run.drive_manifest().settings
         found = AnnotatedRuns([], Counter())
-        annotate(drive.run, drive.truth.truth, vehicle, found)
+        add_approaches(drive.run, drive.truth.truth, vehicle, found)
         approaches[drive.name] = [replace(one, place=drive.layout) for one in found.approaches]
         parts[drive.name] = [
             replace(one, place=drive.layout)
@@ -61,7 +61,7 @@ def lessons_of(drives: Sequence[StudyDrive]) -> Lessons:
     return Lessons(approaches, parts)
 
 
-def learn(drives: Sequence[StudyDrive], lessons: Lessons) -> Learned:
+def fit_beliefs(drives: Sequence[LayoutDrive], lessons: Lessons) -> FoldFits:
     """Fit all kinds of beliefs to these drives."""
     graph, vehicle = graph_of_runs([one.run for one in drives])
     calibrated = fit_messages(
@@ -85,4 +85,4 @@ def learn(drives: Sequence[StudyDrive], lessons: Lessons) -> Learned:
         "calibrated, base rates": {**learned, "features": priors},
         "temporal": {"kind": "temporal", "temporal": fitted.temporal},
     }
-    return Learned(fusions, rates, fitted)
+    return FoldFits(fusions, rates, fitted)

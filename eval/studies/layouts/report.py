@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.eval.scoring.intervals import TOO_FEW, Mean
-from crosscue.eval.studies.page import Table, write_page
+from crosscue.eval.studies.page import PageTable, write_study_page
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.versions import versions
@@ -60,19 +60,21 @@ def write_layout_study(
     }
     write_text(out / TABLES, strict_json(tree) + "\n")
     counts = f"{scores.drives} drives over {scores.layouts} layouts in {settings.folds} folds."
-    write_page(out / PAGE, TITLE, [NOTES[settings.perception], counts], tables_of(scores), [])
+    write_study_page(
+        out / PAGE, TITLE, [NOTES[settings.perception], counts], study_tables(scores), []
+    )
     return LayoutFiles(out / PAGE, out / TABLES)
 
 
-def tables_of(scores: LayoutScores) -> list[Table]:
+def study_tables(scores: LayoutScores) -> list[PageTable]:
     """Return all tables, for the page and for a terminal."""
     found = [
-        Table(
+        PageTable(
             "Beliefs",
             ("belief", "Brier", "log score", "false a drive", "full", "full, m"),
             tuple(_score_row(kind, one) for kind, one in scores.kinds.items()),
         ),
-        Table(
+        PageTable(
             "Brier score by feature",
             ("belief", *next(iter(scores.kinds.values())).brier_by_feature),
             tuple(
@@ -80,12 +82,12 @@ def tables_of(scores: LayoutScores) -> list[Table]:
                 for kind, one in scores.kinds.items()
             ),
         ),
-        Table(
+        PageTable(
             "Belief over time less others",
             DIFFERENCE_HEAD,
             tuple(_difference_row(kind, one) for kind, one in scores.less.items()),
         ),
-        Table(
+        PageTable(
             "Law and coverage, fractions of pictures",
             ("belief", "a way before the intersection", "no approach open"),
             tuple(
@@ -96,7 +98,7 @@ def tables_of(scores: LayoutScores) -> list[Table]:
     ]
     if scores.cues:
         found.append(
-            Table(
+            PageTable(
                 "Each cue left out of the belief over time in every picture, without less with",
                 DIFFERENCE_HEAD,
                 tuple(_difference_row(cue, one) for cue, one in scores.cues.items()),
@@ -104,14 +106,14 @@ def tables_of(scores: LayoutScores) -> list[Table]:
         )
     if scores.rules:
         found.append(
-            Table(
+            PageTable(
                 "Rules for real roads, each left out",
                 ("left out", "Brier", "log score", "false a drive", "full", "full, m"),
                 tuple(_score_row(rule or "none", one) for rule, one in scores.rules.items()),
             )
         )
         found.append(
-            Table(
+            PageTable(
                 "Rules for real roads, without less with",
                 DIFFERENCE_HEAD,
                 tuple(_difference_row(rule, one) for rule, one in scores.rules_less.items()),

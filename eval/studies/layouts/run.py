@@ -9,17 +9,17 @@ from typing import Annotated, Final
 
 from crosscue.datasets.scenes.faulty_labels import DETECTORS, LABEL_IMAGES
 from crosscue.eval.batch.engine import engine_of
-from crosscue.eval.batch.jobs import Done, exit_status_of
+from crosscue.eval.batch.jobs import JobOutcome, exit_status_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.studies.result import StoredResult
 from crosscue.eval.studies.simulated_drives import SPARSE_AND_EMBEDDED, run_drives
 from crosscue.replay.errors import RunError
 from crosscue.verb import Option
 
-from .drives import open_drive
-from .report import LayoutFiles, LayoutScores, tables_of, write_layout_study
+from .drives import open_study_drive
+from .report import LayoutFiles, LayoutScores, study_tables, write_layout_study
 from .settings import LayoutStudy, Perception
-from .study import score_study
+from .study import score_layout_study
 
 # Source of the recorded images, and detectors, by perception.
 SEEN_BY: Final = {
@@ -43,7 +43,7 @@ class LayoutResult(StoredResult):
     perception: Perception
     scores: LayoutScores
     files: LayoutFiles
-    drives: tuple[Done[Outcome], ...]
+    drives: tuple[JobOutcome[Outcome], ...]
 
     @property
     def exit_status(self) -> int:
@@ -62,11 +62,11 @@ class LayoutResult(StoredResult):
             f"{IN_WORDS[self.perception]}"
         )
         yield from (f"  failed {name}: {why}" for name, why in _failures(self.drives).items())
-        yield from ("\n" + table.as_text() for table in tables_of(self.scores))
+        yield from ("\n" + table.as_text() for table in study_tables(self.scores))
         yield f"\nwritten to {self.files.page}"
 
 
-def _failures(drives: tuple[Done[Outcome], ...]) -> dict[str, str]:
+def _failures(drives: tuple[JobOutcome[Outcome], ...]) -> dict[str, str]:
     return {one.job.name: one.error for one in drives if one.error is not None}
 
 
@@ -110,7 +110,7 @@ def run_layout_study(
     )
     failures = _failures(done)
     drives = [
-        open_drive(
+        open_study_drive(
             folder,
             scene.name,
             scene.layout,
@@ -124,6 +124,6 @@ def run_layout_study(
     if len(folds) < study.folds:
         first = next(iter(failures.items()))
         raise RunError(f"{folder}: all drives of a fold failed; the first: {': '.join(first)}")
-    scores = score_study(drives, ablation=ablation)
+    scores = score_layout_study(drives, ablation=ablation)
     files = write_layout_study(folder, study, scores, failures)
     return LayoutResult(study.perception, scores, files, done)

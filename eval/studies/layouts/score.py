@@ -127,7 +127,9 @@ def score_layouts(beliefs: Sequence[DriveBelief]) -> LayoutScore:
     )
 
 
-def difference(first: Sequence[DriveBelief], second: Sequence[DriveBelief]) -> LayoutDifference:
+def score_difference(
+    first: Sequence[DriveBelief], second: Sequence[DriveBelief]
+) -> LayoutDifference:
     """Return the scores of the second minus the first belief, over the same pictures.
 
     Raises:

@@ -16,12 +16,12 @@ from .beliefs import (
     with_fusion,
     with_rules,
 )
-from .drives import StudyDrive
-from .learning import Learned, learn, lessons_of
-from .score import DriveBelief, LayoutDifference, LayoutScores, difference, score_layouts
+from .drives import LayoutDrive
+from .learning import FoldFits, fit_beliefs, lessons_of
+from .score import DriveBelief, LayoutDifference, LayoutScores, score_difference, score_layouts
 
 
-def score_study(drives: Sequence[StudyDrive], *, ablation: bool = True) -> LayoutScores:
+def score_layout_study(drives: Sequence[LayoutDrive], *, ablation: bool = True) -> LayoutScores:
     """Score the drives of each fold with beliefs fitted to the other folds, then run ablations.
 
     Args:
@@ -32,7 +32,7 @@ def score_study(drives: Sequence[StudyDrive], *, ablation: bool = True) -> Layou
     folds = sorted({one.fold for one in drives})
     learned = {}
     for done, fold in enumerate(folds, 1):
-        learned[fold] = learn([one for one in drives if one.fold != fold], lessons)
+        learned[fold] = fit_beliefs([one for one in drives if one.fold != fold], lessons)
         emit(Progress("learning", done, len(folds), "folds"))
 
     def of_kind(kind: str) -> list[DriveBelief]:
@@ -58,20 +58,20 @@ def score_study(drives: Sequence[StudyDrive], *, ablation: bool = True) -> Layou
     cues: dict[str, LayoutDifference] = {}
     for done, (group, some) in enumerate(groups().items() if ablation else (), 1):
         left = without(frozenset(cue.name for cue in some))
-        cues[group] = difference(kinds[EVERYWHERE], left)
+        cues[group] = score_difference(kinds[EVERYWHERE], left)
         emit(Progress("leaving out cues", done, len(groups()), "cues"))
     rules = _by_rule(drives, learned) if ablation else {}
     return LayoutScores(
         {kind: score_layouts(some) for kind, some in kinds.items()},
         {
-            f"{name} less {kind}": difference(kinds[kind], kinds[name])
+            f"{name} less {kind}": score_difference(kinds[kind], kinds[name])
             for name in ("temporal", EVERYWHERE)
             for kind in KINDS
             if kind != name
         },
         cues,
         {rule: score_layouts(some) for rule, some in rules.items()},
-        {rule: difference(rules[""], some) for rule, some in rules.items() if rule},
+        {rule: score_difference(rules[""], some) for rule, some in rules.items() if rule},
         len(drives),
         len({one.layout for one in drives}),
         {
@@ -82,7 +82,7 @@ def score_study(drives: Sequence[StudyDrive], *, ablation: bool = True) -> Layou
 
 
 def _by_rule(
-    drives: Sequence[StudyDrive], learned: Mapping[int, Learned]
+    drives: Sequence[LayoutDrive], learned: Mapping[int, FoldFits]
 ) -> dict[str, list[DriveBelief]]:
     return {
         rule: _all(
@@ -97,8 +97,8 @@ def _by_rule(
 
 
 def _all(
-    drives: Sequence[StudyDrive],
-    belief_of: Callable[[StudyDrive], DriveBelief],
+    drives: Sequence[LayoutDrive],
+    belief_of: Callable[[LayoutDrive], DriveBelief],
     doing: str,
 ) -> list[DriveBelief]:
     found = []

@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.studies.pictures import figure, save
+from crosscue.eval.studies.pictures import figure, save_figure
 from crosscue.localization.town.drive import (
     GOAL_SET,
     LANDMARK_MISSED,
     LANDMARK_REFUSED,
     LANDMARK_SET,
     LANDMARK_TAKEN,
-    Outcome,
+    DriveOutcome,
     Traced,
     streets_of,
 )
-from crosscue.localization.town.settings import Drive
-from crosscue.localization.town.streets import Streets, has_way, place_of, step_of
+from crosscue.localization.town.settings import TownDrive
+from crosscue.localization.town.streets import Streets, has_way, node_position, step_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,13 +31,13 @@ TRUTH: Final = "#2ca02c"
 ESTIMATE: Final = "#1f77b4"
 ELLIPSE: Final = "#ff7f0e"
 ENDS: Final = {
-    Outcome.REACHED: "reached its goal",
-    Outcome.LOST: "lost",
-    Outcome.GIVEN_UP: "given up",
+    DriveOutcome.REACHED: "reached its goal",
+    DriveOutcome.LOST: "lost",
+    DriveOutcome.GIVEN_UP: "given up",
 }
 
 
-def draw(settings: Drive, traced: Traced, seed: int, folder: Path) -> Path:
+def draw_drive(settings: TownDrive, traced: Traced, seed: int, folder: Path) -> Path:
     """Write ``drive_plan.png`` and ``drive_plan.svg``; return the path of the PNG.
 
     Raises:
@@ -70,14 +70,14 @@ def draw(settings: Drive, traced: Traced, seed: int, folder: Path) -> Path:
     axes.set_title(
         f"Simulated drive, seed {seed}: {settings.navigation.strategy}, "
         f"{'no compass' if compass is None else f'compass ±{compass:g}°'}\n"
-        f"{ENDS[Outcome(result.outcome)]} after {result.travelled_m / 1e3:.1f} km, "
+        f"{ENDS[DriveOutcome(result.outcome)]} after {result.travelled_m / 1e3:.1f} km, "
         f"error {result.error_m:.0f} m, major axis {result.major_axis_m:.0f} m",
         fontsize=9,
         loc="left",
         color="0.3",
     )
     axes.legend(frameon=True, framealpha=0.9, fontsize=8, loc="best")
-    return save(made, folder, "drive_plan")
+    return save_figure(made, folder, "drive_plan")
 
 
 def _places(
@@ -105,7 +105,7 @@ def _draw_streets(axes: Axes, streets: Streets) -> None:
             if is_both and there < node:
                 continue
             (both if is_both else single).append(
-                [place_of(streets, node), place_of(streets, there)]
+                [node_position(streets, node), node_position(streets, there)]
             )
     axes.add_collection(LineCollection(both, colors="0.78", linewidths=1.2, zorder=0))
     axes.add_collection(

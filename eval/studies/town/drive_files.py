@@ -27,7 +27,7 @@ from crosscue.localization.town.drive import (
     Traced,
 )
 from crosscue.localization.town.random_stream import key_of
-from crosscue.localization.town.settings import Drive
+from crosscue.localization.town.settings import TownDrive
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
 from crosscue.replay.columns import (
@@ -131,7 +131,7 @@ class StudyDriveFiles:
 
 
 def write_drive_files(
-    folder: Path, settings: Drive, traced: Traced, seed: int, *, overwrite: bool = False
+    folder: Path, settings: TownDrive, traced: Traced, seed: int, *, overwrite: bool = False
 ) -> StudyDriveFiles:
     """Write log, vehicle file, DBC file, truth and landmark database of one drive.
 
@@ -158,7 +158,7 @@ def write_drive_files(
             writer.add_topic(topic)
         for block in _in_order(settings, traced, t_ns, passed, seed, folder):
             writer.write(block)
-    write_text(folder / "vehicle.toml", vehicle_text(settings, traced))
+    write_text(folder / "vehicle.toml", town_vehicle_text(settings, traced))
     landmarks = None
     if len(passed):
         landmarks = folder / "landmarks.db"
@@ -169,7 +169,7 @@ def write_drive_files(
     )
 
 
-def vehicle_text(settings: Drive, traced: Traced) -> str:
+def town_vehicle_text(settings: TownDrive, traced: Traced) -> str:
     """Return the vehicle file of the simulated car and its start."""
     car, sensors = settings.car, settings.sensors
     compass = sensors.compass_2sigma_deg
@@ -192,13 +192,13 @@ def vehicle_text(settings: Drive, traced: Traced) -> str:
     )
 
 
-def _times(settings: Drive, steps: int) -> Int64s:
+def _times(settings: TownDrive, steps: int) -> Int64s:
     """Return the log time at the end of each step."""
     return START_NS + np.round(np.arange(1, steps + 1) * settings.car.step_s * 1e9).astype(np.int64)
 
 
 def _in_order(
-    settings: Drive, traced: Traced, t_ns: Int64s, passed: Floats, seed: int, folder: Path
+    settings: TownDrive, traced: Traced, t_ns: Int64s, passed: Floats, seed: int, folder: Path
 ) -> list[Block]:
     blocks = list(_batches(_can_block(settings, traced, t_ns, folder)))
     if settings.sensors.compass_2sigma_deg is not None:
@@ -212,7 +212,7 @@ def _batches(block: Block) -> Iterator[Block]:
         yield block.take(slice(start, start + BATCH_ROWS))
 
 
-def _can_block(settings: Drive, traced: Traced, t_ns: Int64s, folder: Path) -> Block:
+def _can_block(settings: TownDrive, traced: Traced, t_ns: Int64s, folder: Path) -> Block:
     """Return the wheel speeds of each step, with the time of its middle."""
     database = CanDatabase.load([folder / "study_car.dbc"])
     kmh = np.round(traced.steps[:, 4:6] / settings.car.step_s * 3.6, 2)
@@ -300,7 +300,7 @@ def _seen(wall: Bytes, seed: int) -> Bytes:
 
 def _write_landmarks(path: Path, passed: Floats, sd_m: float, seed: int) -> None:
     """Write one entry per recognition, at the noisy position that the drive used."""
-    from crosscue.localization.landmarks.database import LandmarkWriter, Place
+    from crosscue.localization.landmarks.database import LandmarkPosition, LandmarkWriter
     from crosscue.localization.landmarks.features import make_matcher
 
     matcher = make_matcher("orb")
@@ -308,7 +308,9 @@ def _write_landmarks(path: Path, passed: Floats, sd_m: float, seed: int) -> None
         for number, row in enumerate(passed):
             if row[1] == LANDMARK_MISSED:
                 continue
-            place = Place(f"wall {number}", row[4:6].copy(), sd_m**2 * np.eye(2), None, "simulated")
+            place = LandmarkPosition(
+                f"wall {number}", row[4:6].copy(), sd_m**2 * np.eye(2), None, "simulated"
+            )
             writer.add(place, matcher.describe(_wall(seed, number)))
 
 

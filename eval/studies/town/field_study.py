@@ -19,12 +19,12 @@ import numpy as np
 from crosscue.eval.runs.folder import RunFolder, locked
 from crosscue.eval.scoring.pose.score import PoseScore
 from crosscue.eval.studies.intervals import fraction_of, mean_of
-from crosscue.eval.studies.page import Table, write_page
-from crosscue.eval.studies.pictures import figure, save
+from crosscue.eval.studies.page import PageTable, write_study_page
+from crosscue.eval.studies.pictures import figure, save_figure
 from crosscue.eval.studies.words import percent
 from crosscue.localization.town.drive import Traced
 from crosscue.localization.town.random_stream import key_of
-from crosscue.localization.town.settings import Drive
+from crosscue.localization.town.settings import TownDrive
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree, strict_json
@@ -95,7 +95,7 @@ class FieldRun:
     is_whole: bool
 
 
-class Replayed(Protocol):
+class FieldReplay(Protocol):
     """One drive and its replay; see ``replayed.Replayed``."""
 
     @property
@@ -122,7 +122,9 @@ class Replayed(Protocol):
 class ThroughLog(Protocol):
     """Function that simulates a drive, writes its log, replays and scores it."""
 
-    def __call__(self, folder: Path, settings: Drive, seed: int, *, overwrite: bool) -> Replayed:
+    def __call__(
+        self, folder: Path, settings: TownDrive, seed: int, *, overwrite: bool
+    ) -> FieldReplay:
         """Simulate, replay and score one drive, in its folder."""
         ...
 
@@ -148,7 +150,7 @@ class FieldResult(Result):
 
     folder: Path
     runs: tuple[FieldRun, ...]
-    tables: tuple[Table, ...]
+    tables: tuple[PageTable, ...]
 
     @property
     def page(self) -> Path:
@@ -326,7 +328,9 @@ def _run(through_log: ThroughLog, job: _Job) -> FieldRun:
     return run
 
 
-def finish_field(study: FieldStudy, runs: Sequence[FieldRun], folder: Path) -> tuple[Table, ...]:
+def finish_field(
+    study: FieldStudy, runs: Sequence[FieldRun], folder: Path
+) -> tuple[PageTable, ...]:
     """Write summary, picture and page; return the tables."""
     made = _tables(runs)
     picture = _draw(study, runs, folder)
@@ -335,12 +339,14 @@ def finish_field(study: FieldStudy, runs: Sequence[FieldRun], folder: Path) -> t
         "notes": NOTES,
         "runs": [asdict(run) for run in runs],
     }
-    write_page(folder / PAGE, "Field protocol: simulated runs through logs", NOTES, made, [picture])
+    write_study_page(
+        folder / PAGE, "Field protocol: simulated runs through logs", NOTES, made, [picture]
+    )
     write_text(folder / SUMMARY, strict_json(content) + "\n")
     return made
 
 
-def _tables(runs: Sequence[FieldRun]) -> tuple[Table, ...]:
+def _tables(runs: Sequence[FieldRun]) -> tuple[PageTable, ...]:
     rows = []
     for label, chosen in (
         ("range runs", [r for r in runs if not r.has_landmarks]),
@@ -367,7 +373,7 @@ def _tables(runs: Sequence[FieldRun]) -> tuple[Table, ...]:
             )
         )
     return (
-        Table(
+        PageTable(
             "Replays of the simulated runs",
             (
                 "runs",
@@ -414,4 +420,4 @@ def _draw(study: FieldStudy, runs: Sequence[FieldRun], folder: Path) -> Path:
     axes.set_ylabel("2-sigma ellipse of the replay, full major axis (m)")
     axes.set_title("Simulated field runs, through logs and replay", fontsize=10)
     axes.legend(frameon=False, fontsize=8)
-    return save(made, folder, "field")
+    return save_figure(made, folder, "field")

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.studies.intervals import fraction_of, logistic
-from crosscue.eval.studies.pictures import COLOURS, figure, save
-from crosscue.localization.town.drive import Outcome
+from crosscue.eval.studies.pictures import COLOURS, figure, save_figure
+from crosscue.localization.town.drive import DriveOutcome
 
 from .landmark_study import PUBLISHED_POINT, Cell, LandmarkResult
 from .settings import LandmarkStudy
@@ -25,7 +25,7 @@ BINS: Final = 7
 SHOWN_RATE: Final = 0.6
 
 
-def draw(
+def draw_landmark_study(
     study: LandmarkStudy,
     result: LandmarkResult,
     rows: Sequence[dict[str, NDArray[np.float64]]],
@@ -83,7 +83,7 @@ def _ranges(study: LandmarkStudy, result: LandmarkResult, farthest_m: float, fol
         "Range at 80 % success, simulated; triangles at the dotted line: beyond the farthest goal",
         fontsize=10,
     )
-    return save(made, folder, "landmarks_range")
+    return save_figure(made, folder, "landmarks_range")
 
 
 def _range_line(axes: Axes, cells: Sequence[Cell], colour: str, top: float, shift: float) -> None:
@@ -137,12 +137,12 @@ def _successes(
         "dots: bins with 95 % intervals, lines: logistic curves",
         fontsize=10,
     )
-    return save(made, folder, "landmarks_success")
+    return save_figure(made, folder, "landmarks_success")
 
 
 def _success(axes: Axes, part: dict[str, NDArray[np.float64]], colour: str, label: str) -> None:
     distance_m = part["straight_m"]
-    reached = (part["outcome"] == Outcome.REACHED).astype(np.float64)
+    reached = (part["outcome"] == DriveOutcome.REACHED).astype(np.float64)
     a, b = logistic(distance_m, reached, np.ones((1, len(reached))))
     line_m = np.linspace(0.0, float(distance_m.max()), 200)
     axes.plot(

@@ -16,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.studies.intervals import (
-    Measured,
+    ValueInterval,
     fraction_of,
     mean_of,
     range_at,
     ratio_of,
     ratio_of_means,
 )
-from crosscue.eval.studies.page import Table
+from crosscue.eval.studies.page import PageTable
 from crosscue.eval.studies.words import km, percent
-from crosscue.localization.town.drive import Outcome
-from crosscue.localization.town.settings import Drive
+from crosscue.localization.town.drive import DriveOutcome
+from crosscue.localization.town.settings import TownDrive
 
 from .cases import split
 from .settings import LandmarkStudy
@@ -84,9 +84,9 @@ class Cell:
     drives: int
     lost: int
     given_up: int
-    success: Measured
-    range_m: Measured
-    travelled_m: Measured
+    success: ValueInterval
+    range_m: ValueInterval
+    travelled_m: ValueInterval
     updates: float
 
 
@@ -95,11 +95,11 @@ class CityExtra(NamedTuple):
 
     min_km2: float
     max_km2: float
-    extra: Measured
+    extra: ValueInterval
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class StrategyComparison:
     """Comparison of a strategy with driving straight to the goal.
 
     Attributes:
@@ -121,16 +121,16 @@ class Comparison:
 
     strategy: str
     pairs: int
-    extra_reached: Measured
-    extra_sparse: Measured
+    extra_reached: ValueInterval
+    extra_sparse: ValueInterval
     by_city: tuple[CityExtra, ...]
-    extra: Measured
-    extra_all: Measured
+    extra: ValueInterval
+    extra_all: ValueInterval
     published_extra: float
     gains_m: tuple[float, ...]
     gain_m: float
     beyond: int
-    more_success: Measured
+    more_success: ValueInterval
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,10 +143,10 @@ class LandmarkResult:
     """
 
     cells: tuple[Cell, ...]
-    comparisons: tuple[Comparison, ...]
+    comparisons: tuple[StrategyComparison, ...]
 
 
-def summarise(study: LandmarkStudy, table: pa.Table) -> LandmarkResult:
+def summarise_landmarks(study: LandmarkStudy, table: pa.Table) -> LandmarkResult:
     """Return the results from ``drives.parquet``."""
     cases = study.cases()
     rows = list(split(table))
@@ -155,16 +155,16 @@ def summarise(study: LandmarkStudy, table: pa.Table) -> LandmarkResult:
     return LandmarkResult(cells, tuple(_comparisons(cells[:grid], rows[:grid])))
 
 
-def _cell(settings: Drive, rows: dict[str, NDArray[np.float64]]) -> Cell:
+def _cell(settings: TownDrive, rows: dict[str, NDArray[np.float64]]) -> Cell:
     outcome = rows["outcome"]
-    reached = outcome == Outcome.REACHED
+    reached = outcome == DriveOutcome.REACHED
     return Cell(
         strategy=settings.navigation.strategy,
         landmarks_per_km2=settings.landmarks_per_km2,
         detection_rate=settings.sensors.detection_rate,
         drives=len(outcome),
-        lost=int((outcome == Outcome.LOST).sum()),
-        given_up=int((outcome == Outcome.GIVEN_UP).sum()),
+        lost=int((outcome == DriveOutcome.LOST).sum()),
+        given_up=int((outcome == DriveOutcome.GIVEN_UP).sum()),
         success=fraction_of(int(reached.sum()), len(outcome)),
         range_m=range_at(rows["straight_m"], reached.astype(np.float64), SUCCESS),
         travelled_m=mean_of(rows["travelled_m"]),
@@ -174,7 +174,7 @@ def _cell(settings: Drive, rows: dict[str, NDArray[np.float64]]) -> Cell:
 
 def comparisons_of(
     study: LandmarkStudy, rows: Sequence[dict[str, NDArray[np.float64]]]
-) -> list[Comparison]:
+) -> list[StrategyComparison]:
     """Compare strategies with straight to goal.
 
     Args:
@@ -188,7 +188,7 @@ def comparisons_of(
 
 def _comparisons(
     cells: Sequence[Cell], rows: Sequence[dict[str, NDArray[np.float64]]]
-) -> list[Comparison]:
+) -> list[StrategyComparison]:
     places = {(c.strategy, c.landmarks_per_km2, c.detection_rate): i for i, c in enumerate(cells)}
     strategies = [s for s in dict.fromkeys(c.strategy for c in cells) if s != STRAIGHT]
     if not any(c.strategy == STRAIGHT for c in cells):
@@ -213,11 +213,11 @@ def _comparison(
     pairs: Sequence[tuple[int, int]],
     cells: Sequence[Cell],
     rows: Sequence[dict[str, NDArray[np.float64]]],
-) -> Comparison:
+) -> StrategyComparison:
     ours, theirs, better = [], [], []
     ways, reached = [], []
     for i, j in pairs:
-        mine, straight = (rows[k]["outcome"] == Outcome.REACHED for k in (i, j))
+        mine, straight = (rows[k]["outcome"] == DriveOutcome.REACHED for k in (i, j))
         ours.append(rows[i]["travelled_m"][mine & straight])
         theirs.append(rows[j]["travelled_m"][mine & straight])
         better.append(mine.astype(np.float64) - straight)
@@ -230,11 +230,11 @@ def _comparison(
         if math.isfinite(mine.range_m.value) and math.isfinite(straight.range_m.value)
     )
     way = np.concatenate(ours), np.concatenate(theirs)
-    ratio = ratio_of(*way) if len(way[0]) else Measured(math.nan, math.nan, math.nan)
+    ratio = ratio_of(*way) if len(way[0]) else ValueInterval(math.nan, math.nan, math.nan)
     driven, there = np.concatenate(ways, axis=1), np.concatenate(reached, axis=1)
     per_km2 = np.repeat([cells[i].landmarks_per_km2 for i, _ in pairs], [len(w[0]) for w in ways])
     area_km2 = np.concatenate([rows[i]["area_km2"] for i, _ in pairs])
-    return Comparison(
+    return StrategyComparison(
         strategy=strategy,
         pairs=len(way[0]),
         extra_reached=_extra(driven, there),
@@ -253,20 +253,20 @@ def _comparison(
     )
 
 
-def _extra(driven: NDArray[np.float64], there: NDArray[np.float64]) -> Measured:
+def _extra(driven: NDArray[np.float64], there: NDArray[np.float64]) -> ValueInterval:
     """Return the extra distance; arrays have shape (2, N): this strategy, straight to goal."""
     return _less_one(ratio_of_means(driven[0], there[0], driven[1], there[1]))
 
 
-def _less_one(ratio: Measured) -> Measured:
-    return Measured(*(value - 1.0 for value in ratio))
+def _less_one(ratio: ValueInterval) -> ValueInterval:
+    return ValueInterval(*(value - 1.0 for value in ratio))
 
 
-def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[Table, ...]:
+def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[PageTable, ...]:
     """Return the results as tables, with the published ones."""
     grid = result.cells[: len(result.cells) - len(study.points)]
     by_strategy = [
-        Table(
+        PageTable(
             f"Range at 80 % success, km: {strategy}",
             ("landmarks per km2", *(f"rate {100 * rate:.0f} %" for rate in study.detection_rates)),
             tuple(
@@ -283,7 +283,7 @@ def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[Table, ...]:
         )
         for strategy in study.strategies
     ]
-    compared = Table(
+    compared = PageTable(
         "Against straight to goal",
         (
             "strategy",
@@ -315,7 +315,7 @@ def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[Table, ...]:
             for c in result.comparisons
         ),
     )
-    cities = Table(
+    cities = PageTable(
         "Drives farther than straight to goal, by size of city",
         (
             "strategy",
@@ -334,7 +334,7 @@ def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[Table, ...]:
             for c in result.comparisons
         ),
     )
-    points = Table(
+    points = PageTable(
         "Landmark to landmark, single points",
         ("landmarks per km2", "rate", "drives", "reached", "range at 80 %, km", "field test, km"),
         tuple(

@@ -10,10 +10,17 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.studies.pictures import COLOURS, figure, save
-from crosscue.localization.town.drive import Outcome
+from crosscue.eval.studies.pictures import COLOURS, figure, save_figure
+from crosscue.localization.town.drive import DriveOutcome
 
-from .range_study import CALIBRATED_DEG, PREDICTED, PUBLISHED_M, Choice, CompassResult, points
+from .range_study import (
+    CALIBRATED_DEG,
+    PREDICTED,
+    PUBLISHED_M,
+    CompassCase,
+    CompassResult,
+    loss_points,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +31,7 @@ NAME: Final = "range"
 CHOICES: Final = "range_choices"
 
 
-def draw(
+def draw_range_study(
     results: Sequence[CompassResult],
     rows: Sequence[dict[str, NDArray[np.float64]]],
     limit_m: float,
@@ -51,10 +58,10 @@ def draw(
     survival.set_ylabel("fraction of drives not lost yet")
     survival.set_title("Crosses: mean distance at loss; dotted: published", fontsize=9)
     made.suptitle("Range without landmarks, simulated", fontsize=11)
-    return save(made, folder, NAME)
+    return save_figure(made, folder, NAME)
 
 
-def name_of(result: CompassResult) -> str:
+def compass_name(result: CompassResult) -> str:
     """Return the compass as text."""
     degrees = result.compass_2sigma_deg
     return "no compass" if degrees is None else f"compass ±{degrees:g}° (2 sigma)"
@@ -63,18 +70,22 @@ def name_of(result: CompassResult) -> str:
 def _growth(
     axes: Axes, result: CompassResult, columns: dict[str, NDArray[np.float64]], colour: str
 ) -> None:
-    distance_m, axis_m = points(columns)
+    distance_m, axis_m = loss_points(columns)
     axes.plot(distance_m * KM, axis_m, ".", ms=1.5, alpha=0.35, color=colour, rasterized=True)
     curve_m = np.linspace(0.0, FIRST_GOAL_KM / KM, 400)
     axes.plot(
-        curve_m * KM, result.growth.axis_m(curve_m), color=colour, lw=1.6, label=name_of(result)
+        curve_m * KM,
+        result.growth.axis_m(curve_m),
+        color=colour,
+        lw=1.6,
+        label=compass_name(result),
     )
 
 
 def _survival(
     axes: Axes, result: CompassResult, columns: dict[str, NDArray[np.float64]], colour: str
 ) -> None:
-    lost_m = np.sort(columns["travelled_m"][columns["outcome"] == Outcome.LOST])
+    lost_m = np.sort(columns["travelled_m"][columns["outcome"] == DriveOutcome.LOST])
     left = 1.0 - np.arange(len(lost_m) + 1) / result.drives
     end_m = max(60_000.0, float(lost_m[-1]) if len(lost_m) else 0.0)
     axes.step(
@@ -98,7 +109,7 @@ def _survival(
         axes.axvline(result.published_m * KM, color=colour, ls=":", lw=1.4)
 
 
-def draw_choices(choices: Sequence[Choice], folder: Path) -> Path:
+def draw_choices(choices: Sequence[CompassCase], folder: Path) -> Path:
     """Write ``range_choices.png`` and ``range_choices.svg``."""
     made, axes = figure(2, 12.0, 4.6)
     for panel, compass in zip(axes, (CALIBRATED_DEG, PREDICTED[0]), strict=True):
@@ -126,4 +137,4 @@ def draw_choices(choices: Sequence[Choice], folder: Path) -> Path:
         panel.set_title(f"compass ±{compass:g}°: {role}; dashed: published", fontsize=9)
     axes[0].legend(frameon=False, fontsize=8)
     made.suptitle("Other choices of slip and compass interval, simulated", fontsize=11)
-    return save(made, folder, CHOICES)
+    return save_figure(made, folder, CHOICES)

@@ -16,10 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring.consistency import mean_band
-from crosscue.eval.studies.intervals import Measured, fraction_of, mean_of, measured, weights_of
-from crosscue.localization.town.drive import Outcome, Result, drive_many
+from crosscue.eval.studies.intervals import (
+    ValueInterval,
+    fraction_of,
+    mean_of,
+    measured,
+    weights_of,
+)
+from crosscue.localization.town.drive import DriveOutcome, DriveResult, drive_many
 from crosscue.localization.town.random_stream import key_of
-from crosscue.localization.town.settings import Drive
+from crosscue.localization.town.settings import TownDrive
 
 from .cases import split
 from .settings import UNTIL_LOST, RangeStudy, changed
@@ -58,7 +64,7 @@ class Growth:
     start_m2: float
     linear_m: float
     square: float
-    crossing_m: Measured
+    crossing_m: ValueInterval
 
     def axis_m(self, distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the major axis at given distances."""
@@ -95,10 +101,10 @@ class CompassResult:
     lost: int
     given_up: int
     reached_first_goal: int
-    lost_after_m: Measured
+    lost_after_m: ValueInterval
     shortest_m: float
     longest_m: float
-    fraction_lost: Measured
+    fraction_lost: ValueInterval
     law_m: float
     growth: Growth
     nees_mean: float
@@ -107,7 +113,7 @@ class CompassResult:
     is_calibrated: bool
 
 
-def summarise(study: RangeStudy, table: pa.Table) -> list[CompassResult]:
+def summarise_ranges(study: RangeStudy, table: pa.Table) -> list[CompassResult]:
     """Return the results by compass, in the order of the study's cases."""
     return [
         _of_case(case.settings, rows)
@@ -115,16 +121,18 @@ def summarise(study: RangeStudy, table: pa.Table) -> list[CompassResult]:
     ]
 
 
-def points(rows: dict[str, NDArray[np.float64]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def loss_points(
+    rows: dict[str, NDArray[np.float64]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return distance and major axis of each drive at its first goal, or at an earlier loss."""
     reached = ~np.isnan(rows["first_goal_m"])
     distance = np.where(reached, rows["first_goal_m"], rows["travelled_m"])
     axis = np.where(reached, rows["first_goal_axis_m"], rows["major_axis_m"])
-    is_point = reached | (rows["outcome"] == Outcome.LOST)
+    is_point = reached | (rows["outcome"] == DriveOutcome.LOST)
     return distance[is_point], axis[is_point]
 
 
-def law_m(settings: Drive) -> float:
+def law_m(settings: TownDrive) -> float:
     """Return the distance at loss when driving straight, by r ds D; NaN without a compass."""
     compass = settings.sensors.compass_2sigma_deg
     if compass is None:
@@ -139,7 +147,7 @@ def implied_m(published_deg: float, compass_deg: float) -> float:
     return PUBLISHED_M[published_deg] * (published_deg / compass_deg) ** 2
 
 
-def calibrate(drive: Drive, workers: int, tolerance: float = 2e-3) -> float:
+def calibrate(drive: TownDrive, workers: int, tolerance: float = 2e-3) -> float:
     """Find the compass interval for which the mean range at 30 degrees is the published one.
 
     Uses separate seeds, which no study reports, and the same seeds at each step for convergence.
@@ -165,24 +173,24 @@ def calibrate(drive: Drive, workers: int, tolerance: float = 2e-3) -> float:
                 goals=UNTIL_LOST,
             )
             rows = np.concatenate(list(pool.map(lambda p: drive_many(settings, p), parts)))  # noqa: B023
-            lost = rows[:, 0] == Outcome.LOST
-            mean_m = float(rows[lost, Result._fields.index("travelled_m")].mean())
+            lost = rows[:, 0] == DriveOutcome.LOST
+            mean_m = float(rows[lost, DriveResult._fields.index("travelled_m")].mean())
             if abs(mean_m / wanted_m - 1.0) < tolerance:
                 return interval_m
             interval_m *= mean_m / wanted_m
 
 
-def _of_case(settings: Drive, rows: dict[str, NDArray[np.float64]]) -> CompassResult:
+def _of_case(settings: TownDrive, rows: dict[str, NDArray[np.float64]]) -> CompassResult:
     sensors = settings.sensors
     n = len(rows["outcome"])
-    is_lost = rows["outcome"] == Outcome.LOST
+    is_lost = rows["outcome"] == DriveOutcome.LOST
     lost_m = rows["travelled_m"][is_lost]
     compass = sensors.compass_2sigma_deg
     return CompassResult(
         compass_2sigma_deg=compass,
         drives=n,
         lost=int(is_lost.sum()),
-        given_up=int((rows["outcome"] == Outcome.GIVEN_UP).sum()),
+        given_up=int((rows["outcome"] == DriveOutcome.GIVEN_UP).sum()),
         reached_first_goal=int((~np.isnan(rows["first_goal_m"])).sum()),
         lost_after_m=mean_of(lost_m),
         shortest_m=float(lost_m.min()) if len(lost_m) else math.nan,
@@ -190,7 +198,7 @@ def _of_case(settings: Drive, rows: dict[str, NDArray[np.float64]]) -> CompassRe
         fraction_lost=fraction_of(int(is_lost.sum()), n),
         law_m=law_m(settings),
         growth=fit_growth(
-            *points(rows), 4.0 * sensors.start_position_sd_m, settings.navigation.lost_above_m
+            *loss_points(rows), 4.0 * sensors.start_position_sd_m, settings.navigation.lost_above_m
         ),
         nees_mean=float(rows["nees"].mean()),
         nees_band=mean_band(3, n),
@@ -235,7 +243,7 @@ def _crossing(start: float, linear: float, square: float, limit_m: float) -> flo
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class CompassCase:
     """Distance at loss with one slip and one compass interval.
 
     Attributes:
@@ -250,10 +258,10 @@ class Choice:
     compass_interval_m: float
     is_studied: bool
     drives: int
-    lost_after_m: dict[float | None, Measured]
+    lost_after_m: dict[float | None, ValueInterval]
 
 
-def drive_choices(study: RangeStudy, workers: int = 2) -> tuple[Choice, ...]:
+def drive_choices(study: RangeStudy, workers: int = 2) -> tuple[CompassCase, ...]:
     """Simulate every pair of slip and interval, which takes seconds for a full study."""
     from concurrent.futures import ThreadPoolExecutor
 
@@ -270,13 +278,13 @@ def drive_choices(study: RangeStudy, workers: int = 2) -> tuple[Choice, ...]:
         )
 
 
-def _choice(study: RangeStudy, pair: tuple[float, float], count: int) -> Choice:
+def _choice(study: RangeStudy, pair: tuple[float, float], count: int) -> CompassCase:
     slip, interval_m = pair
     own = study.drive.sensors
     sensors = own.model_copy(update={"slip_per_sqrt_m": slip, "compass_interval_m": interval_m})
     drive = study.drive.model_copy(update={"sensors": sensors})
     seeds = np.array([key_of(study.seed, BLOCK, i) for i in range(count)], np.uint64)
-    return Choice(
+    return CompassCase(
         slip_per_sqrt_m=slip,
         compass_interval_m=interval_m,
         is_studied=(slip, interval_m) == (own.slip_per_sqrt_m, own.compass_interval_m),
@@ -288,14 +296,14 @@ def _choice(study: RangeStudy, pair: tuple[float, float], count: int) -> Choice:
 
 
 def _lost_after(
-    drive: Drive, compass: float | None, seeds: np.typing.NDArray[np.uint64]
-) -> Measured:
+    drive: TownDrive, compass: float | None, seeds: np.typing.NDArray[np.uint64]
+) -> ValueInterval:
     rows = drive_many(changed(drive, compass_2sigma_deg=compass, goals=UNTIL_LOST), seeds)
-    lost = rows[:, Result._fields.index("outcome")] == Outcome.LOST
-    return mean_of(rows[lost, Result._fields.index("travelled_m")])
+    lost = rows[:, DriveResult._fields.index("outcome")] == DriveOutcome.LOST
+    return mean_of(rows[lost, DriveResult._fields.index("travelled_m")])
 
 
-def choice_tree(choice: Choice) -> dict[str, object]:
+def choice_tree(choice: CompassCase) -> dict[str, object]:
     """Return a choice as in ``summary.json``, with the compass in degrees, or ``none``."""
     return {
         **asdict(choice),

@@ -12,14 +12,14 @@ from pydantic import ValidationError
 
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.eval.pipeline.replay import replay_drive
-from crosscue.eval.recording import save
+from crosscue.eval.recording import save_rrd
 from crosscue.eval.report.pose_figures import draw_all
 from crosscue.eval.report.summary import pose_summary
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.files import FOLDER, METRICS
-from crosscue.eval.scoring.pose.score import PoseScore, load_truth, measure, truth_track
+from crosscue.eval.scoring.pose.score import PoseScore, load_truth, measure_pose, truth_track
 from crosscue.localization.town.drive import Traced, drive_traced
-from crosscue.localization.town.settings import Drive, Navigation, Sensors
+from crosscue.localization.town.settings import Navigation, Sensors, TownDrive
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.tree_text import strict_json
@@ -55,7 +55,9 @@ class Replayed:
     landmark_counts: dict[str, int]
 
 
-def through_log(folder: Path, settings: Drive, seed: int, *, overwrite: bool = False) -> Replayed:
+def through_log(
+    folder: Path, settings: TownDrive, seed: int, *, overwrite: bool = False
+) -> Replayed:
     """Simulate a drive, write its log, replay it into ``folder/run``, and score the run.
 
     Raises:
@@ -84,7 +86,7 @@ def score_pose(run: RunFolder, truth_path: Path) -> PoseScore:
         SchemaError: The truth does not fit the run.
     """
     truth, _ = load_truth(truth_path)
-    result, poses = measure(run, truth_path)
+    result, poses = measure_pose(run, truth_path)
     content = {"truth": truth.model_dump(mode="json"), "pose": asdict(result)}
     write_text(run.file(FOLDER) / METRICS, strict_json(content) + "\n")
     draw_all(poses, run.file(FOLDER))
@@ -171,7 +173,7 @@ def run_study_drive(
     if not 0 <= seed < 1 << 64:
         raise UsageError(f"seed: {seed}, expected 0 or more, below 2^64")
     try:
-        settings = Drive(
+        settings = TownDrive(
             sensors=Sensors(
                 compass_2sigma_deg=compass_2sigma_deg or None, detection_rate=detection_rate
             ),
@@ -183,7 +185,7 @@ def run_study_drive(
         raise UsageError(f"{first['loc'][-1]}: {first['input']}, {first['msg'].lower()}") from None
     place = Path(output)
     made = through_log(place, settings, seed, overwrite=overwrite)
-    picture = drive_figure.draw(settings, made.traced, seed, place)
+    picture = drive_figure.draw_drive(settings, made.traced, seed, place)
     recording = made.run.file("drive.rrd")
-    save(made.run, recording, truth_track(made.files.truth, made.run))
+    save_rrd(made.run, recording, truth_track(made.files.truth, made.run))
     return StudyDrive(made, picture, recording)

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal, overload
 
 from crosscue.eval.runs.folder import RunFolder, locked
-from crosscue.eval.studies.page import Table, write_page
+from crosscue.eval.studies.page import PageTable, write_study_page
 from crosscue.eval.studies.result import StoredResult
 from crosscue.eval.studies.words import km, percent
-from crosscue.localization.town.drive import Result as DriveResult
+from crosscue.localization.town.drive import DriveResult as DriveResult
 from crosscue.localization.town.drive import drive_traced
 from crosscue.replay.errors import RunError
 from crosscue.replay.files import door
@@ -51,7 +51,7 @@ class Made:
     """
 
     folder: Path
-    tables: tuple[Table, ...]
+    tables: tuple[PageTable, ...]
     notes: tuple[str, ...]
 
 
@@ -92,7 +92,7 @@ class StudyResult(StoredResult):
         drives = self.drives
         settings = self.study.cases()[drives["case"][row].as_py()].settings
         seed = drives["seed"][row].as_py()
-        return drive_figure.draw(settings, drive_traced(settings, seed), seed, self.folder)
+        return drive_figure.draw_drive(settings, drive_traced(settings, seed), seed, self.folder)
 
     def lines(self) -> Iterator[str]:
         """Yield the tables, notes on them, and the paths of the page and the drives."""
@@ -277,8 +277,8 @@ def drive_study(
 def finish_range(study: RangeStudy, folder: Path) -> Made:
     """Write summary, picture and page from ``drives.parquet``."""
     table = RunFolder(folder).table(DRIVES)
-    results = range_study.summarise(study, table)
-    picture = range_figure.draw(
+    results = range_study.summarise_ranges(study, table)
+    picture = range_figure.draw_range_study(
         results, list(split(table)), study.drive.navigation.lost_above_m, folder
     )
     others = range_study.drive_choices(study)
@@ -297,8 +297,8 @@ def finish_range(study: RangeStudy, folder: Path) -> Made:
 def finish_landmarks(study: LandmarkStudy, folder: Path) -> Made:
     """Write summary, pictures and page from ``drives.parquet``."""
     table = RunFolder(folder).table(DRIVES)
-    result = landmark_study.summarise(study, table)
-    pictures = landmark_figure.draw(study, result, list(split(table)), folder)
+    result = landmark_study.summarise_landmarks(study, table)
+    pictures = landmark_figure.draw_landmark_study(study, result, list(split(table)), folder)
     tables = landmark_study.tables(study, result)
     return _finish(
         study,
@@ -334,10 +334,10 @@ RANGE_NOTES: Final = (
 )
 
 
-def range_tables(results: Sequence[range_study.CompassResult]) -> tuple[Table, ...]:
+def range_tables(results: Sequence[range_study.CompassResult]) -> tuple[PageTable, ...]:
     """Return the results by compass, with the published ones."""
     return (
-        Table(
+        PageTable(
             "Distance at loss (95 % intervals)",
             (
                 "compass",
@@ -352,7 +352,7 @@ def range_tables(results: Sequence[range_study.CompassResult]) -> tuple[Table, .
             ),
             tuple(
                 (
-                    range_figure.name_of(r),
+                    range_figure.compass_name(r),
                     str(r.drives),
                     percent(r.fraction_lost),
                     km(r.lost_after_m) if r.lost else "never lost",
@@ -368,13 +368,13 @@ def range_tables(results: Sequence[range_study.CompassResult]) -> tuple[Table, .
     )
 
 
-def choices_table(choices: Sequence[range_study.Choice]) -> Table:
+def choices_table(choices: Sequence[range_study.CompassCase]) -> PageTable:
     """Return every choice, with the published numbers."""
     published = [
         f"{range_study.PUBLISHED_M[c] / 1e3:.1f} published"
         for c in (range_study.CALIBRATED_DEG, *range_study.PREDICTED)
     ]
-    return Table(
+    return PageTable(
         f"Mean distance at loss with other choices, km ({choices[0].drives} drives each)",
         (
             "slip, m per root m",
@@ -409,7 +409,7 @@ def _finish(
     folder: Path,
     title: str,
     results: object,
-    tables: tuple[Table, ...],
+    tables: tuple[PageTable, ...],
     notes: tuple[str, ...],
     pictures: Sequence[Path],
     **more: object,
@@ -421,7 +421,7 @@ def _finish(
         **more,
         "columns": ["case", "drive", "seed", *DriveResult._fields],
     }
-    write_page(folder / PAGE, f"{title}: simulated study", notes, tables, pictures)
+    write_study_page(folder / PAGE, f"{title}: simulated study", notes, tables, pictures)
     write_text(folder / SUMMARY, strict_json(summary) + "\n")
     return Made(folder, tables, notes)
 

@@ -19,7 +19,7 @@ from typing import Annotated, ClassVar, Final, Literal, NamedTuple, Self, TypeVa
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from crosscue.localization.town.settings import City, Drive, Proportion
+from crosscue.localization.town.settings import City, Proportion, TownDrive
 from crosscue.replay.errors import StudyFileError, UsageError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import toml_tree
@@ -47,13 +47,13 @@ class Case(NamedTuple):
     """
 
     block: int
-    settings: Drive
+    settings: TownDrive
 
 
 class _Study(Section):
     version: Literal[1] = VERSION
     seed: Seed = 1
-    drive: Drive = Drive()
+    drive: TownDrive = TownDrive()
 
     varied: ClassVar[tuple[str, ...]] = ()
     """Settings of the drive that the study sets."""
@@ -173,7 +173,7 @@ class FieldStudy(_Study):
         "city.largest_km2",
     )
 
-    def settings(self, *, has_landmarks: bool) -> Drive:
+    def settings(self, *, has_landmarks: bool) -> TownDrive:
         """Return the settings of one kind of run."""
         town = self.drive.city.model_dump(exclude={"smallest_km2", "largest_km2"})
         base = self.drive.model_copy(
@@ -198,7 +198,7 @@ Study = TypeVar("Study", RangeStudy, LandmarkStudy, FieldStudy)
 _Sensors = ("compass_2sigma_deg", "detection_rate")
 
 
-def changed(drive: Drive, **values: object) -> Drive:
+def changed(drive: TownDrive, **values: object) -> TownDrive:
     """Return a drive's settings with some replaced, by their names without sections."""
     sensors = {name: values.pop(name) for name in _Sensors if name in values}
     navigation = {"strategy": values.pop("strategy")} if "strategy" in values else {}
@@ -271,7 +271,7 @@ def _misfit(why: str, given: object, *keys: str) -> ValidationError:
     )
 
 
-def _landmarks(drive: Drive, strategy: str, per_km2: float, rate: float) -> Drive:
+def _landmarks(drive: TownDrive, strategy: str, per_km2: float, rate: float) -> TownDrive:
     return changed(
         drive, strategy=strategy, landmarks_per_km2=per_km2, detection_rate=rate, goals=1
     )

@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crosscue.eval.batch.ray_cluster import joined
+from crosscue.eval.batch.ray_cluster import connect_ray
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.localization.town import parameters
 from crosscue.localization.town import settings as drive_settings
-from crosscue.localization.town.drive import Keys, Result, drive_many, drive_one
+from crosscue.localization.town.drive import DriveResult, Keys, drive_many, drive_one
 from crosscue.localization.town.random_stream import key_of
-from crosscue.localization.town.settings import Drive
+from crosscue.localization.town.settings import TownDrive
 from crosscue.replay.columns import Floats
 from crosscue.replay.compiled import fingerprint
 from crosscue.replay.errors import RunError, UnreadableRunError, UsageError, WorkerError
@@ -40,11 +40,11 @@ if TYPE_CHECKING:
 CHUNK_DRIVES: Final = 100
 CHUNKS: Final = "chunks"
 DRIVES: Final = "drives"
-DriveMany = Callable[[Drive, Keys], Floats]
+DriveMany = Callable[[TownDrive, Keys], Floats]
 
 
 @dataclass(frozen=True, slots=True)
-class Chunk:
+class DriveBatch:
     """Some drives of one case.
 
     Attributes:
@@ -57,7 +57,7 @@ class Chunk:
     """
 
     case: int
-    settings: Drive
+    settings: TownDrive
     block: int
     first: int
     count: int
@@ -77,10 +77,12 @@ class Chunk:
         return parts.hexdigest()[:32]
 
 
-def chunks_of(cases: Sequence[Case], drives: int, study_seed: int) -> list[Chunk]:
+def chunks_of(cases: Sequence[Case], drives: int, study_seed: int) -> list[DriveBatch]:
     """Return all chunks, in the order of the result."""
     return [
-        Chunk(i, case.settings, case.block, first, min(CHUNK_DRIVES, drives - first), study_seed)
+        DriveBatch(
+            i, case.settings, case.block, first, min(CHUNK_DRIVES, drives - first), study_seed
+        )
         for i, case in enumerate(cases)
         for first in range(0, drives, CHUNK_DRIVES)
     ]
@@ -98,7 +100,7 @@ def workers_of(workers: int | None) -> int:
 
 
 def run(
-    chunks: Sequence[Chunk],
+    chunks: Sequence[DriveBatch],
     folder: Path,
     workers: int,
     ray_address: str | None = None,
@@ -133,12 +135,12 @@ def run(
     )
     for chunk, rows in finished:
         with TableSink(kept, chunk.name, _chunk_schema()) as sink:
-            sink.write(dict(zip(Result._fields, rows.T, strict=True)))
+            sink.write(dict(zip(DriveResult._fields, rows.T, strict=True)))
         done += 1
         yield done
 
 
-def assemble(chunks: Sequence[Chunk], folder: Path) -> None:
+def assemble(chunks: Sequence[DriveBatch], folder: Path) -> None:
     """Write ``drives.parquet`` with all drives and their conditions, in order.
 
     Raises:
@@ -173,7 +175,7 @@ def drives_schema() -> pa.Schema:
     )
 
 
-def _with_conditions(chunk: Chunk, rows: dict[str, Floats]) -> dict[str, object]:
+def _with_conditions(chunk: DriveBatch, rows: dict[str, Floats]) -> dict[str, object]:
     n, settings = chunk.count, chunk.settings
     return {
         "case": [chunk.case] * n,
@@ -190,7 +192,7 @@ def _with_conditions(chunk: Chunk, rows: dict[str, Floats]) -> dict[str, object]
 def _chunk_schema() -> pa.Schema:
     import pyarrow as pa
 
-    return pa.schema([(name, pa.float64()) for name in Result._fields])
+    return pa.schema([(name, pa.float64()) for name in DriveResult._fields])
 
 
 @cache
@@ -199,7 +201,7 @@ def _code() -> bytes:
     return fingerprint(drive_one).encode() + b"".join(settings)
 
 
-def _read(kept: RunFolder, chunk: Chunk) -> dict[str, Floats] | None:
+def _read(kept: RunFolder, chunk: DriveBatch) -> dict[str, Floats] | None:
     """Read a finished chunk; None if it is missing or damaged."""
     if not kept.file(f"{chunk.name}.parquet").exists():
         return None
@@ -207,17 +209,17 @@ def _read(kept: RunFolder, chunk: Chunk) -> dict[str, Floats] | None:
         table = kept.table(chunk.name)
     except RunError:
         return None
-    if table.num_rows != chunk.count or table.column_names != list(Result._fields):
+    if table.num_rows != chunk.count or table.column_names != list(DriveResult._fields):
         return None
-    return {name: table[name].to_numpy() for name in Result._fields}
+    return {name: table[name].to_numpy() for name in DriveResult._fields}
 
 
 def _on_threads(
-    chunks: Sequence[Chunk], workers: int, drive: DriveMany
-) -> Iterator[tuple[Chunk, Floats]]:
+    chunks: Sequence[DriveBatch], workers: int, drive: DriveMany
+) -> Iterator[tuple[DriveBatch, Floats]]:
     waiting = deque(chunks)
     pool = ThreadPoolExecutor(workers)
-    running: dict[Future[Floats], Chunk] = {}
+    running: dict[Future[Floats], DriveBatch] = {}
     try:
         while waiting or running:
             while waiting and len(running) < 2 * workers:
@@ -242,12 +244,14 @@ def _result(get: Callable[[], Floats]) -> Floats:
         ) from None
 
 
-def _on_ray(chunks: Sequence[Chunk], workers: int, address: str) -> Iterator[tuple[Chunk, Floats]]:
-    with joined(address, workers) as ray:
+def _on_ray(
+    chunks: Sequence[DriveBatch], workers: int, address: str
+) -> Iterator[tuple[DriveBatch, Floats]]:
+    with connect_ray(address, workers) as ray:
         drive = ray.remote(max_retries=2)(_drive_chunk)
         max_running = 2 * max(int(ray.cluster_resources().get("CPU", 1)), 1)
         waiting = deque(chunks)
-        running: dict[Any, Chunk] = {}
+        running: dict[Any, DriveBatch] = {}
         while waiting or running:
             while waiting and len(running) < max_running:
                 chunk = waiting.popleft()
@@ -257,7 +261,7 @@ def _on_ray(chunks: Sequence[Chunk], workers: int, address: str) -> Iterator[tup
                 yield running.pop(reference), _from_ray(ray, reference)
 
 
-def _drive_chunk(chunk: Chunk) -> Floats:
+def _drive_chunk(chunk: DriveBatch) -> Floats:
     return drive_many(chunk.settings, chunk.seeds())
 
 

@@ -11,21 +11,21 @@ import numpy as np
 from crosscue.replay.columns import Block, Messages, Topic
 from crosscue.replay.decode.refuse import MISFIT, WRONG_CODING, refuse
 from crosscue.replay.decode.ros.definition import Definitions, definitions_of, well_known
-from crosscue.replay.decode.ros.fields import Fields, Part, WalkedFields
-from crosscue.replay.decode.ros.plan import Plan, plan_of
+from crosscue.replay.decode.ros.fields import FieldColumns, MessageBatch, WalkedFields
+from crosscue.replay.decode.ros.plan import ParsingPlan, compile_plan
 from crosscue.replay.decode.ros.repeated import (
     LAYOUTS_KEPT,
     MAX_BYTES,
-    Layout,
+    MessageLayout,
     RepeatedFields,
     layout_of,
     repeats,
     tail_counts,
     tail_of,
 )
-from crosscue.replay.decode.ros.standard import Doubt, Kind, header_ns, kind_of
+from crosscue.replay.decode.ros.standard import Doubt, RosConversion, conversion_for, header_ns
 from crosscue.replay.decode.ros.type_names import ros2_spelling
-from crosscue.replay.decode.ros.walk import CDR_PADDING, Bools, Rows, gather, walk
+from crosscue.replay.decode.ros.walk import CDR_PADDING, Bools, Rows, gather, locate_fields
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 
@@ -48,10 +48,10 @@ class RosDecoder:
         layouts: Known layouts by the length of their message; None for a length without a layout.
     """
 
-    plan: Plan
-    kind: Kind
+    plan: ParsingPlan
+    kind: RosConversion
     tail: str = ""
-    layouts: dict[int, Layout | None] = field(default_factory=dict)
+    layouts: dict[int, MessageLayout | None] = field(default_factory=dict)
 
     def __call__(self, block: Block, ledger: Ledger) -> Block:
         """Decode a block; messages that do not fit are counted in ``ledger``."""
@@ -73,7 +73,7 @@ class RosDecoder:
             picked.sequence,
         )
 
-    def walked(self, block: Block, messages: Messages, ledger: Ledger) -> tuple[Fields, Rows]:
+    def walked(self, block: Block, messages: Messages, ledger: Ledger) -> tuple[FieldColumns, Rows]:
         """Return the fields of the messages that fit, and their row numbers in the block.
 
         The others are dropped or skipped in ``ledger``, with reason and time.
@@ -119,11 +119,13 @@ class RosDecoder:
         parts, rows = [], []
         for little, index in self._by_order(block, messages, ledger):
             whole = len(index) == len(messages)
-            found = walk(self.plan, messages if whole else messages.take(index), little=little)
+            found = locate_fields(
+                self.plan, messages if whole else messages.take(index), little=little
+            )
             for refused in found.refused:
                 _refuse(ledger, block, index[refused.rows], MISFIT, refused.why)
             fits = np.flatnonzero(found.ok)
-            parts.append(Part(found, fits))
+            parts.append(MessageBatch(found, fits))
             rows.append(index[fits])
         kept = rows[0] if len(rows) == 1 else np.concatenate(rows)
         order = None
@@ -189,8 +191,8 @@ def ros_decoder(topic: Topic) -> RosDecoder | None:
     if known is None:
         return None
     try:
-        plan = plan_of(name, known, is_cdr=topic.encoding == "cdr")
-        kind = kind_of(name)
+        plan = compile_plan(name, known, is_cdr=topic.encoding == "cdr")
+        kind = conversion_for(name)
         kind.check(plan)
     except SchemaError as error:
         raise SchemaError(f"{topic.name}: {error}") from None

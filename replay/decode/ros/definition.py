@@ -40,7 +40,7 @@ DURATION: Final = "builtin_interfaces/msg/Duration"
 IDL_BYTES: Final = 64 << 10
 
 
-class Shape(Enum):
+class Multiplicity(Enum):
     """Multiplicity of a field."""
 
     ONE = "one"
@@ -49,7 +49,7 @@ class Shape(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class MessageField:
     """One field of a message.
 
     Attributes:
@@ -62,12 +62,12 @@ class Field:
 
     name: str
     type_name: str
-    shape: Shape = Shape.ONE
+    shape: Multiplicity = Multiplicity.ONE
     size: int = 0
     text_bound: int = 0
 
 
-Definitions = Mapping[str, tuple[Field, ...]]
+Definitions = Mapping[str, tuple[MessageField, ...]]
 
 _SEPARATOR: Final = re.compile(r"^={40,}[ \t\r]*$", re.MULTILINE)
 _ACTION_PART: Final = re.compile(r"^---[ \t\r]*$", re.MULTILINE)
@@ -115,7 +115,7 @@ def definitions_of(
 
 def _from_msg(type_name: str, text: str) -> Definitions:
     sections = _SEPARATOR.split(text)
-    raw: dict[str, tuple[Field, ...]] = {}
+    raw: dict[str, tuple[MessageField, ...]] = {}
     for i, section in enumerate(sections):
         name, body = type_name, section
         if i:
@@ -144,7 +144,7 @@ def _feedback_of_action(type_name: str, text: str) -> str:
     return f"{fields}{'=' * 80}\nMSG: {name}_Feedback\n{parts[2]}\n{others}"
 
 
-def _fields_of(owner: str, body: str) -> Iterator[Field]:
+def _fields_of(owner: str, body: str) -> Iterator[MessageField]:
     for line in body.split("\n"):
         line = _ANNOTATION.sub("", line.strip(), count=1)
         if not line or line.startswith("#"):
@@ -154,31 +154,31 @@ def _fields_of(owner: str, body: str) -> Iterator[Field]:
             raise SchemaError(f"{owner}: cannot read the line {line[:80]!r} of its definition")
         if match["rest"].startswith("="):
             continue
-        shape = Shape.ONE
+        shape = Multiplicity.ONE
         if match["array"]:
             fixed = match["size"] and not match["most"]
-            shape = Shape.ARRAY if fixed else Shape.SEQUENCE
+            shape = Multiplicity.ARRAY if fixed else Multiplicity.SEQUENCE
         if match["text"] and match["type"] != "string":
             raise SchemaError(f"{owner}: only strings may have a bound, not {line[:80]!r}")
         has_default = match["rest"] and not match["rest"].startswith("#")
         if has_default and match["type"] not in PRIMITIVES and match["type"] != "string":
             raise SchemaError(f"{owner}: cannot read the line {line[:80]!r} of its definition")
-        yield Field(
+        yield MessageField(
             match["name"], match["type"], shape, int(match["size"] or 0), int(match["text"] or 0)
         )
 
 
 def _resolved(
-    owner: str, fields: tuple[Field, ...], known: Mapping[str, tuple[Field, ...]]
-) -> tuple[Field, ...]:
+    owner: str, fields: tuple[MessageField, ...], known: Mapping[str, tuple[MessageField, ...]]
+) -> tuple[MessageField, ...]:
     package = owner.rsplit("/", 1)[0]
     return tuple(
-        Field(f.name, _full_name(f.type_name, package, known), f.shape, f.size, f.text_bound)
+        MessageField(f.name, _full_name(f.type_name, package, known), f.shape, f.size, f.text_bound)
         for f in fields
     )
 
 
-def _full_name(name: str, package: str, known: Mapping[str, tuple[Field, ...]]) -> str:
+def _full_name(name: str, package: str, known: Mapping[str, tuple[MessageField, ...]]) -> str:
     if name in PRIMITIVES or name == "string":
         return name
     if name == "time":
@@ -198,7 +198,7 @@ def _from_idl(type_name: str, text: str) -> Definitions:
         raise SchemaError(
             f"{type_name}: IDL has {len(text)} characters, over the limit of {IDL_BYTES}"
         )
-    found: dict[str, tuple[Field, ...]] = {}
+    found: dict[str, tuple[MessageField, ...]] = {}
     for section in _SEPARATOR.split(text):
         head, _, body = section.lstrip().partition("\n")
         source = body if head.startswith("IDL:") else section
@@ -242,17 +242,21 @@ def _without_comments(text: str) -> str:
     return "".join(kept) + text[at:]
 
 
-def _from_rosbags(fields: object) -> tuple[Field, ...]:
+def _from_rosbags(fields: object) -> tuple[MessageField, ...]:
     """Convert fields from the representation of rosbags."""
-    out: list[Field] = []
+    out: list[MessageField] = []
     assert isinstance(fields, list)
     for name, (node, inner) in fields:
-        shape, size = Shape.ONE, 0
+        shape, size = Multiplicity.ONE, 0
         if node.name in ("ARRAY", "SEQUENCE"):
             (node, inner), size = inner[0], inner[1]
-            shape = Shape.ARRAY if fields[len(out)][1][0].name == "ARRAY" else Shape.SEQUENCE
+            shape = (
+                Multiplicity.ARRAY
+                if fields[len(out)][1][0].name == "ARRAY"
+                else Multiplicity.SEQUENCE
+            )
         type_name, bound = inner if node.name == "BASE" else (inner, 0)
-        out.append(Field(name, type_name, shape, size, bound))
+        out.append(MessageField(name, type_name, shape, size, bound))
     return tuple(out)
 
 

@@ -9,12 +9,12 @@ from typing import Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.decode.ros.plan import Plan, Value
-from crosscue.replay.decode.ros.walk import Bools, Found, Rows, gather
+from crosscue.replay.decode.ros.plan import ParsingPlan, Value
+from crosscue.replay.decode.ros.walk import Bools, FieldPositions, Rows, gather
 
 
 @dataclass(slots=True, eq=False)
-class Part:
+class MessageBatch:
     """Messages of one byte order.
 
     Attributes:
@@ -22,15 +22,15 @@ class Part:
         rows: Shape (M,): indices of the messages that fit.
     """
 
-    found: Found
+    found: FieldPositions
     rows: Rows
 
 
-class Fields(Protocol):
+class FieldColumns(Protocol):
     """Columns of the M messages that fit their definition."""
 
     @property
-    def plan(self) -> Plan:
+    def plan(self) -> ParsingPlan:
         """Parsing plan of their type."""
         ...
 
@@ -77,9 +77,9 @@ class WalkedFields:
         seen: Numbers decoded so far.
     """
 
-    plan: Plan
+    plan: ParsingPlan
     buffer: NDArray[np.uint8]
-    parts: tuple[Part, ...]
+    parts: tuple[MessageBatch, ...]
     order: Rows | None
     seen: dict[str, NDArray[np.generic]] = field(default_factory=dict)
 
@@ -124,7 +124,7 @@ class WalkedFields:
         """Return sequences of numbers as shape (M, k), k <= ``width``, padded with NaN."""
         code = self.plan.sequences[path].code
 
-        def of(part: Part) -> NDArray[np.generic]:
+        def of(part: MessageBatch) -> NDArray[np.generic]:
             first, count = (each[part.rows] for each in part.found.sequences[path])
             out = np.full((len(first), width), np.nan)
             for k in range(min(int(count.max(initial=0)), width)):
@@ -137,7 +137,7 @@ class WalkedFields:
         joined = self._joined(of).astype(np.float64, copy=False)
         return joined[:, : min(int(count.max(initial=0)), width)]
 
-    def _joined(self, of: Callable[[Part], NDArray[np.generic]]) -> NDArray[np.generic]:
+    def _joined(self, of: Callable[[MessageBatch], NDArray[np.generic]]) -> NDArray[np.generic]:
         if len(self.parts) == 1:
             return of(self.parts[0])
         joined = np.concatenate([of(part) for part in self.parts])
@@ -153,7 +153,7 @@ class WalkedFields:
         parts, at = [], 0
         for part in self.parts:
             size = len(part.rows)
-            parts.append(Part(part.found, part.rows[keep[at : at + size]]))
+            parts.append(MessageBatch(part.found, part.rows[keep[at : at + size]]))
             at += size
         order = None
         if self.order is not None:
@@ -161,11 +161,11 @@ class WalkedFields:
         return WalkedFields(self.plan, self.buffer, tuple(parts), order)
 
 
-def _ordered(code: str, found: Found) -> str:
+def _ordered(code: str, found: FieldPositions) -> str:
     return ("<" if found.little else ">") + code
 
 
-def _numbers(part: Part, value: Value, *, is_cdr: bool) -> NDArray[np.generic]:
+def _numbers(part: MessageBatch, value: Value, *, is_cdr: bool) -> NDArray[np.generic]:
     found = part.found
     begin, modulo, offsets = found.places[value.path]
     if len(part.rows) != len(found.ok):
@@ -181,7 +181,7 @@ def _numbers(part: Part, value: Value, *, is_cdr: bool) -> NDArray[np.generic]:
 
 
 def _nanoseconds(
-    found: Found, place: NDArray[np.int64], code: str, *, is_cdr: bool
+    found: FieldPositions, place: NDArray[np.int64], code: str, *, is_cdr: bool
 ) -> NDArray[np.int64]:
     """Decode times: only ROS 1 seconds are unsigned, only ROS 1 durations have signed fractions."""
     seconds = "i4" if is_cdr or code == "duration" else "u4"

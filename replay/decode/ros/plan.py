@@ -20,8 +20,8 @@ from crosscue.replay.decode.ros.definition import (
     PRIMITIVES,
     TIME,
     Definitions,
-    Field,
-    Shape,
+    MessageField,
+    Multiplicity,
     well_known,
 )
 from crosscue.replay.errors import SchemaError
@@ -52,7 +52,7 @@ class Value:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class FixedFields:
     """Adjacent fields of fixed size.
 
     Attributes:
@@ -108,11 +108,11 @@ class Items:
     item_bytes: int
 
 
-Step: TypeAlias = Run | Text | Items
+Step: TypeAlias = FixedFields | Text | Items
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plan:
+class ParsingPlan:
     """Parsing plan of one message type.
 
     Attributes:
@@ -132,17 +132,17 @@ class Plan:
     sequences: Mapping[str, Items]
 
 
-def plan_of(
+def compile_plan(
     type_name: str, known: Definitions, *, is_cdr: bool, limits: Limits = DEFAULT_LIMITS
-) -> Plan:
+) -> ParsingPlan:
     """Compile the parsing plan of ``type_name``.
 
     Raises:
         SchemaError: A type is missing or contains itself, or every message exceeds the limits.
     """
     steps = _Planner(type_name, known, is_cdr, limits).message(type_name, "", 0)
-    runs = [step for step in steps if isinstance(step, Run)]
-    return Plan(
+    runs = [step for step in steps if isinstance(step, FixedFields)]
+    return ParsingPlan(
         type_name,
         is_cdr,
         steps,
@@ -197,7 +197,7 @@ class _Planner:
             else:
                 yield from pieces
 
-    def _fields(self, name: str) -> tuple[Field, ...]:
+    def _fields(self, name: str) -> tuple[MessageField, ...]:
         fields = self.known.get(name)
         if fields is None and self.is_cdr:
             fields = (well_known(name) or {}).get(name)
@@ -205,11 +205,11 @@ class _Planner:
             raise SchemaError(f"{self.root}: its definition lacks the type {name}")
         return fields
 
-    def _field(self, each: Field, path: str, depth: int) -> Iterator[_Piece]:
-        if each.shape is Shape.ONE:
+    def _field(self, each: MessageField, path: str, depth: int) -> Iterator[_Piece]:
+        if each.shape is Multiplicity.ONE:
             yield from self._one(each, path, depth)
             return
-        if each.shape is Shape.ARRAY:
+        if each.shape is Multiplicity.ARRAY:
             if each.size < 1:
                 raise SchemaError(f"{self.root}: array {path} of length {each.size}")
             if each.type_name in PRIMITIVES:
@@ -217,7 +217,7 @@ class _Planner:
                 return
         yield self._items(each, path, depth)
 
-    def _one(self, each: Field, path: str, depth: int) -> Iterator[_Piece]:
+    def _one(self, each: MessageField, path: str, depth: int) -> Iterator[_Piece]:
         if each.type_name in PRIMITIVES:
             yield self._number(each, path, 0)
         elif each.type_name == "string":
@@ -228,7 +228,7 @@ class _Planner:
         else:
             raise SchemaError(f"{self.root}: {path} has the unsupported type {each.type_name}")
 
-    def _number(self, each: Field, path: str, count: int) -> _Piece:
+    def _number(self, each: MessageField, path: str, count: int) -> _Piece:
         code = PRIMITIVES[each.type_name]
         width = int(code[1])
         value = Value(path, code, count, each.type_name == "bool")
@@ -243,13 +243,13 @@ class _Planner:
             )
         return _Fixed(value, align if self.is_cdr else 1, size, align, size)
 
-    def _items(self, each: Field, path: str, depth: int) -> Items:
+    def _items(self, each: MessageField, path: str, depth: int) -> Items:
         self._count()
-        one = Field(each.name, each.type_name, text_bound=each.text_bound)
+        one = MessageField(each.name, each.type_name, text_bound=each.text_bound)
         item = tuple(_in_runs(self._one(one, path, depth)))
         min_bytes = sum(_min_bytes(step) for step in item)
-        fixed = all(isinstance(step, Run) for step in item)
-        is_array = each.shape is Shape.ARRAY
+        fixed = all(isinstance(step, FixedFields) for step in item)
+        is_array = each.shape is Multiplicity.ARRAY
         if is_array and min_bytes * each.size > self.limits.message_bytes:
             raise SchemaError(
                 f"{self.root}: {path} alone takes {min_bytes * each.size} bytes, over the limit of "
@@ -261,8 +261,12 @@ class _Planner:
             each.size if is_array else None,
             0 if is_array else each.size,
             PRIMITIVES.get(each.type_name, ""),
-            _jumps([step.size for step in item if isinstance(step, Run)]) if fixed else None,
-            _jumps([step.cdr_size for step in item if isinstance(step, Run)]) if fixed else None,
+            _jumps([step.size for step in item if isinstance(step, FixedFields)])
+            if fixed
+            else None,
+            _jumps([step.cdr_size for step in item if isinstance(step, FixedFields)])
+            if fixed
+            else None,
             min_bytes,
         )
 
@@ -273,7 +277,7 @@ class _Planner:
 
 
 def _min_bytes(step: Step) -> int:
-    if isinstance(step, Run):
+    if isinstance(step, FixedFields):
         return int(step.size.min())
     if isinstance(step, Text):
         return 4
@@ -298,10 +302,10 @@ def _in_runs(pieces: Iterator[_Piece]) -> Iterator[Step]:
         yield _run(waiting)
 
 
-def _run(pieces: list[_Fixed]) -> Run:
+def _run(pieces: list[_Fixed]) -> FixedFields:
     stored = [(piece.align, piece.width) for piece in pieces]
     cdr = [(piece.cdr_align, piece.cdr_width) for piece in pieces]
-    return Run(
+    return FixedFields(
         tuple(piece.value for piece in pieces),
         tuple(piece.width for piece in pieces),
         *_laid_out(stored),

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Int64s, Messages
-from crosscue.replay.decode.ros.plan import Items, Plan, Run, Step, Text
+from crosscue.replay.decode.ros.plan import FixedFields, Items, ParsingPlan, Step, Text
 from crosscue.replay.decode.ros.walk import Bools
 
 # Max size of a message for this path; longer messages are few, and copying them costs more than
@@ -29,7 +29,7 @@ LAYOUTS_KEPT: Final = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class MessageLayout:
     """Positions of all fields in a message, counted from its first byte.
 
     Attributes:
@@ -51,7 +51,7 @@ class Layout:
     tail: str = ""
 
 
-def tail_of(plan: Plan) -> str:
+def tail_of(plan: ParsingPlan) -> str:
     """Return the path of the bytes at the end of a type; empty if it does not end in bytes."""
     last = plan.steps[-1] if plan.steps else None
     if not isinstance(last, Items) or last.count is not None or last.bound:
@@ -59,7 +59,7 @@ def tail_of(plan: Plan) -> str:
     return last.path if last.code in ("u1", "i1") else ""
 
 
-def layout_of(plan: Plan, raw: bytes) -> Layout | None:
+def layout_of(plan: ParsingPlan, raw: bytes) -> MessageLayout | None:
     """Return the layout of a little-endian message that was parsed without error.
 
     It is None for a message that is tiny or long, or that has many items of varying size.
@@ -85,7 +85,7 @@ def layout_of(plan: Plan, raw: bytes) -> Layout | None:
             return None
         raw, reading.fixed = raw[:size], list(fixed)
         reading.sequences[tail] = (size, 0)
-    return Layout(
+    return MessageLayout(
         raw,
         reading.places,
         reading.texts,
@@ -112,14 +112,14 @@ class _Reading:
     def steps(self, steps: tuple[Step, ...], *, keep: bool) -> None:
         """Execute all steps; ``keep`` records the positions."""
         for step in steps:
-            if isinstance(step, Run):
+            if isinstance(step, FixedFields):
                 self._run(step, keep)
             elif isinstance(step, Text):
                 self._text(step, keep)
             else:
                 self._sequence(step, keep)
 
-    def _run(self, run: Run, keep: bool) -> None:
+    def _run(self, run: FixedFields, keep: bool) -> None:
         modulo = self.at & 7
         if keep:
             for k, value in enumerate(run.values):
@@ -180,7 +180,7 @@ def _probes(
         )
 
 
-def repeats(layout: Layout, messages: Messages) -> Bytes | None:
+def repeats(layout: MessageLayout, messages: Messages) -> Bytes | None:
     """Return messages as rows, shape (N, len(``layout.raw``)), if all repeat it; else None.
 
     Args:
@@ -205,7 +205,9 @@ def repeats(layout: Layout, messages: Messages) -> Bytes | None:
     return rows
 
 
-def tail_counts(layout: Layout, rows: Bytes, messages: Messages, padding: int) -> Int64s | None:
+def tail_counts(
+    layout: MessageLayout, rows: Bytes, messages: Messages, padding: int
+) -> Int64s | None:
     """Return the bytes in each message's tail, shape (N,), if they fill the messages; else None.
 
     Args:
@@ -234,8 +236,8 @@ class RepeatedFields:
         seen: Numbers decoded so far.
     """
 
-    plan: Plan
-    layout: Layout
+    plan: ParsingPlan
+    layout: MessageLayout
     rows: Bytes
     buffer: Bytes
     start: Int64s

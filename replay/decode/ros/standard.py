@@ -32,9 +32,9 @@ from crosscue.replay.decode.refuse import (
     LONG_LENS,
     VIDEO_CODING,
 )
-from crosscue.replay.decode.ros.fields import Fields
+from crosscue.replay.decode.ros.fields import FieldColumns
 from crosscue.replay.decode.ros.paths import quat, xyz
-from crosscue.replay.decode.ros.plan import Plan
+from crosscue.replay.decode.ros.plan import ParsingPlan
 from crosscue.replay.decode.ros.walk import Bools, gather
 from crosscue.replay.errors import SchemaError
 
@@ -49,7 +49,7 @@ LENS_COEFFICIENTS: Final = 14
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class RosConversion:
     """Conversion of one message type to rows.
 
     Attributes:
@@ -61,10 +61,10 @@ class Kind:
     """
 
     needs: tuple[str, ...]
-    build: Callable[[Fields], Decoded]
-    doubts: Callable[[Fields], Iterator[Doubt]] | None = None
+    build: Callable[[FieldColumns], Decoded]
+    doubts: Callable[[FieldColumns], Iterator[Doubt]] | None = None
 
-    def check(self, plan: Plan) -> None:
+    def check(self, plan: ParsingPlan) -> None:
         """Check that a definition has the fields of its type.
 
         Raises:
@@ -84,20 +84,20 @@ class Kind:
                 )
 
 
-def _table(**sources: str) -> Kind:
+def _table(**sources: str) -> RosConversion:
     """Return the kind of a table with one field per column; ``path:9`` is an array of nine."""
 
-    def build(fields: Fields) -> Table:
+    def build(fields: FieldColumns) -> Table:
         return Table({name: fields.number(path.split(":")[0]) for name, path in sources.items()})
 
-    return Kind(tuple(sources.values()), build)
+    return RosConversion(tuple(sources.values()), build)
 
 
 # Mask of the bytes that a frame carries, by its length.
 _CARRIED: Final = np.where(np.arange(8) < np.arange(9)[:, None], 255, 0).astype(np.uint8)
 
 
-def _can_frame(fields: Fields) -> CanFrames:
+def _can_frame(fields: FieldColumns) -> CanFrames:
     length = fields.number("dlc").astype(np.uint8, copy=False)
     payload = fields.number("data").astype(np.uint8, copy=False)
     kind = _frame_kinds(fields)
@@ -115,7 +115,7 @@ def _can_frame(fields: Fields) -> CanFrames:
     )
 
 
-def _frame_kinds(fields: Fields) -> NDArray[np.uint8]:
+def _frame_kinds(fields: FieldColumns) -> NDArray[np.uint8]:
     remote = fields.number("is_rtr").astype(np.bool_, copy=False)
     error = fields.number("is_error").astype(np.bool_, copy=False)
     if not np.count_nonzero(remote) and not np.count_nonzero(error):
@@ -123,7 +123,7 @@ def _frame_kinds(fields: Fields) -> NDArray[np.uint8]:
     return np.where(error, ERROR, np.where(remote, REMOTE, DATA)).astype(np.uint8)
 
 
-def _can_doubts(fields: Fields) -> Iterator[Doubt]:
+def _can_doubts(fields: FieldColumns) -> Iterator[Doubt]:
     # As unsigned numbers, negative numbers of a wrong definition are too large as well.
     identifier = fields.number("id").astype(np.int64).view(np.uint64)
     long = identifier > 0x7FF
@@ -135,7 +135,7 @@ def _can_doubts(fields: Fields) -> Iterator[Doubt]:
     yield fields.number("dlc").astype(np.int64).view(np.uint64) > 8, "data length code over 8"
 
 
-def _can_fd_frame(fields: Fields) -> CanFrames:
+def _can_fd_frame(fields: FieldColumns) -> CanFrames:
     remote = fields.number("is_rtr").astype(np.bool_)
     error = fields.number("is_error").astype(np.bool_)
     first, length = fields.items("data")
@@ -153,7 +153,7 @@ def _can_fd_frame(fields: Fields) -> CanFrames:
     )
 
 
-def _can_fd_doubts(fields: Fields) -> Iterator[Doubt]:
+def _can_fd_doubts(fields: FieldColumns) -> Iterator[Doubt]:
     identifier = fields.number("id").astype(np.int64)
     extended = fields.number("is_extended").astype(np.bool_)
     max_id = np.where(extended, 0x1FFF_FFFF, 0x7FF)
@@ -161,12 +161,12 @@ def _can_fd_doubts(fields: Fields) -> Iterator[Doubt]:
     yield fields.items("data")[1] > FD_BYTES, "over 64 data bytes"
 
 
-def _picture_ranges(fields: Fields) -> Messages:
+def _picture_ranges(fields: FieldColumns) -> Messages:
     first, size = fields.items("data")
     return Messages(fields.buffer, first, first + size)
 
 
-def _codings(fields: Fields) -> Sequence[ImageCoding | None]:
+def _codings(fields: FieldColumns) -> Sequence[ImageCoding | None]:
     pictures = _picture_ranges(fields)
     first, size = fields.items("data")
     if len(fields) and np.minimum.reduce(size) >= len(JPEG):
@@ -180,29 +180,29 @@ def _codings(fields: Fields) -> Sequence[ImageCoding | None]:
     ]
 
 
-def _compressed(fields: Fields) -> Images:
+def _compressed(fields: FieldColumns) -> Images:
     return Images(_picture_ranges(fields), tuple(c for c in _codings(fields) if c is not None))
 
 
-def _compressed_doubts(fields: Fields) -> Iterator[Doubt]:
+def _compressed_doubts(fields: FieldColumns) -> Iterator[Doubt]:
     yield fields.items("data")[1] == 0, EMPTY_PICTURE
     codings = _codings(fields)
     if None in codings:
         yield np.array([c is None for c in codings], np.bool_), IMAGE_CODING
 
 
-def _video(fields: Fields) -> Images:
+def _video(fields: FieldColumns) -> Images:
     labels = fields.texts("format")
     return Images(_picture_ranges(fields), tuple(STREAMS[label.lower()] for label in labels))
 
 
-def _video_doubts(fields: Fields) -> Iterator[Doubt]:
+def _video_doubts(fields: FieldColumns) -> Iterator[Doubt]:
     yield fields.items("data")[1] == 0, EMPTY_PICTURE
     known = [label.lower() in STREAMS for label in fields.texts("format")]
     yield ~np.array(known, np.bool_), VIDEO_CODING
 
 
-def _raw(fields: Fields) -> Images:
+def _raw(fields: FieldColumns) -> Images:
     return Images(
         _picture_ranges(fields),
         ("raw",) * len(fields),
@@ -213,7 +213,7 @@ def _raw(fields: Fields) -> Images:
     )
 
 
-def _raw_doubts(fields: Fields) -> Iterator[Doubt]:
+def _raw_doubts(fields: FieldColumns) -> Iterator[Doubt]:
     width, height, step = (
         fields.number(name).astype(np.int64) for name in ("width", "height", "step")
     )
@@ -227,7 +227,7 @@ def _raw_doubts(fields: Fields) -> Iterator[Doubt]:
     yield big & deep, BIG_ENDIAN
 
 
-def _camera_info(fields: Fields) -> Table:
+def _camera_info(fields: FieldColumns) -> Table:
     names = fields.plan.values
     lens = "d" if "d" in fields.plan.sequences else "D"
     columns: dict[str, NDArray[np.generic]] = {
@@ -240,7 +240,7 @@ def _camera_info(fields: Fields) -> Table:
     return Table(columns)
 
 
-def _camera_info_doubts(fields: Fields) -> Iterator[Doubt]:
+def _camera_info_doubts(fields: FieldColumns) -> Iterator[Doubt]:
     lens = "d" if "d" in fields.plan.sequences else "D"
     yield fields.items(lens)[1] > LENS_COEFFICIENTS, LONG_LENS
 
@@ -252,7 +252,7 @@ _IMU: Final = {
 }
 
 
-def _imu(fields: Fields) -> Table:
+def _imu(fields: FieldColumns) -> Table:
     """Build the table; values are NaN where a covariance of -1 marks a missing estimate."""
     columns: dict[str, NDArray[np.generic]] = {}
     for estimate, sources in _IMU.items():
@@ -267,31 +267,33 @@ def _imu(fields: Fields) -> Table:
 _POSE: Final = xyz("{}_m", "pose.position") | quat("pose.orientation")
 _POSE_COV: Final = xyz("{}_m", "pose.pose.position") | quat("pose.pose.orientation")
 
-BY_TYPE: Final[Mapping[str, Kind]] = {
-    "can_msgs/msg/Frame": Kind(
+BY_TYPE: Final[Mapping[str, RosConversion]] = {
+    "can_msgs/msg/Frame": RosConversion(
         ("id", "is_rtr", "is_extended", "is_error", "dlc", "data:8"), _can_frame, _can_doubts
     ),
-    "crosscue_msgs/msg/CanFdFrame": Kind(
+    "crosscue_msgs/msg/CanFdFrame": RosConversion(
         ("id", "is_rtr", "is_extended", "is_error", "is_fd", "data[u1]"),
         _can_fd_frame,
         _can_fd_doubts,
     ),
-    "sensor_msgs/msg/CompressedImage": Kind(
+    "sensor_msgs/msg/CompressedImage": RosConversion(
         ("format$", "data[u1]"), _compressed, _compressed_doubts
     ),
-    "foxglove_msgs/msg/CompressedImage": Kind(
+    "foxglove_msgs/msg/CompressedImage": RosConversion(
         ("format$", "data[u1]"), _compressed, _compressed_doubts
     ),
-    "foxglove_msgs/msg/CompressedVideo": Kind(("format$", "data[u1]"), _video, _video_doubts),
-    "sensor_msgs/msg/Image": Kind(
+    "foxglove_msgs/msg/CompressedVideo": RosConversion(
+        ("format$", "data[u1]"), _video, _video_doubts
+    ),
+    "sensor_msgs/msg/Image": RosConversion(
         ("width", "height", "step", "encoding$", "is_bigendian", "data[u1]"), _raw, _raw_doubts
     ),
-    "sensor_msgs/msg/CameraInfo": Kind(
+    "sensor_msgs/msg/CameraInfo": RosConversion(
         ("width", "height", "k:9|K:9", "p:12|P:12", "d[f8]|D[f8]"),
         _camera_info,
         _camera_info_doubts,
     ),
-    "sensor_msgs/msg/Imu": Kind(
+    "sensor_msgs/msg/Imu": RosConversion(
         tuple(path for columns in _IMU.values() for path in columns.values())
         + tuple(f"{estimate}_covariance:9" for estimate in _IMU),
         _imu,
@@ -316,7 +318,7 @@ BY_TYPE: Final[Mapping[str, Kind]] = {
 }
 
 
-def generic(fields: Fields) -> Table:
+def generic(fields: FieldColumns) -> Table:
     """Return all numbers of messages with dotted names, and the length of every sequence."""
     columns: dict[str, NDArray[np.generic]] = {
         path: fields.number(path) for path in fields.plan.values
@@ -333,25 +335,25 @@ def generic(fields: Fields) -> Table:
 OWN_TYPES: Final = "crosscue_msgs/msg/"
 
 
-def own_table(fields: Fields) -> Table:
+def own_table(fields: FieldColumns) -> Table:
     """Return the table that a type of ``crosscue convert`` stores."""
     columns = dict(generic(fields).columns)
     columns.pop("header.stamp", None)
     return Table(columns or {"present": np.ones(len(fields), np.bool_)})
 
 
-def kind_of(type_name: str) -> Kind:
+def conversion_for(type_name: str) -> RosConversion:
     """Return the conversion of a type."""
     if type_name in BY_TYPE:
         return BY_TYPE[type_name]
-    return Kind((), own_table if type_name.startswith(OWN_TYPES) else generic)
+    return RosConversion((), own_table if type_name.startswith(OWN_TYPES) else generic)
 
 
 # Paths of the sensor's time in a message; the first one found is used.
 STAMPS: Final = ("header.stamp", "timestamp", "stamp")
 
 
-def header_ns(fields: Fields) -> Int64s | None:
+def header_ns(fields: FieldColumns) -> Int64s | None:
     """Return the sensor's own time, shape (M,), or None for a type without one."""
     values = fields.plan.values
     for path in STAMPS:

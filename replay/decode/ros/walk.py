@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Int64s, Messages
-from crosscue.replay.decode.ros.plan import Items, Plan, Run, Step, Text, jumped
+from crosscue.replay.decode.ros.plan import FixedFields, Items, ParsingPlan, Step, Text, jumped
 
 Bools = NDArray[np.bool_]
 Rows = NDArray[np.intp]
@@ -39,7 +39,7 @@ class Refused:
 
 
 @dataclass(slots=True, eq=False)
-class Found:
+class FieldPositions:
     """Positions of all fields in N messages of one byte order.
 
     Attributes:
@@ -97,7 +97,7 @@ class Cursor:
         return np.flatnonzero(which) if isinstance(self.rows, slice) else self.rows[which]
 
 
-def walk(plan: Plan, messages: Messages, *, little: bool = True) -> Found:
+def locate_fields(plan: ParsingPlan, messages: Messages, *, little: bool = True) -> FieldPositions:
     """Find every field of every message.
 
     Args:
@@ -107,7 +107,7 @@ def walk(plan: Plan, messages: Messages, *, little: bool = True) -> Found:
     """
     head = 4 if plan.is_cdr else 0
     origin = messages.start + head
-    found = Found(messages.buffer, little, np.ones(len(messages), np.bool_))
+    found = FieldPositions(messages.buffer, little, np.ones(len(messages), np.bool_))
     cursor = Cursor(slice(None), origin, np.zeros_like(origin), messages.stop - origin)
     Walker(found, plan.is_cdr).whole(plan, cursor)
     return found
@@ -124,12 +124,12 @@ class Walker:
         spent: Number of steps inside sequences of items of varying size.
     """
 
-    found: Found
+    found: FieldPositions
     is_cdr: bool
     damaged: bool = False
     spent: int = 0
 
-    def whole(self, plan: Plan, cursor: Cursor) -> None:
+    def whole(self, plan: ParsingPlan, cursor: Cursor) -> None:
         """Parse from the first field to the last, and check that nothing is left over."""
         self.refuse(cursor, cursor.stop < 0, "no room for the encapsulation")
         self.steps(plan.steps, cursor, keep=True)
@@ -154,14 +154,14 @@ class Walker:
     def steps(self, steps: Iterable[Step], cursor: Cursor, *, keep: bool) -> None:
         """Execute all steps; ``keep`` records positions, for fields outside sequences only."""
         for step in steps:
-            if isinstance(step, Run):
+            if isinstance(step, FixedFields):
                 self.run(step, cursor, keep)
             elif isinstance(step, Text):
                 self.text(step, cursor, keep)
             else:
                 self.items(step, cursor, keep)
 
-    def run(self, run: Run, cursor: Cursor, keep: bool) -> None:
+    def run(self, run: FixedFields, cursor: Cursor, keep: bool) -> None:
         """Advance past fields of fixed size."""
         modulo = _same(cursor.at & 7)
         begin = cursor.origin + cursor.at
@@ -280,7 +280,7 @@ def _same(column: Int64s) -> Int64s | int:
 def are_utf8(buffer: Bytes, first: Int64s, length: Int64s) -> Bools:
     """Check that ranges of ``buffer`` are UTF-8 text; ranges of one length are checked together."""
     fine = np.ones(len(first), np.bool_)
-    for rows, width in by_length(length):
+    for rows, width in group_by_length(length):
         if width == 0:
             continue
         high = gather(buffer, "u1", width, first[rows]).max(axis=1) >= 0x80
@@ -297,7 +297,7 @@ def _is_utf8(text: bytes) -> bool:
     return True
 
 
-def by_length(length: Int64s) -> Iterable[tuple[Rows, int]]:
+def group_by_length(length: Int64s) -> Iterable[tuple[Rows, int]]:
     """Yield rows grouped by length; nothing is sorted in the usual case of equal lengths."""
     if not len(length):
         return

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import DATA, ERROR, LENGTH_UNKNOWN, REMOTE, CanFrames, Int64s
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.mobileye.bits import Words, words_of
+from crosscue.replay.mobileye.bits import Words, leading_words
 from crosscue.replay.mobileye.layout import Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings
 
@@ -87,7 +87,7 @@ class Admission:
             self._instance.take(frames.arbitration_id[good], mode="clip"),
             frames.length[good],
             log_ns[good],
-            words_of(frames.data[good]),
+            leading_words(frames.data[good]),
         )
 
     def _report(

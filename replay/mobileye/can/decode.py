@@ -19,13 +19,13 @@ from crosscue.replay.mobileye.bursts import (
     CUT,
     NO_BURST,
     Fault,
-    Parts,
+    FrameParts,
     Status,
     events,
-    join,
+    join_obstacles,
     no_parts,
     no_status,
-    pair,
+    pair_lanes,
     shortage,
     sift,
 )
@@ -33,16 +33,16 @@ from crosscue.replay.mobileye.clock import CounterClock
 from crosscue.replay.mobileye.layout import (
     UNKNOWN,
     VARIANTS,
+    BitField,
     Columns,
-    Field,
     Message,
     Variant,
     layout,
     variant_number,
 )
-from crosscue.replay.mobileye.settings import DEFAULTS, MobileyeSettings, mounting_of
+from crosscue.replay.mobileye.settings import DEFAULTS, MobileyeSettings, device_mounting
 from crosscue.replay.mobileye.tables import lane_places, table_block, to_vehicle
-from crosscue.replay.mobileye.wire import columns_of, values_of
+from crosscue.replay.mobileye.wire import si_columns, values_of
 
 from .admit import Admission, Admitted
 from .family import FamilyEvidence
@@ -77,7 +77,7 @@ class Statuses:
         self._clock = clock
         self._message = layout()["status"]
         self._number = layout().messages.index(self._message)
-        self._fields: dict[str, Field] = {f.name: f for f in self._message.fields}
+        self._fields: dict[str, BitField] = {f.name: f for f in self._message.fields}
         self._opened = 0
         self._word = np.zeros(0, dtype=np.uint64)
         self._log_ns = np.zeros(0, dtype=np.int64)
@@ -113,8 +113,8 @@ class Statuses:
             self._ledger.skip(self._bus, REPEATED_STATUS, len(log_ns), "0x738", int(log_ns[0]))
 
     def _rows(self, frames: Admitted) -> tuple[Status, Block]:
-        variant = by_length(self._message, frames.length, self._settings)
-        columns = columns_of(self._message, values_of(self._message, frames.words, variant))
+        variant = variant_by_length(self._message, frames.length, self._settings)
+        columns = si_columns(self._message, values_of(self._message, frames.words, variant))
         counter_ms = self._raw("counter_ms", frames.words)
         image_ns = self._clock.feed(counter_ms, frames.log_ns)
         number = self._opened + np.arange(len(frames), dtype=np.int64)
@@ -181,7 +181,7 @@ class MobileyeDecoder:
         self._open = no_parts()
         self._is_closed = False
         self._lanes = {table: no_parts() for table in _LANE_PARTS}
-        self._mounting = mounting_of(settings, bus, ledger)
+        self._mounting = device_mounting(settings, bus, ledger)
 
     def __call__(self, block: Block) -> list[Block]:
         """Decode the frames of a block.
@@ -237,8 +237,8 @@ class MobileyeDecoder:
         self._is_closed = is_closed
         return self._finish(kept.take(~is_open), known.take(np.s_[:-1]), is_end=False)
 
-    def _finish(self, parts: Parts, status: Status, is_end: bool) -> list[Block]:
-        triples, faults = join(parts)
+    def _finish(self, parts: FrameParts, status: Status, is_end: bool) -> list[Block]:
+        triples, faults = join_obstacles(parts)
         if is_end:
             faults = [f._replace(reason=CUT_AT_END) if f.reason == CUT else f for f in faults]
         self._report(faults)
@@ -270,8 +270,8 @@ class MobileyeDecoder:
         fresh = _parts_of(frames, burst_at, _LANE_PARTS[table])
         return self._pair(table, self._lanes[table] + fresh, is_last=False) if len(fresh) else []
 
-    def _pair(self, table: str, parts: Parts, is_last: bool) -> list[Block]:
-        a, b, self._lanes[table], faults = pair(parts, self._settings.within_ns, is_last)
+    def _pair(self, table: str, parts: FrameParts, is_last: bool) -> list[Block]:
+        a, b, self._lanes[table], faults = pair_lanes(parts, self._settings.within_ns, is_last)
         self._report(faults)
         if not len(a):
             return []
@@ -295,7 +295,7 @@ class MobileyeDecoder:
         if message.variant == "family":
             return self._family(frames.words)
         if message.variant == "length":
-            return by_length(message, frames.length, self._settings)
+            return variant_by_length(message, frames.length, self._settings)
         if message.variant != "revision":
             return _unknown(len(frames))
         if self._settings.revision != "auto":
@@ -319,14 +319,14 @@ class MobileyeDecoder:
                 self._ledger.skip(self._bus, fault.reason, count, where, log_ns)
 
 
-def _parts_of(frames: Admitted, burst_at: Int64s, names: Sequence[str]) -> Parts:
+def _parts_of(frames: Admitted, burst_at: Int64s, names: Sequence[str]) -> FrameParts:
     messages = layout().messages
     numbers = np.array([next(k for k, m in enumerate(messages) if m.name == n) for n in names])
     part = np.full(len(messages), -1, dtype=np.int64)
     part[numbers] = np.arange(len(names))
     of_frame = part[frames.message]
     rows = np.flatnonzero(of_frame >= 0)
-    return Parts(
+    return FrameParts(
         burst_at[rows],
         frames.instance[rows],
         of_frame[rows],
@@ -336,14 +336,16 @@ def _parts_of(frames: Admitted, burst_at: Int64s, names: Sequence[str]) -> Parts
 
 
 def _columns(message: Message, words: Words, variant: Variant) -> Columns:
-    return columns_of(message, values_of(message, words, variant))
+    return si_columns(message, values_of(message, words, variant))
 
 
 def _unknown(n: int) -> Variant:
     return np.full(n, UNKNOWN, dtype=np.int8)
 
 
-def by_length(message: Message, length: NDArray[np.uint8], settings: MobileyeSettings) -> Variant:
+def variant_by_length(
+    message: Message, length: NDArray[np.uint8], settings: MobileyeSettings
+) -> Variant:
     """Return the variant of frames by length; if the log has no lengths, by the set revision."""
     stand_in = variant_number(settings.revision) if message.name == "status" else UNKNOWN
     of_length = np.full(256, stand_in, dtype=np.int8)

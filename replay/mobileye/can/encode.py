@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table
 from crosscue.replay.mobileye.bits import Words, payloads_of
 from crosscue.replay.mobileye.clock import MS
-from crosscue.replay.mobileye.geometry import AT_REAR_AXLE, Mounting
+from crosscue.replay.mobileye.geometry import AT_REAR_AXLE, DevicePosition
 from crosscue.replay.mobileye.layout import (
     UNKNOWN,
     VARIANTS,
@@ -146,7 +146,7 @@ def _check_bursts(named: Iterable[tuple[str, Block]]) -> None:
         raise ValueError(f"obstacles of burst {min(alone)}: expected a status row of that burst")
 
 
-def _seen(objects: Table, mounting: Mounting) -> tuple[Floats, NDArray[np.bool_]]:
+def _seen(objects: Table, mounting: DevicePosition) -> tuple[Floats, NDArray[np.bool_]]:
     """Return distances ahead of the device, and a mask of the objects that it would report."""
     on_device = to_device("obstacles", dict(objects.columns), mounting)
     seen = np.ones(len(objects), dtype=np.bool_)

@@ -32,9 +32,9 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.bursts import NO_BURST
 from crosscue.replay.mobileye.clock import CounterClock
 from crosscue.replay.mobileye.layout import Columns, Message, layout, variant_number
-from crosscue.replay.mobileye.settings import DEFAULTS, MobileyeSettings, mounting_of
+from crosscue.replay.mobileye.settings import DEFAULTS, MobileyeSettings, device_mounting
 from crosscue.replay.mobileye.tables import LEFT, RIGHT, table_block, to_vehicle
-from crosscue.replay.mobileye.wire import blank_dependent, columns_of, from_given
+from crosscue.replay.mobileye.wire import blank_dependent, from_given, si_columns
 
 from .bursts import Obstacles, RosBursts
 from .sign import LaneSignVotes
@@ -87,7 +87,7 @@ class RosMobileye:
         self._clock = CounterClock(settings.min_latency_ns)
         self._votes = {name: LaneSignVotes(label, settings.ros_lane_sign) for name, label in _SIDED}
         self._waiting: dict[str, list[Block]] = {name: [] for name, _ in _SIDED}
-        self._mounting = mounting_of(settings, bus, ledger)
+        self._mounting = device_mounting(settings, bus, ledger)
 
     def __call__(self, block: Block) -> list[Block]:
         """Return the new rows of tables from a block of decoded messages."""
@@ -131,7 +131,7 @@ class RosMobileye:
     def _statuses(self, block: Block, rows: Table) -> list[Block]:
         stamp_ns = stamps_of(block)
         message = layout()["status"]
-        columns = columns_of(message, _values(message, rows))
+        columns = si_columns(message, _values(message, rows))
         image_ns = self._clock.feed(columns["counter_ms"].astype(np.int64), stamp_ns)
         number = self._bursts.add_status(stamp_ns, image_ns, columns["count"].astype(np.int64))
         leading: Columns = {
@@ -147,7 +147,7 @@ class RosMobileye:
         columns: Columns = {}
         assert isinstance(block.rows, Table)
         for message in messages:
-            columns |= columns_of(message, _values(message, block.rows))
+            columns |= si_columns(message, _values(message, block.rows))
         self._check_angle(columns)
         return Obstacles(stamps_of(block), block.log_ns, columns)
 
@@ -172,7 +172,7 @@ class RosMobileye:
         self, block: Block, rows: Table, message: Message, is_mirrored: bool = False
     ) -> Block:
         values = _values(message, rows, is_mirrored)
-        columns = {**self._leading(block, message), **columns_of(message, values)}
+        columns = {**self._leading(block, message), **si_columns(message, values)}
         columns = to_vehicle(message.table, columns, self._mounting)
         return table_block(self._bus, message.table, block.log_ns, columns)
 
@@ -217,7 +217,7 @@ class RosMobileye:
         side = _side_of_topic(block.topic)
         columns: Columns = {}
         for name in ("lane_a", "lane_b"):
-            columns |= columns_of(layout()[name], _values(layout()[name], rows, is_mirrored))
+            columns |= si_columns(layout()[name], _values(layout()[name], rows, is_mirrored))
         n = len(block)
         table, places = "lanes", {"side": np.full(n, side or 0, dtype=np.int8)}
         if side is None:

@@ -18,7 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import DATA, ERROR, REMOTE, Bytes, CanFrames, Int64s
-from crosscue.replay.readers.can_rows import FD_LENGTHS, IS_FD_LENGTH, FrameRows, joined, widened
+from crosscue.replay.readers.can_rows import FD_LENGTHS, IS_FD_LENGTH, FrameRows, merge_two, widened
 from crosscue.replay.readers.can_text.dialect import NO_ROWS
 
 MAGIC: Final = b"LOBJ"
@@ -41,7 +41,7 @@ _NANOS_MAX: Final = 1 << 60
 
 
 @dataclass(slots=True)
-class Tally:
+class ObjectCounts:
     """Counts of one pass, which are compared with the file header.
 
     Attributes:
@@ -81,7 +81,7 @@ class Chain:
 
 
 def chain_of(
-    stream: Bytes, *, is_resumed: bool, is_end: bool, size_max: int, tally: Tally, place: str
+    stream: Bytes, *, is_resumed: bool, is_end: bool, size_max: int, tally: ObjectCounts, place: str
 ) -> Chain:
     """Find the complete objects in ``stream``.
 
@@ -166,7 +166,7 @@ def _repair(
 
 
 def _without_objects(
-    stream: Bytes, is_resumed: bool, is_end: bool, tally: Tally, place: str
+    stream: Bytes, is_resumed: bool, is_end: bool, tally: ObjectCounts, place: str
 ) -> Chain:
     rest = max(len(stream) - len(MAGIC) - PADDING_MAX, 0) if not is_end else len(stream)
     if len(stream) - rest != len(stream) and not is_resumed and bool(stream.any()):
@@ -233,7 +233,9 @@ _KINDS: Final = (
 FRAME_TYPES: Final = frozenset(type_ for types, _ in _KINDS for type_ in types)
 
 
-def rows_of(stream: Bytes, start: Int64s, start_ns: int, tally: Tally, place: str) -> FrameRows:
+def parse_frames(
+    stream: Bytes, start: Int64s, start_ns: int, tally: ObjectCounts, place: str
+) -> FrameRows:
     """Parse the CAN frames among the objects at ``start``; ``bus`` contains channel numbers.
 
     Args:
@@ -256,7 +258,7 @@ def rows_of(stream: Bytes, start: Int64s, start_ns: int, tally: Tally, place: st
         if bool(is_kind.any()):
             is_frame |= is_kind
             found = _kind_rows(padded, start[is_kind], body, types, start_ns, tally, place)
-            rows = joined(rows, found)
+            rows = merge_two(rows, found)
     for kind, count in zip(*np.unique(type_[~is_frame], return_counts=True), strict=True):
         if not 0 < kind <= TYPE_MAX:
             tally.damage("object of impossible type", f"{place}, type {kind}")
@@ -272,7 +274,7 @@ def _kind_rows(
     body: np.dtype[np.void],
     types: tuple[int, ...],
     start_ns: int,
-    tally: Tally,
+    tally: ObjectCounts,
     place: str,
 ) -> FrameRows:
     header = _records(stream, start, _TIMED)
@@ -304,7 +306,11 @@ def _records(stream: Bytes, start: Int64s, layout: np.dtype[np.void]) -> NDArray
 
 
 def _classic(
-    stream: Bytes, start: Int64s, header: NDArray[np.void], record: NDArray[np.void], tally: Tally
+    stream: Bytes,
+    start: Int64s,
+    header: NDArray[np.void],
+    record: NDArray[np.void],
+    tally: ObjectCounts,
 ) -> tuple[CanFrames, NDArray[np.bool_]]:
     del stream, start, header, tally
     kind = np.where(record["flags"] & 0x80, REMOTE, DATA)
@@ -314,7 +320,11 @@ def _classic(
 
 
 def _fd(
-    stream: Bytes, start: Int64s, header: NDArray[np.void], record: NDArray[np.void], tally: Tally
+    stream: Bytes,
+    start: Int64s,
+    header: NDArray[np.void],
+    record: NDArray[np.void],
+    tally: ObjectCounts,
 ) -> tuple[CanFrames, NDArray[np.bool_]]:
     del stream, start, header, tally
     is_fd = (record["fd"] & 1) != 0
@@ -325,7 +335,11 @@ def _fd(
 
 
 def _fd64(
-    stream: Bytes, start: Int64s, header: NDArray[np.void], record: NDArray[np.void], tally: Tally
+    stream: Bytes,
+    start: Int64s,
+    header: NDArray[np.void],
+    record: NDArray[np.void],
+    tally: ObjectCounts,
 ) -> tuple[CanFrames, NDArray[np.bool_]]:
     is_fd = (record["flags"] & 0x1000) != 0
     kind = np.where(record["flags"] & 0x10, REMOTE, DATA)
@@ -356,7 +370,11 @@ def _fits_code(
 
 
 def _error_ext(
-    stream: Bytes, start: Int64s, header: NDArray[np.void], record: NDArray[np.void], tally: Tally
+    stream: Bytes,
+    start: Int64s,
+    header: NDArray[np.void],
+    record: NDArray[np.void],
+    tally: ObjectCounts,
 ) -> tuple[CanFrames, NDArray[np.bool_]]:
     del stream, start, header, tally
     kind = np.full(len(record), ERROR)
@@ -365,7 +383,11 @@ def _error_ext(
 
 
 def _error(
-    stream: Bytes, start: Int64s, header: NDArray[np.void], record: NDArray[np.void], tally: Tally
+    stream: Bytes,
+    start: Int64s,
+    header: NDArray[np.void],
+    record: NDArray[np.void],
+    tally: ObjectCounts,
 ) -> tuple[CanFrames, NDArray[np.bool_]]:
     del stream, start, header, tally
     n = len(record)

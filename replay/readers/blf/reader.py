@@ -34,7 +34,16 @@ from crosscue.replay.readers.can_rows import (
 from crosscue.replay.readers.can_text.digits import NANOS, within_range
 from crosscue.replay.seal.touched import Touched, open_noted
 
-from .objects import BASE_BYTES, CONTAINER, MAGIC, PADDING_MAX, TYPE_MAX, Tally, chain_of, rows_of
+from .objects import (
+    BASE_BYTES,
+    CONTAINER,
+    MAGIC,
+    PADDING_MAX,
+    TYPE_MAX,
+    ObjectCounts,
+    chain_of,
+    parse_frames,
+)
 from .windows import unwanted
 
 _HEADER: Final = struct.Struct("<4sL8BQQLL8H8H")
@@ -158,7 +167,7 @@ class _Pass:
         touched: Touched,
         selection: Selection = EVERYTHING,
     ) -> None:
-        self.tally = Tally()
+        self.tally = ObjectCounts()
         self._path, self._header, self._limits, self._names = path, header, limits, names
         self._tail = b""
         self._is_resumed = self._has_loose = False
@@ -262,7 +271,7 @@ class _Pass:
         if is_end and len(stream) - chain.rest >= len(MAGIC):
             self.tally.damage("last object is cut", place)
         start_ns = self._header.start_ns or 0
-        return self._named(rows_of(stream, chain.start, start_ns, self.tally, place))
+        return self._named(parse_frames(stream, chain.start, start_ns, self.tally, place))
 
     def _named(self, rows: FrameRows) -> FrameRows:
         if not len(rows):

@@ -31,13 +31,13 @@ from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import FD_LENGTHS
 
 from .dialect import (
-    Damage,
+    DamagedLine,
     Dialect,
     Fast,
-    Frame,
-    Mark,
+    HeaderLine,
     Other,
     Outcome,
+    ParsedFrame,
     TextCanLog,
     comment,
     head_of,
@@ -53,7 +53,7 @@ from .digits import (
     seconds_ns,
     within_range,
 )
-from .lines import Field, Lines, clean_lines, next_fields, skip_gap
+from .lines import Lines, WordRanges, clean_lines, next_fields, skip_gap
 from .spaced import (
     NOTHING_FAST,
     Spaced,
@@ -164,7 +164,7 @@ class Asc(Dialect):
         if found := _TIMED.fullmatch(text):
             seconds = int(found[1])
             if seconds > SECONDS_MAX:
-                return Damage(OUT_OF_RANGE)
+                return DamagedLine(OUT_OF_RANGE)
             return self._timed(seconds * NANOS + int(found[2].ljust(9, "0")), found[3])
         text = text.strip().removeprefix("\xef\xbb\xbf")
         if not text or text.startswith("//"):
@@ -174,12 +174,14 @@ class Asc(Dialect):
     def last(self, line: bytes) -> Outcome:
         """Accept the line if it has as many bytes as its length states."""
         outcome = self.slow(line)
-        may_be_cut = isinstance(outcome, Frame) and (self._base == 10 or outcome.kind == REMOTE)
+        may_be_cut = isinstance(outcome, ParsedFrame) and (
+            self._base == 10 or outcome.kind == REMOTE
+        )
         if outcome is None or may_be_cut or isinstance(outcome, Other):
-            return Damage("last line has no line end, may be cut") if line.strip() else None
+            return DamagedLine("last line has no line end, may be cut") if line.strip() else None
         return outcome
 
-    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, Mark]]) -> Int64s:
+    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, HeaderLine]]) -> Int64s:
         """Add the date, and sum up times that are relative to the previous line."""
         out = np.empty_like(t_ns)
         begin = 0
@@ -223,7 +225,7 @@ class Asc(Dialect):
             self._last_ns = int(t_ns[-1])
         return t_ns + self._start_ns
 
-    def _note(self, mark: Mark) -> None:
+    def _note(self, mark: HeaderLine) -> None:
         if mark.tag:
             self._block = mark.tag
         if mark.origin_ns is None:
@@ -235,72 +237,72 @@ class Asc(Dialect):
 
     def _header(self, text: str) -> Outcome:
         if found := _HEADER_DATE.fullmatch(text):
-            return Mark(_date_ns(found[1]))
+            return HeaderLine(_date_ns(found[1]))
         if found := _BEGIN.fullmatch(text):
-            return Mark(_date_ns(found[1].strip()), tag=_BEGINS)
+            return HeaderLine(_date_ns(found[1].strip()), tag=_BEGINS)
         if _END.fullmatch(text):
-            return Mark(tag=_ENDS)
+            return HeaderLine(tag=_ENDS)
         if _HEADER_EVENTS.fullmatch(text):
-            return Mark()
+            return HeaderLine()
         if found := _HEADER_BASE.fullmatch(text):
             base = 10 if found[1].lower() == "dec" else 16
             is_relative = (found[2] or "").lower() == "relative"
             is_same = (base, is_relative) == (self._base, self._is_relative)
-            return Mark(stops="" if is_same else "a different 'base' line inside the file")
-        return Damage(NOT_UNDERSTOOD)
+            return HeaderLine(stops="" if is_same else "a different 'base' line inside the file")
+        return DamagedLine(NOT_UNDERSTOOD)
 
     def _timed(self, t_ns: int, rest: str) -> Outcome:
         if _SECOND.search(rest):
-            return Damage("two lines in one")
+            return DamagedLine("two lines in one")
         if self._is_relative and t_ns > _STEP_MAX_NS:
-            return Damage(OUT_OF_RANGE)
+            return DamagedLine(OUT_OF_RANGE)
         if _EVENT.fullmatch(rest):
             return Other("event that is not a CAN frame", t_ns)
         if not rest.isascii():
-            return Damage(NOT_UNDERSTOOD)
+            return DamagedLine(NOT_UNDERSTOOD)
         if found := _FD_ERROR.fullmatch(rest) or _ERROR.fullmatch(rest):
             is_fd = rest[:5].upper() == "CANFD"
-            return _checked(Frame(found[1], t_ns, 0, False, ERROR, 0, b"", is_fd))
+            return _checked(ParsedFrame(found[1], t_ns, 0, False, ERROR, 0, b"", is_fd))
         words = rest.split()
         if words[0].upper() == "CANFD":
             return self._fd_frame(t_ns, words[1:])
         if len(words) >= 4 and words[2].lower() in ("rx", "tx"):
             return self._frame(t_ns, words)
-        return Damage(NOT_UNDERSTOOD)
+        return DamagedLine(NOT_UNDERSTOOD)
 
     def _frame(self, t_ns: int, words: list[str]) -> Outcome:
         bus, _, _, letter = words[:4]
         rest = words[4:]
         found = self._identifier(words[1])
         if found is None:
-            return Damage("identifier out of range")
+            return DamagedLine("identifier out of range")
         if letter.lower() == "r":
-            return _checked(Frame(bus, t_ns, *found, REMOTE, 0))
+            return _checked(ParsedFrame(bus, t_ns, *found, REMOTE, 0))
         if letter.lower() != "d" or not rest or not _is_code(rest[0], self._base):
-            return Damage(NOT_UNDERSTOOD)
+            return DamagedLine(NOT_UNDERSTOOD)
         length = min(int(rest[0], self._base), 8)
         payload = self._payload(rest[1:], length)
         if payload is None:
-            return Damage("length differs from the number of bytes")
-        return _checked(Frame(bus, t_ns, *found, DATA, length, payload))
+            return DamagedLine("length differs from the number of bytes")
+        return _checked(ParsedFrame(bus, t_ns, *found, DATA, length, payload))
 
     def _fd_frame(self, t_ns: int, words: list[str]) -> Outcome:
         if len(words) < 7 or words[1].lower() not in ("rx", "tx"):
-            return Damage(NOT_UNDERSTOOD)
+            return DamagedLine(NOT_UNDERSTOOD)
         found = self._identifier(words[2])
         rest = words[3:] if words[3] in ("0", "1") else words[4:]
         if found is None:
-            return Damage("identifier out of range")
+            return DamagedLine("identifier out of range")
         if len(rest) < 4 or {rest[0], rest[1]} - {"0", "1"} or not _is_code(rest[2], self._base):
-            return Damage(NOT_UNDERSTOOD)
+            return DamagedLine(NOT_UNDERSTOOD)
         code = int(rest[2], self._base)
         if rest[3] == "0" and code:
-            return _checked(Frame(words[0], t_ns, *found, REMOTE, 0, b"", True))
+            return _checked(ParsedFrame(words[0], t_ns, *found, REMOTE, 0, b"", True))
         length = int(FD_LENGTHS[code])
         payload = self._payload(rest[4:], length, is_last=False)
         if rest[3] != str(length) or payload is None:
-            return Damage("length differs from the number of bytes")
-        return _checked(Frame(words[0], t_ns, *found, DATA, length, payload, True))
+            return DamagedLine("length differs from the number of bytes")
+        return _checked(ParsedFrame(words[0], t_ns, *found, DATA, length, payload, True))
 
     def _identifier(self, word: str) -> tuple[int, bool] | None:
         found = _IDENTIFIER.fullmatch(word)
@@ -331,9 +333,9 @@ def _is_code(word: str, base: int) -> bool:
     return len(word) == 1 and word in "0123456789abcdefABCDEF"
 
 
-def _checked(frame: Frame) -> Outcome:
+def _checked(frame: ParsedFrame) -> Outcome:
     if not is_bus_name(frame.bus.encode("latin-1", "replace")):
-        return Damage(NOT_UNDERSTOOD)
+        return DamagedLine(NOT_UNDERSTOOD)
     return frame
 
 
@@ -366,14 +368,14 @@ def _single(lines: Lines, line: Int64s) -> Int64s:
     return line[~twice] if bool(twice.any()) else line
 
 
-def _is_fd(lines: Lines, word: Field) -> Bools:
+def _is_fd(lines: Lines, word: WordRanges) -> Bools:
     """Return whether each word is ``CANFD``."""
     found: Bools = (lines.words[word.start] & np.uint64(0xFFFFFFFFFF)) == _CANFD
     found &= word.size == 5
     return found
 
 
-def _classic(lines: Lines, line: Int64s, head: list[Field], t_ns: Int64s, ok: Bools) -> Fast:
+def _classic(lines: Lines, line: Int64s, head: list[WordRanges], t_ns: Int64s, ok: Bools) -> Fast:
     """Parse ``time bus id Rx d 8`` and the bytes, with no further byte after the last one."""
     if not bool(ok.any()):
         return NOTHING_FAST
@@ -389,7 +391,7 @@ def _classic(lines: Lines, line: Int64s, head: list[Field], t_ns: Int64s, ok: Bo
     return spaced_frames(lines, at, t_ns, ok & (follower.size != 2))
 
 
-def _fd(lines: Lines, line: Int64s, head: list[Field], t_ns: Int64s, ok: Bools) -> Fast:
+def _fd(lines: Lines, line: Int64s, head: list[WordRanges], t_ns: Int64s, ok: Bools) -> Fast:
     """Parse ``time CANFD bus Rx id [name] brs esi code count`` and the bytes."""
     keep = np.flatnonzero(ok)
     if not len(keep):
@@ -413,19 +415,19 @@ def _fd(lines: Lines, line: Int64s, head: list[Field], t_ns: Int64s, ok: Bools) 
 def _spaced(
     lines: Lines,
     line: Int64s,
-    bus: Field,
-    identifier: Field,
+    bus: WordRanges,
+    identifier: WordRanges,
     length: Int64s,
     payload: Int64s,
     is_fd: Bools,
 ) -> Spaced:
     """Return the fields, with the ``x`` of 29-bit identifiers removed."""
     is_extended: Bools = (lines.buffer[identifier.stop - 1] | 0x20) == ord("x")
-    digits = Field(identifier.start, identifier.stop - is_extended)
+    digits = WordRanges(identifier.start, identifier.stop - is_extended)
     return Spaced(line, bus, digits, is_extended, length, payload, is_fd)
 
 
-def _is_flag(lines: Lines, word: Field) -> Bools:
+def _is_flag(lines: Lines, word: WordRanges) -> Bools:
     letter = lines.buffer[word.start]
     found: Bools = (letter == ord("0")) | (letter == ord("1"))
     found &= word.size == 1

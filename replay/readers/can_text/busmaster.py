@@ -16,7 +16,7 @@ import numpy as np
 from crosscue.replay.columns import DATA, REMOTE, Int64s
 from crosscue.replay.ledger import Ledger
 
-from .dialect import Damage, Dialect, Fast, Frame, Mark, Other, Outcome
+from .dialect import DamagedLine, Dialect, Fast, HeaderLine, Other, Outcome, ParsedFrame
 from .digits import NANOS, TIME_MAX_NS, Bools, decimal, within_range
 from .lines import Lines, clean_lines, next_fields, skip_gap
 from .spaced import NOTHING_FAST, Spaced, is_direction, payload_stop, spaced_frames
@@ -87,16 +87,16 @@ class Busmaster(Dialect):
             return self._frame(found)
         if _EVENT.match(line):
             return Other("error or warning, no frame")
-        return Damage("line is not a BUSMASTER frame") if line else None
+        return DamagedLine("line is not a BUSMASTER frame") if line else None
 
     def last(self, line: bytes) -> Outcome:
         """Accept the line if it has as many bytes as its length states, in hexadecimal."""
         outcome = self.slow(line)
-        if isinstance(outcome, Frame) and outcome.kind == DATA and self._base == 16:
+        if isinstance(outcome, ParsedFrame) and outcome.kind == DATA and self._base == 16:
             return outcome
-        return Damage("last line has no line end, may be cut") if line.strip() else None
+        return DamagedLine("last line has no line end, may be cut") if line.strip() else None
 
-    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, Mark]]) -> Int64s:
+    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, HeaderLine]]) -> Int64s:
         """Add the date and a day at every midnight, or sum up relative times."""
         out = t_ns.copy()
         begin = 0
@@ -143,10 +143,10 @@ class Busmaster(Dialect):
 
     def _header(self, line: bytes) -> Outcome:
         if found := _START.fullmatch(line):
-            return Mark(origin_ns=_start_of(found))
+            return HeaderLine(origin_ns=_start_of(found))
         if (b"***DEC***" in line) != (self._base == 10) and line in (b"***DEC***", b"***HEX***"):
-            return Mark(stops="a different number base inside the file")
-        return Mark()
+            return HeaderLine(stops="a different number base inside the file")
+        return HeaderLine()
 
     def _frame(self, found: re.Match[bytes]) -> Outcome:
         hour, minute, second = int(found[1]), int(found[2]), int(found[3])
@@ -155,15 +155,15 @@ class Busmaster(Dialect):
             identifier = int(found[7], self._base)
             payload = bytes(int(one, self._base) for one in found[11].split())
         except ValueError:
-            return Damage("number out of range")
+            return DamagedLine("number out of range")
         is_extended, is_remote = found[8] == b"x", bool(found[9])
         if identifier > (0x1FFFFFFF if is_extended else 0x7FF):
-            return Damage("identifier out of range")
+            return DamagedLine("identifier out of range")
         if len(payload) != (0 if is_remote else int(found[10])) or len(payload) > 8:
-            return Damage("length differs from the number of bytes")
+            return DamagedLine("length differs from the number of bytes")
         kind = REMOTE if is_remote else DATA
         bus = found[6].decode("ascii")
-        return Frame(bus, t_ns, identifier, is_extended, kind, len(payload), payload)
+        return ParsedFrame(bus, t_ns, identifier, is_extended, kind, len(payload), payload)
 
 
 def _start_of(found: re.Match[bytes]) -> int | None:

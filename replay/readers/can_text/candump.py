@@ -26,12 +26,12 @@ from crosscue.replay.readers.can_rows import IS_FD_LENGTH
 
 from .busmaster import BUSMASTER_HEAD, Busmaster
 from .dialect import (
-    Damage,
+    DamagedLine,
     Dialect,
     Fast,
-    Frame,
     Other,
     Outcome,
+    ParsedFrame,
     TextCanLog,
     head_of,
     payloads,
@@ -160,11 +160,11 @@ class Candump(Dialect):
             return Other("CAN XL frame, not supported", _time_ns(found), bus)
         if not line.strip():
             return None
-        return Damage(NOT_A_FRAME, taints=not line.startswith(b"("))
+        return DamagedLine(NOT_A_FRAME, taints=not line.startswith(b"("))
 
     def last(self, line: bytes) -> Outcome:
         """Reject the line, because a truncated payload cannot be detected."""
-        return Damage("last line has no line end, may be cut") if line.strip() else None
+        return DamagedLine("last line has no line end, may be cut") if line.strip() else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,7 +266,7 @@ def _frame_of_log_line(found: re.Match[bytes]) -> Outcome:
     flags, fd_text, remote, text = found[5], found[6], found[7], found[8]
     payload = bytes.fromhex((fd_text or text or b"").decode("ascii"))
     if t_ns is None or not IS_INTERFACE.fullmatch(bus):
-        return Damage(OUT_OF_RANGE if t_ns is None else NOT_A_FRAME)
+        return DamagedLine(OUT_OF_RANGE if t_ns is None else NOT_A_FRAME)
     kind = DATA if remote is None else REMOTE
     return _frame(bus, t_ns, found[4], kind, payload, flags is not None)
 
@@ -276,9 +276,9 @@ def _frame_of_screen_line(found: re.Match[bytes]) -> Outcome:
     kind = REMOTE if text == b"remote request" else DATA
     payload = b"" if kind == REMOTE else bytes.fromhex(text.decode("ascii"))
     if t_ns is None or not IS_INTERFACE.fullmatch(bus):
-        return Damage(OUT_OF_RANGE if t_ns is None else NOT_A_FRAME)
+        return DamagedLine(OUT_OF_RANGE if t_ns is None else NOT_A_FRAME)
     if kind == DATA and int(length) != len(payload):
-        return Damage("length differs from the number of bytes")
+        return DamagedLine("length differs from the number of bytes")
     return _frame(bus, t_ns, found[4], kind, payload, is_fd=len(length) == 2)
 
 
@@ -288,11 +288,11 @@ def _frame(
     identifier = int(id_text, 16)
     is_long = len(id_text) == 8
     if identifier > (0x3FFFFFFF if is_long else 0x7FF):
-        return Damage("identifier out of range")
+        return DamagedLine("identifier out of range")
     if len(payload) > 64 or not (IS_FD_LENGTH[len(payload)] if is_fd else len(payload) <= 8):
-        return Damage("invalid number of payload bytes")
+        return DamagedLine("invalid number of payload bytes")
     is_error = bool(identifier & ERROR_FLAG)
-    return Frame(
+    return ParsedFrame(
         bus.decode("ascii"),
         t_ns,
         identifier & 0x1FFFFFFF,

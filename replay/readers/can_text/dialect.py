@@ -29,13 +29,13 @@ from crosscue.replay.readers.can_rows import (
     bus_name,
     bus_number,
     bus_topic,
-    joined,
     keep_memory,
+    merge_two,
     widened,
 )
 
 from .digits import Bools, payload8, payload64, spaced8
-from .lines import Lines, Overlong, Tail, lines_of
+from .lines import Lines, Overlong, Tail, read_lines
 
 HEAD_BYTES: Final = 64 << 10
 # Maximum length of a line that is parsed by ``slow``.
@@ -45,7 +45,7 @@ _EXCERPT: Final = 60
 _DOS_END: Final = b"\x1a"
 
 
-class Frame(NamedTuple):
+class ParsedFrame(NamedTuple):
     """A frame parsed by ``slow``; ``t_ns`` is the time in the line, before ``Dialect.clock``."""
 
     bus: str
@@ -69,7 +69,7 @@ class Other(NamedTuple):
     number: int | None = None
 
 
-class Damage(NamedTuple):
+class DamagedLine(NamedTuple):
     """A line that cannot be parsed.
 
     With ``taints``, the same damage may have truncated the previous line.
@@ -79,7 +79,7 @@ class Damage(NamedTuple):
     taints: bool = False
 
 
-class Mark(NamedTuple):
+class HeaderLine(NamedTuple):
     """A header or comment line.
 
     Attributes:
@@ -93,7 +93,7 @@ class Mark(NamedTuple):
     tag: str = ""
 
 
-Outcome: TypeAlias = Frame | Other | Damage | Mark | None
+Outcome: TypeAlias = ParsedFrame | Other | DamagedLine | HeaderLine | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,10 +119,10 @@ class ChunkResult:
     """
 
     rows: FrameRows
-    odd: Sequence[tuple[int, int, Frame]]
+    odd: Sequence[tuple[int, int, ParsedFrame]]
     others: Sequence[tuple[int, Other]]
     damaged: Sequence[int]
-    marks: Sequence[tuple[int, Mark]]
+    marks: Sequence[tuple[int, HeaderLine]]
     first_number: int
     done: int
 
@@ -146,7 +146,7 @@ class Dialect(ABC):
     def last(self, line: bytes) -> Outcome:
         """Parse a last line without a line end, which may be truncated."""
 
-    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, Mark]]) -> Int64s:
+    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, HeaderLine]]) -> Int64s:
         """Convert the times in the lines to log times.
 
         Args:
@@ -229,7 +229,7 @@ class TextCanLog(Closing):
         scribe = _ChunkParser(self._dialect(), self._names, ledger)
         size = self._path.stat().st_size
         try:
-            for piece in lines_of(self._path):
+            for piece in read_lines(self._path):
                 rows = scribe.rows(piece)
                 yield from blocks_by_bus(rows, tuple(self._names), ledger, selection)
                 if scribe.stopped:
@@ -252,7 +252,7 @@ class TextCanLog(Closing):
         last = tail[tail.rfind(b"\n") + 1 :]
         if last not in (b"", _DOS_END):
             outcome = dialect.last(last) if len(last) <= LINE_MAX else None
-            if outcome is None or isinstance(outcome, Frame | Damage):
+            if outcome is None or isinstance(outcome, ParsedFrame | DamagedLine):
                 detail = f"{len(last)} bytes without a line end: {last[:_EXCERPT]!r}"
                 ledger.drop("", "file may be cut in its last line", None, detail)
         if missing := dialect.unended(head, tail):
@@ -261,7 +261,7 @@ class TextCanLog(Closing):
     def _peek(self, dialect: Dialect) -> None:
         ledger = Ledger(str(self._path))
         scribe = _ChunkParser(dialect, self._names, ledger)
-        for piece in lines_of(self._path, HEAD_BYTES):
+        for piece in read_lines(self._path, HEAD_BYTES):
             found = len(scribe.rows(piece))
             if isinstance(piece, Lines) or found or scribe.is_recognised:
                 break
@@ -298,8 +298,8 @@ class _ChunkParser:
         odd = _SlowLines()
         outcome = self.dialect.last(tail.text) if len(tail.text) <= LINE_MAX else None
         if outcome is None and tail.text.strip():
-            outcome = Damage("last line has no line end, may be cut")
-        if outcome is None or isinstance(outcome, Frame):
+            outcome = DamagedLine("last line has no line end, may be cut")
+        if outcome is None or isinstance(outcome, ParsedFrame):
             detail = f"line {tail.number} has no line end"
             self._ledger.drop("", "file may be cut after its last frame", None, detail)
         self._add(odd, 0, tail.number, tail.text, outcome)
@@ -312,7 +312,7 @@ class _ChunkParser:
         for i in _left_over(lines, rows):
             line = lines.text(i)
             outcome = self._outcome_of(line)
-            if isinstance(outcome, Damage) and outcome.taints and i > 0:
+            if isinstance(outcome, DamagedLine) and outcome.taints and i > 0:
                 odd.tainted.append(i - 1)
             if i >= lines.done:
                 break
@@ -333,16 +333,16 @@ class _ChunkParser:
 
     def _outcome_of(self, line: bytes) -> Outcome:
         if len(line) > LINE_MAX:
-            return Damage("line too long")
+            return DamagedLine("line too long")
         outcome = self.dialect.slow(line)
         if _CONTROL.search(line):
-            taints = isinstance(outcome, Damage) and outcome.taints
-            return Damage("control characters in a line", taints)
+            taints = isinstance(outcome, DamagedLine) and outcome.taints
+            return DamagedLine("control characters in a line", taints)
         return outcome
 
     def _add(self, odd: _SlowLines, i: int, number: int, line: bytes, outcome: Outcome) -> None:
         match outcome:
-            case Frame():
+            case ParsedFrame():
                 code = bus_number(outcome.bus, self._names)
                 if code < 0:
                     odd.damaged.append(i)
@@ -355,10 +355,10 @@ class _ChunkParser:
                 odd.plain.append((i, outcome))
                 if outcome.t_ns is not None:
                     odd.times.append((i, outcome.t_ns))
-            case Damage():
+            case DamagedLine():
                 odd.damaged.append(i)
                 self._drop("", outcome.reason, number, line)
-            case Mark():
+            case HeaderLine():
                 self.is_recognised = True
                 odd.marks.append((i, outcome))
                 if outcome.stops:
@@ -389,7 +389,7 @@ class _ChunkParser:
             topic = bus and bus_name(bus)
             self._ledger.find(topic, len(numbers))
             self._ledger.skip(topic, reason, len(numbers), f"from line {numbers[0]} on")
-        rows = joined(rows, odd.rows())
+        rows = merge_two(rows, odd.rows())
         place, t_ns = rows.place, rows.log_ns
         if odd.times:
             at, values = (np.array(column, np.int64) for column in zip(*odd.times, strict=True))
@@ -429,9 +429,9 @@ class _SlowLines:
     """The lines of a chunk that were parsed by ``slow``."""
 
     def __init__(self) -> None:
-        self.frames: list[tuple[int, int, Frame]] = []
+        self.frames: list[tuple[int, int, ParsedFrame]] = []
         self.times: list[tuple[int, int]] = []
-        self.marks: list[tuple[int, Mark]] = []
+        self.marks: list[tuple[int, HeaderLine]] = []
         self.others: dict[tuple[str, str], list[int]] = {}
         self.plain: list[tuple[int, Other]] = []
         self.damaged: list[int] = []

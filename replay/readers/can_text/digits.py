@@ -48,7 +48,7 @@ _ZEROS: Final = _u(0x3030303030303030)
 _POWER: Final = np.array([10**k for k in range(10)], np.int64)
 
 
-def words_of(buffer: Bytes) -> Words:
+def byte_words(buffer: Bytes) -> Words:
     """Return a view of every eight consecutive bytes as a word, shape (len - 7,)."""
     words: Words = np.ndarray((len(buffer) - 7,), np.dtype("<u8"), buffer.data, strides=(1,))
     return words
@@ -138,7 +138,7 @@ def seconds_ns(
 
     Args:
         buffer: The characters.
-        words: View of ``buffer`` from ``words_of``.
+        words: View of ``buffer`` from ``byte_words``.
         start: Shape (N,): first character of each number.
         stop: Shape (N,): one past its last character.
         marked: Reject numbers without a decimal mark.

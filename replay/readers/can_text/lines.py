@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from .digits import BACK, FRONT, Words, words_of
+from .digits import BACK, FRONT, Words, byte_words
 
 Bytes: TypeAlias = NDArray[np.uint8]
 Int64s: TypeAlias = NDArray[np.int64]
@@ -30,7 +30,7 @@ class Lines:
 
     Attributes:
         buffer: The chunk with ``FRONT`` bytes before it and ``BACK`` after it.
-        words: ``words_of(buffer)``.
+        words: ``byte_words(buffer)``.
         start: Shape (N,), int64: first character of each line.
         stop: Shape (N,), int64: one past its last character, without the line end.
         first_number: Number of the first line in the file, counted from 1.
@@ -79,7 +79,7 @@ class Tail:
     text: bytes
 
 
-def lines_of(path: Path, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Lines | Overlong | Tail]:
+def read_lines(path: Path, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Lines | Overlong | Tail]:
     """Yield the file's lines in order, then the characters after the last line end.
 
     The last complete line of a chunk is repeated as the first line of the next chunk, so that every
@@ -90,7 +90,7 @@ def lines_of(path: Path, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Lines | Ove
     """
     buffer = np.zeros(FRONT + chunk_bytes + BACK, np.uint8)
     buffer[FRONT + chunk_bytes :] = NEWLINE
-    words = words_of(buffer)
+    words = byte_words(buffer)
     kept, number, dropping, is_end = 0, 1, 0, False
     with path.open("rb", buffering=0) as file:
         while not is_end:
@@ -148,7 +148,7 @@ def _lines(buffer: Bytes, words: Words, newline: Int64s, number: int, done: int)
     return Lines(buffer, words, start, stop, number, done)
 
 
-class Field(NamedTuple):
+class WordRanges(NamedTuple):
     """One word of each of N lines, as ranges; an empty range at the line's end if missing."""
 
     start: Int64s
@@ -159,9 +159,9 @@ class Field(NamedTuple):
         """Number of characters of each word."""
         return self.stop - self.start
 
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Field:
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> WordRanges:
         """Return the selected words."""
-        return Field(self.start[index], self.stop[index])
+        return WordRanges(self.start[index], self.stop[index])
 
 
 _ONES: Final = np.uint64(0x0101010101010101)
@@ -179,7 +179,7 @@ _IN_BITMAP: Final = np.uint64((1 << 8 * _BITMAP_WORDS) - 1)
 _STEPS_MAX: Final = 64
 
 
-def next_fields(lines: Lines, at: Int64s, limit: Int64s, count: int) -> list[Field]:
+def next_fields(lines: Lines, at: Int64s, limit: Int64s, count: int) -> list[WordRanges]:
     """Find the next ``count`` words of lines, from ``at`` on and before ``limit``.
 
     A bitmap marks which of the next characters belong to a word. Words are found in the bitmap with
@@ -201,7 +201,7 @@ def next_fields(lines: Lines, at: Int64s, limit: Int64s, count: int) -> list[Fie
             start[open_] = _seek(lines.words, past[open_], limit[open_], _word_bits)
             stop[open_] = _seek(lines.words, start[open_], limit[open_], _gap_bits)
         past = np.minimum(stop, limit)
-        fields.append(Field(np.minimum(start, limit), past))
+        fields.append(WordRanges(np.minimum(start, limit), past))
     return fields
 
 

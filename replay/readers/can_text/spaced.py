@@ -9,11 +9,11 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.columns import DATA, CanFrames, Int64s
-from crosscue.replay.readers.can_rows import joined
+from crosscue.replay.readers.can_rows import merge_two
 
 from .dialect import NO_ROWS, Fast, payloads, picked
 from .digits import LABEL_MAX, Bools, hexadecimal, labels
-from .lines import SPACE, Field, Lines
+from .lines import SPACE, Lines, WordRanges
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,8 +31,8 @@ class Spaced:
     """
 
     line: Int64s
-    bus: Field | None
-    identifier: Field
+    bus: WordRanges | None
+    identifier: WordRanges
     is_extended: Bools
     length: Int64s
     payload: Int64s
@@ -87,7 +87,7 @@ def is_bus_name(spelled: bytes) -> bool:
     return bool(spelled) and all(SPACE < c < 127 for c in spelled)
 
 
-def is_direction(lines: Lines, word: Field) -> Bools:
+def is_direction(lines: Lines, word: WordRanges) -> Bools:
     """Return whether each word is ``Rx`` or ``Tx``."""
     letter = lines.buffer[word.start]
     found: Bools = (letter == ord("R")) | (letter == ord("T"))
@@ -101,5 +101,5 @@ def joined_fast(parts: Sequence[Fast]) -> Fast:
     names: tuple[str, ...] = ()
     for part in parts:
         shifted = replace(part.rows, bus=part.rows.bus + len(names))
-        rows, names = joined(rows, shifted), (*names, *part.names)
+        rows, names = merge_two(rows, shifted), (*names, *part.names)
     return Fast(rows, names)

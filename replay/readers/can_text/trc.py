@@ -26,19 +26,19 @@ from crosscue.replay.readers.can_rows import FD_LENGTHS, IS_FD_LENGTH
 
 from .dialect import (
     ChunkResult,
-    Damage,
+    DamagedLine,
     Dialect,
     Fast,
-    Frame,
-    Mark,
+    HeaderLine,
     Other,
     Outcome,
+    ParsedFrame,
     TextCanLog,
     comment,
     head_of,
 )
 from .digits import NANOS, OUT_OF_RANGE, SECONDS_MAX, Bools, decimal, seconds_ns, within_range
-from .lines import Field, Lines, clean_lines, next_fields, skip_gap
+from .lines import Lines, WordRanges, clean_lines, next_fields, skip_gap
 from .message_numbers import MessageNumbers
 from .spaced import NOTHING_FAST, Spaced, is_bus_name, is_direction, payload_stop, spaced_frames
 
@@ -160,23 +160,23 @@ class Trc(Dialect):
         found = _TIME.fullmatch(by.get("O", ""))
         number = (_OLD_NUMBER if self._is_old else _NUMBER).fullmatch(by.get("N", "1"))
         if not found or not number or by.get("R", "-") != "-":
-            return Damage(NOT_UNDERSTOOD)
+            return DamagedLine(NOT_UNDERSTOOD)
         if int(found[1]) > SECONDS_MAX:
-            return Damage(OUT_OF_RANGE)
+            return DamagedLine(OUT_OF_RANGE)
         t_ns = (int(found[1]) * NANOS + int((found[2] or "").ljust(9, "0"))) // 1000
         outcome = self._outcome(t_ns, by, values[before:])
-        if isinstance(outcome, Frame | Other) and "N" in by:
+        if isinstance(outcome, ParsedFrame | Other) and "N" in by:
             return outcome._replace(number=int(by["N"].rstrip(")")))
         return outcome
 
     def last(self, line: bytes) -> Outcome:
         """Accept the line if it has as many bytes as its length states."""
         outcome = self.slow(line)
-        if isinstance(outcome, Frame | Damage):
+        if isinstance(outcome, ParsedFrame | DamagedLine):
             return outcome
-        return Damage("last line has no line end, may be cut") if line.strip() else None
+        return DamagedLine("last line has no line end, may be cut") if line.strip() else None
 
-    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, Mark]]) -> Int64s:
+    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, HeaderLine]]) -> Int64s:
         """Add the last start time before each line."""
         out = np.empty_like(t_ns)
         begin = 0
@@ -238,7 +238,7 @@ class Trc(Dialect):
         else:
             ledger.notice("the log has no $STARTTIME; times count from 1970-01-01")
 
-    def _kinds(self, lines: Lines, word: Field | None, count: int) -> tuple[Bools, Bools]:
+    def _kinds(self, lines: Lines, word: WordRanges | None, count: int) -> tuple[Bools, Bools]:
         """Return masks of the CAN FD frames and of the data frames."""
         if word is None:
             return np.zeros(count, np.bool_), np.ones(count, np.bool_)
@@ -251,13 +251,13 @@ class Trc(Dialect):
 
     def _header(self, line: bytes) -> Outcome:
         if found := _START.fullmatch(line):
-            return Mark(_start_ns(found))
+            return HeaderLine(_start_ns(found))
         if found := _VERSION.fullmatch(line):
             is_same = found[1].decode("ascii") == self._version
-            return Mark(stops="" if is_same else "a different version inside the file")
+            return HeaderLine(stops="" if is_same else "a different version inside the file")
         if found := _COLUMNS.fullmatch(line):
             is_same = found[1].decode("ascii").replace(",", "") == self._columns
-            return Mark(stops="" if is_same else "different columns inside the file")
+            return HeaderLine(stops="" if is_same else "different columns inside the file")
         return comment(line.decode("latin-1"))
 
     def _outcome(self, t_ns: int, by: dict[str, str], rest: list[str]) -> Outcome:
@@ -269,29 +269,29 @@ class Trc(Dialect):
         is_remote = type_ == "RR" or (self._is_old and rest == ["RTR"])
         is_frame = type_ in (("RX", "TX") if self._is_old else _DATA_TYPES)
         if not (is_error or is_remote or is_frame) or not is_bus_name(bus.encode("latin-1")):
-            return Damage(NOT_UNDERSTOOD)
+            return DamagedLine(NOT_UNDERSTOOD)
         if is_error and id_text == "-":
             id_text = "0000"
         is_extended = len(id_text) > 4
         if not _HEX_ID.fullmatch(id_text):
-            return Damage(NOT_UNDERSTOOD)
+            return DamagedLine(NOT_UNDERSTOOD)
         identifier = int(id_text, 16)
         if identifier > (0x1FFFFFFF if is_extended else 0x7FF):
-            return Damage("identifier out of range")
+            return DamagedLine("identifier out of range")
         if is_remote:
             is_bare = not rest or rest == ["RTR"]
-            remote = Frame(bus, t_ns, identifier, is_extended, REMOTE, 0)
-            return remote if is_bare else Damage(NOT_UNDERSTOOD)
+            remote = ParsedFrame(bus, t_ns, identifier, is_extended, REMOTE, 0)
+            return remote if is_bare else DamagedLine(NOT_UNDERSTOOD)
         is_fd = type_ in _DATA_TYPES[1:]
         length = _length(by, is_fd)
         if length is None or len(rest) != length or not all(_PAIR.fullmatch(w) for w in rest):
-            return Damage("length differs from the number of bytes")
+            return DamagedLine("length differs from the number of bytes")
         kind = ERROR if is_error else DATA
         payload = bytes(int(word, 16) for word in rest)
-        return Frame(bus, t_ns, identifier, is_extended, kind, length, payload, is_fd)
+        return ParsedFrame(bus, t_ns, identifier, is_extended, kind, length, payload, is_fd)
 
 
-def _number(lines: Lines, word: Field, is_old: bool) -> tuple[Int64s, Bools]:
+def _number(lines: Lines, word: WordRanges, is_old: bool) -> tuple[Int64s, Bools]:
     """Parse message numbers, which are followed by a bracket in old versions."""
     stop = word.stop - is_old
     number, ok = decimal(lines.words, stop, stop - word.start)
@@ -300,14 +300,14 @@ def _number(lines: Lines, word: Field, is_old: bool) -> tuple[Int64s, Bools]:
     return number, ok
 
 
-def _offsets_ns(lines: Lines, time: Field) -> tuple[Int64s, Bools]:
+def _offsets_ns(lines: Lines, time: WordRanges) -> tuple[Int64s, Bools]:
     """Convert milliseconds to nanoseconds; integers may have no decimal mark."""
     scaled, ok = seconds_ns(lines.buffer, lines.words, time.start, time.stop, marked=False)
     return scaled // 1000, ok
 
 
 def _lengths(
-    lines: Lines, code: Field | None, count: Field | None, is_fd: Bools
+    lines: Lines, code: WordRanges | None, count: WordRanges | None, is_fd: Bools
 ) -> tuple[Int64s, Bools]:
     """Return the number of payload bytes from the length, else from the length code."""
     word = count or code

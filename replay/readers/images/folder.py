@@ -18,7 +18,7 @@ from crosscue.replay.files.time_file_names import find_time_file
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.time_file import read_time_file
-from crosscue.replay.readers.timed_files import pair
+from crosscue.replay.readers.timed_files import pair_with_times
 from crosscue.replay.seal.touched import Touched
 
 from .files import PictureFiles, list_pictures
@@ -76,7 +76,7 @@ def open_images(path: Path, limits: Limits) -> ImageFolder:
     times = read_time_file(time_file, limits)
     name = path.resolve()
     camera = name.parent.name if name.name == "data" else name.name
-    files = pair(paths, times)
+    files = pair_with_times(paths, times)
     topic = Topic(camera or "images", "crosscue/Images", "columns", declared=files.declared)
     pictures = PictureFiles(topic, files)
     if time_file.parent == path:
@@ -90,7 +90,7 @@ def picture_names(log: Log) -> Mapping[str, int]:
         return {}
     time_file = find_time_file(log.path)
     assert time_file is not None
-    files = pair(list_pictures(log.path), read_time_file(time_file, DEFAULT_LIMITS))
+    files = pair_with_times(list_pictures(log.path), read_time_file(time_file, DEFAULT_LIMITS))
     return {
         path.name: t_ns
         for path, t_ns in zip(files.paths, files.t_ns.tolist(), strict=True)

@@ -8,7 +8,7 @@ from crosscue.replay.ledger import Ledger
 
 
 @dataclass(slots=True)
-class Tally:
+class CaseCount:
     """Number of cases, with a description of the first one."""
 
     count: int = 0
@@ -36,11 +36,11 @@ class Checks:
     attachments: int = 0
     attachments_unread: int = 0
     attachments_right: int = 0
-    bad_attachments: Tally = field(default_factory=Tally)
-    bad_indexes: Tally = field(default_factory=Tally)
-    bad_heads: Tally = field(default_factory=Tally)
-    bad_definitions: Tally = field(default_factory=Tally)
-    ignored: Tally = field(default_factory=Tally)
+    bad_attachments: CaseCount = field(default_factory=CaseCount)
+    bad_indexes: CaseCount = field(default_factory=CaseCount)
+    bad_heads: CaseCount = field(default_factory=CaseCount)
+    bad_definitions: CaseCount = field(default_factory=CaseCount)
+    ignored: CaseCount = field(default_factory=CaseCount)
 
     def report(self, ledger: Ledger) -> None:
         """Report the checks in the ledger."""

@@ -32,7 +32,7 @@ from crosscue.replay.seal.touched import Touched
 from .bytes import ByteFile, RangedByteFile
 from .channels import TopicBook
 from .recording_pass import CUT, INCOMPLETE, read_segments
-from .segments import Segment, find_segments, has_whole_summary
+from .segments import RecordingSegment, find_segments, has_whole_summary
 from .window import find_window
 
 HEADER_GUESS: Final = 64
@@ -124,7 +124,7 @@ class McapLog(Closing):
         self._file.close()
 
 
-def declared_counts(segments: tuple[Segment, ...], book: TopicBook) -> dict[str, int]:
+def declared_counts(segments: tuple[RecordingSegment, ...], book: TopicBook) -> dict[str, int]:
     """Return the statistics' message counts by topic; empty if a recording has no counts."""
     counts: Counter[str] = Counter()
     for segment in segments:
@@ -146,7 +146,7 @@ def open_mcap(path: Path, limits: Limits) -> McapLog:
     return McapLog(path, limits)
 
 
-def open_ranged(name: Path, ranged: RangedFile, limits: Limits) -> McapLog | None:
+def open_remote_mcap(name: Path, ranged: RangedFile, limits: Limits) -> McapLog | None:
     """Open a remote MCAP file by its summary; None if the summary is insufficient.
 
     Args:

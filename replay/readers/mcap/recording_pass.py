@@ -16,37 +16,37 @@ from crosscue.replay.columns import Block, Bytes
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.chunks.blocks import BlockBuilder
-from crosscue.replay.readers.mcap.chunks.load import Load, Loader, Stretch
+from crosscue.replay.readers.mcap.chunks.load import ChunkRecords, Load, Loader
 from crosscue.replay.readers.mcap.chunks.rows import (
     NEVER_IN_A_CHUNK,
     Rows,
     contradicts,
-    join,
+    join_chunks,
     rows_by_index,
     rows_by_scan,
 )
-from crosscue.replay.readers.mcap.damage.resync import Plausible, Resync
+from crosscue.replay.readers.mcap.damage.resync import McapResync, Plausible
 
 from .bytes import ByteFile
 from .channels import TopicBook
 from .checks import Checks
 from .records import PREFIX, BrokenRecordError
-from .segments import Segment, Summary
+from .segments import RecordingSegment, Summary
 from .walk import (
     STOPS_A_RUN,
     Attachment,
-    Chunk,
     End,
-    Gap,
     How,
     Ignored,
     Item,
+    LooseRecords,
     Oversized,
-    Run,
     Stray,
+    UnreadableBytes,
+    UnreadChunk,
     Walk,
 )
-from .window import Window, find_window
+from .window import ChunkWindow, find_window
 
 DAMAGED_CHUNK: Final = "damaged chunk"
 DAMAGED_RECORD: Final = "damaged record"
@@ -59,7 +59,7 @@ DETAILS_JOINED: Final = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Damage:
+class DamagedPart:
     """A damaged part that may have contained messages.
 
     Attributes:
@@ -77,7 +77,7 @@ class Damage:
 
 def read_segments(
     file: ByteFile,
-    segments: Sequence[Segment],
+    segments: Sequence[RecordingSegment],
     book: TopicBook,
     limits: Limits,
     ledger: Ledger,
@@ -114,7 +114,7 @@ class SegmentPass:
     def __init__(
         self,
         file: ByteFile,
-        segment: Segment,
+        segment: RecordingSegment,
         book: TopicBook,
         limits: Limits,
         ledger: Ledger,
@@ -130,20 +130,20 @@ class SegmentPass:
         self._ledger = ledger
         self._selection = selection
         self._may_skip = selection != EVERYTHING
-        self._inside: Window | None = None
+        self._inside: ChunkWindow | None = None
         self._doubt = ""
         self._checks = checks
         self._loader = loader
         self._where = where
-        self._damages: list[Damage] = []
+        self._damages: list[DamagedPart] = []
         self._rows_doubted = 0
         self._is_short: bool | None = None
         self._section: Future[int | None] | None = None
         self._attachments: list[tuple[int, int, Future[int | None]]] = []
-        self._waiting: list[tuple[Stretch, Rows]] = []
+        self._waiting: list[tuple[ChunkRecords, Rows]] = []
         self._declarations = segment.declarations(book)
         self._builder = BlockBuilder(ledger, selection, limits, self._declarations)
-        self._search = Resync(file, segment.end, segment.has_end, (), self._plausible())
+        self._search = McapResync(file, segment.end, segment.has_end, (), self._plausible())
 
     def blocks(self) -> Iterator[Block]:
         """Yield the blocks of the recording."""
@@ -164,17 +164,17 @@ class SegmentPass:
             self._ledger.drop("", INCOMPLETE, None, self._where + segment.after)
         self._finish_checks()
 
-    def _window(self) -> Window | None:
+    def _window(self) -> ChunkWindow | None:
         """Locate the selection by the index; if it cannot be trusted, report the reason."""
         if not self._may_skip or not self._segment.has_end:
             return None
         found = find_window(self._segment, self._declarations, self._selection)
-        if isinstance(found, Window):
+        if isinstance(found, ChunkWindow):
             return found
         self._notice(f"the requested part was found by reading the complete file: {found}")
         return None
 
-    def _windowed(self, window: Window) -> Iterator[Block]:
+    def _windowed(self, window: ChunkWindow) -> Iterator[Block]:
         """Yield blocks of the indexed chunks in the window, and of all records outside chunks."""
         if self._segment.data_crc:
             # This checksum covers all bytes of the section.
@@ -200,10 +200,12 @@ class SegmentPass:
     def _walked(self, walk: Iterator[Item]) -> Iterator[Block]:
         items = self._loader.ahead(walk, self._is_wanted)
         for (item, load), (following, _) in pairwise(chain(items, [(None, None)])):
-            if isinstance(item, Chunk):
+            if isinstance(item, UnreadChunk):
                 yield from self._chunk(item, load)
-            elif isinstance(item, Run):
-                yield from self._run(item, following if isinstance(following, Gap) else None)
+            elif isinstance(item, LooseRecords):
+                yield from self._run(
+                    item, following if isinstance(following, UnreadableBytes) else None
+                )
             else:
                 self._note(item)
 
@@ -227,7 +229,7 @@ class SegmentPass:
             return Plausible(channels)
         return Plausible(channels, (statistics.start, statistics.end))
 
-    def _is_wanted(self, chunk: Chunk) -> bool:
+    def _is_wanted(self, chunk: UnreadChunk) -> bool:
         """Return whether the chunk must be read, as chunks with inconsistent indexes must."""
         index, head = chunk.index, chunk.head
         if not self._may_skip or index is None or head is None or not chunk.messages:
@@ -244,7 +246,7 @@ class SegmentPass:
             return True
         return any(self._builder.wants(m) for m in filled)
 
-    def _chunk(self, chunk: Chunk, load: Load | None) -> Iterator[Block]:
+    def _chunk(self, chunk: UnreadChunk, load: Load | None) -> Iterator[Block]:
         self._checks.chunks += 1
         if self._inside is not None and not _is_as_indexed(chunk):
             self._doubt = self._doubt or f"it does not match the chunk at byte {chunk.at}"
@@ -269,23 +271,23 @@ class SegmentPass:
         yield from self._waiting_blocks()
         yield from self._builder.build(rows, self._checks, chunk.at)
 
-    def _stretch(self, chunk: Chunk, load: Load | None) -> Stretch:
+    def _stretch(self, chunk: UnreadChunk, load: Load | None) -> ChunkRecords:
         if load is not None:
             return load.stretch()
         # The chunk is selected only now, because a channel has been declared again.
         records = self._loader.load(chunk)
-        return Stretch(records, 0, len(records))
+        return ChunkRecords(records, 0, len(records))
 
     def _waiting_blocks(self) -> Iterator[Block]:
         """Yield the collected messages of the chunks of one group."""
         if not self._waiting:
             return
         whole = self._waiting[0][0].whole
-        rows = join(whole, [(rows, stretch.begin) for stretch, rows in self._waiting])
+        rows = join_chunks(whole, [(rows, stretch.begin) for stretch, rows in self._waiting])
         self._waiting.clear()
         yield from self._builder.build(rows, self._checks, 0)
 
-    def _rows(self, chunk: Chunk, buffer: Bytes) -> Rows:
+    def _rows(self, chunk: UnreadChunk, buffer: Bytes) -> Rows:
         """Parse the messages of a chunk with all possible checks.
 
         Raises:
@@ -304,7 +306,7 @@ class SegmentPass:
         self._count_verification(chunk, rows)
         return rows
 
-    def _count_verification(self, chunk: Chunk, rows: Rows) -> None:
+    def _count_verification(self, chunk: UnreadChunk, rows: Rows) -> None:
         """Count the kind of verification of a chunk's bytes.
 
         Raises:
@@ -331,13 +333,13 @@ class SegmentPass:
             doubt = doubt or "its message index names other messages"
             raise BrokenRecordError(f"has no checksum, and {doubt}")
 
-    def _cut_rows(self, chunk: Chunk, buffer: Bytes) -> Rows:
+    def _cut_rows(self, chunk: UnreadChunk, buffer: Bytes) -> Rows:
         rows = rows_by_scan(buffer, NEVER_IN_A_CHUNK, self._limits.records_per_chunk)
         head = chunk.head
         assert head is not None, "a chunk with rows has a head"
         has = self._file.size - chunk.body_at
         self._damages.append(
-            Damage(
+            DamagedPart(
                 CUT,
                 f"the chunk at byte {chunk.at} ends after {has} of {head.body_size} bytes; of its "
                 f"start {len(rows)} messages are read, which no checksum covers",
@@ -347,7 +349,7 @@ class SegmentPass:
         self._checks.rows_bare += len(rows)
         return rows
 
-    def _drop_chunk(self, chunk: Chunk, why: str) -> None:
+    def _drop_chunk(self, chunk: UnreadChunk, why: str) -> None:
         source = chunk.index or chunk.head
         t_ns = None if source is None or source.start >= 1 << 63 else source.start
         span = "" if source is None else f"; log times {source.start} to {source.end}"
@@ -358,9 +360,9 @@ class SegmentPass:
             self._builder.drop_of_channel(channel_id, reason, count, detail, t_ns)
         held = chunk.index.channels if chunk.index is not None else frozenset[int]()
         if not counts or chunk.index_fault or not held <= counts.keys():
-            self._damages.append(Damage(reason, detail, t_ns))
+            self._damages.append(DamagedPart(reason, detail, t_ns))
 
-    def _run(self, run: Run, gap: Gap | None) -> Iterator[Block]:
+    def _run(self, run: LooseRecords, gap: UnreadableBytes | None) -> Iterator[Block]:
         """Yield the messages of a run outside chunks, up to a gap that may overlap it."""
         rows = run.rows
         if gap is not None:
@@ -401,15 +403,15 @@ class SegmentPass:
         if self._is_short is None:
             count, has_chunks = 0, False
             for item in self._walk():
-                has_chunks |= isinstance(item, Chunk)
-                count += len(item.rows) if isinstance(item, Run) else 0
+                has_chunks |= isinstance(item, UnreadChunk)
+                count += len(item.rows) if isinstance(item, LooseRecords) else 0
             self._is_short = count < statistics.message_count and not has_chunks
         return self._is_short
 
     def _report_suspicion(self, place: str) -> None:
         if self._summary.statistics is None and not self._segment.data_crc:
             detail = f"{place}: its end seems to consist of other records of this recording"
-            self._damages.append(Damage(DAMAGED_RECORD, detail))
+            self._damages.append(DamagedPart(DAMAGED_RECORD, detail))
 
     def _plausible_rows(self, rows: Rows, at: int) -> Rows:
         """Select the messages without a valid checksum that agree with the statistics.
@@ -430,7 +432,7 @@ class SegmentPass:
             self._builder.drop(rows.take(slice(i, i + 1)), DAMAGED_RECORD, detail)
         return rows if good.all() else rows.take(np.flatnonzero(good))
 
-    def _before_gap(self, run: Run, gap: Gap) -> Rows:
+    def _before_gap(self, run: LooseRecords, gap: UnreadableBytes) -> Rows:
         """Return the messages of a run before a gap, and drop the others."""
         end = min(gap.at - run.at, run.rows.end)
         count = int(np.searchsorted(run.rows.offset, end))
@@ -451,14 +453,14 @@ class SegmentPass:
             case Attachment() if self._inside is not None:
                 self._checks.attachments += 1
                 self._checks.attachments_unread += 1
-            case Gap(at, to, why):
+            case UnreadableBytes(at, to, why):
                 self._damages.append(
-                    Damage(DAMAGED_RECORD, f"{self._where}bytes {at} to {to}: {why}")
+                    DamagedPart(DAMAGED_RECORD, f"{self._where}bytes {at} to {to}: {why}")
                 )
             case Stray(at, index):
                 detail = f"{self._where}message index at byte {at}: no chunk precedes it"
                 counts = {index.channel_id: len(index.entries)}
-                self._damages.append(Damage(DAMAGED_CHUNK, detail, None, counts))
+                self._damages.append(DamagedPart(DAMAGED_CHUNK, detail, None, counts))
             case End(at, how):
                 self._end(at, how)
             case Oversized(at, size, channel_id, log):
@@ -476,10 +478,10 @@ class SegmentPass:
     def _end(self, at: int, how: How) -> None:
         if how is How.CUT:
             detail = f"{self._where}the record at byte {at} extends beyond the end of the file"
-            self._damages.append(Damage(CUT, detail))
+            self._damages.append(DamagedPart(CUT, detail))
         elif how is How.BARE:
             detail = f"{self._where}it ends at byte {at} without a data end record and a footer"
-            self._damages.append(Damage(CUT, detail))
+            self._damages.append(DamagedPart(CUT, detail))
         elif how is How.FOOTER:
             self._notice("it has no data end record")
 
@@ -547,7 +549,7 @@ class SegmentPass:
             known = self._ledger.claim(self._declarations.topic(channel_id), count)
             self._builder.drop_of_channel(channel_id, reason, count - known, detail, t_ns)
 
-    def _report(self, damage: Damage) -> None:
+    def _report(self, damage: DamagedPart) -> None:
         if not damage.counts:
             self._ledger.drop("", damage.reason, None, damage.detail, damage.t_ns)
         for channel_id, count in damage.counts.items():
@@ -559,7 +561,7 @@ class SegmentPass:
         self._ledger.notice(self._where + sentence)
 
 
-def _is_as_indexed(chunk: Chunk) -> bool:
+def _is_as_indexed(chunk: UnreadChunk) -> bool:
     """Return whether the chunk and its message indexes agree with the summary."""
     index = chunk.index
     if index is None or chunk.fault or chunk.differs:

@@ -68,7 +68,7 @@ class BrokenRecordError(LogFormatError):
     """A record's content contradicts its own lengths; readers report it as a loss."""
 
 
-class Fields:
+class FieldParser:
     """Parses the fields of a record's content in order."""
 
     def __init__(self, content: bytes | memoryview) -> None:
@@ -191,14 +191,14 @@ class Footer:
 
 def read_schema(content: bytes | memoryview) -> Schema:
     """Parse a Schema record."""
-    fields = Fields(content)
+    fields = FieldParser(content)
     schema_id, name, encoding = fields.number(2), fields.text(), fields.text()
     return Schema(schema_id, name, encoding, bytes(fields.take(fields.number(4))))
 
 
 def read_channel(content: bytes | memoryview) -> Channel:
     """Parse a Channel record."""
-    fields = Fields(content)
+    fields = FieldParser(content)
     channel = Channel(fields.number(2), fields.number(2), fields.text(), fields.text())
     return replace(channel, converted_from=_converted_from(fields.take(fields.number(4))))
 
@@ -208,7 +208,7 @@ def _converted_from(metadata: bytes | memoryview) -> str:
     key = CONVERTED_FROM.encode()
     if key not in bytes(metadata):
         return ""
-    fields = Fields(metadata)
+    fields = FieldParser(metadata)
     try:
         while True:
             name, value = fields.text(), fields.text()
@@ -249,7 +249,7 @@ def read_message_index(content: bytes | memoryview) -> MessageIndex:
 
 def read_statistics(content: bytes | memoryview) -> Statistics:
     """Parse a Statistics record."""
-    fields = Fields(content)
+    fields = FieldParser(content)
     message_count = fields.number(8)
     fields.take(2 + 4 + 4 + 4)
     chunk_count = fields.number(4)
@@ -264,15 +264,15 @@ def read_statistics(content: bytes | memoryview) -> Statistics:
 
 def read_footer(content: bytes | memoryview) -> Footer:
     """Parse a Footer record."""
-    fields = Fields(content)
+    fields = FieldParser(content)
     return Footer(fields.number(8), fields.number(8), fields.number(4))
 
 
 def check_metadata(content: bytes | memoryview) -> None:
     """Raise BrokenRecordError unless ``content`` is a Metadata record."""
-    fields = Fields(content)
+    fields = FieldParser(content)
     fields.text()
-    entries = Fields(fields.take(fields.number(4)))
+    entries = FieldParser(fields.take(fields.number(4)))
     while entries.at < len(entries.content):
         entries.text()
 

@@ -16,8 +16,8 @@ import numpy as np
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.checksum import crc32
 from crosscue.replay.limits import Limits
-from crosscue.replay.readers.mcap.chunks.chunk_table import ChunkTable, run_of, table_of
-from crosscue.replay.readers.mcap.chunks.inflate import inflate, inflate_prefix
+from crosscue.replay.readers.mcap.chunks.chunk_table import ChunkTable, parse_chunk_indexes, run_of
+from crosscue.replay.readers.mcap.chunks.inflate import inflate_chunk, inflate_prefix
 from crosscue.replay.readers.mcap.chunks.rows import NEVER_IN_A_CHUNK, Definition, rows_by_scan
 from crosscue.replay.readers.mcap.damage.find import find_bytes, verified_head
 
@@ -46,10 +46,10 @@ from .records import (
     read_schema,
     read_statistics,
 )
-from .walk import Chunk, End, How, Run, Walk
+from .walk import End, How, LooseRecords, UnreadChunk, Walk
 
 MAX_HEADER: Final = 1 << 16
-NO_CHUNKS: Final = table_of(b"", (), (), 0)
+NO_CHUNKS: Final = parse_chunk_indexes(b"", (), (), 0)
 DATA_END_PREFIX: Final = PREFIX.pack(DATA_END, DATA_END_SIZE - PREFIX.size)
 
 
@@ -94,7 +94,7 @@ class Summary:
 
 
 @dataclass(frozen=True, slots=True)
-class Segment:
+class RecordingSegment:
     """One recording within a file.
 
     Attributes:
@@ -138,7 +138,7 @@ class Segment:
 
 def find_segments(
     file: ByteFile, path: Path, book: TopicBook, limits: Limits
-) -> tuple[Segment, ...]:
+) -> tuple[RecordingSegment, ...]:
     """Find the recordings in a file, and add their topics to ``book``.
 
     Raises:
@@ -171,7 +171,7 @@ def has_whole_summary(file: ByteFile, limits: Limits) -> bool:
     return segment is not None and segment.summary is not None and segment.summary.names_all
 
 
-def _by_footer(file: ByteFile, limits: Limits) -> Segment | None:
+def _by_footer(file: ByteFile, limits: Limits) -> RecordingSegment | None:
     """Return the only segment, if the footer and the summary before it are valid."""
     footer_at = file.size - FOOTER_SIZE - len(MAGIC)
     if footer_at < len(MAGIC) + DATA_END_SIZE:
@@ -191,7 +191,7 @@ def _by_footer(file: ByteFile, limits: Limits) -> Segment | None:
         summary = _read_summary(file, 0, footer.summary_at, footer_at, footer.crc, limits)
     except BrokenRecordError:
         return None
-    return Segment(0, _begin(file, 0), data_end_at, True, data_crc, summary)
+    return RecordingSegment(0, _begin(file, 0), data_end_at, True, data_crc, summary)
 
 
 def _data_end(file: ByteFile, at: int) -> int | None:
@@ -267,7 +267,7 @@ def _parse_summary(records: bytes, base: int) -> Summary:
             sizes += [length] * run
             at += (run - 1) * size
         at += PREFIX.size + length
-    chunks = table_of(records, begins, sizes, base)
+    chunks = parse_chunk_indexes(records, begins, sizes, base)
     return Summary(schemas, channels, statistics, chunks)
 
 
@@ -288,14 +288,16 @@ def _declared(summary: Summary) -> tuple[list[Schema], list[Channel]]:
     return list(summary.schemas.values()), list(summary.channels.values())
 
 
-def _enter(segment: Segment, declarations: Declarations) -> Segment:
+def _enter(segment: RecordingSegment, declarations: Declarations) -> RecordingSegment:
     """Return the segment with the declarations, and add its topics by channel number."""
     for _ in declarations.topics():
         pass
     return replace(segment, schemas=declarations.schemas, channels=declarations.channels)
 
 
-def _survey_named(file: ByteFile, segment: Segment, book: TopicBook, limits: Limits) -> Segment:
+def _survey_named(
+    file: ByteFile, segment: RecordingSegment, book: TopicBook, limits: Limits
+) -> RecordingSegment:
     """Find channels in the data section that the summary does not declare."""
     walk = Walk(file, segment.begin, segment.end, segment.known_chunks(file, limits), limits)
     declarations = Declarations(book, *_declared(segment.summary or Summary()))
@@ -303,9 +305,9 @@ def _survey_named(file: ByteFile, segment: Segment, book: TopicBook, limits: Lim
     return _enter(segment, declarations)
 
 
-def _survey(file: ByteFile, book: TopicBook, limits: Limits) -> tuple[Segment, ...]:
+def _survey(file: ByteFile, book: TopicBook, limits: Limits) -> tuple[RecordingSegment, ...]:
     """Find all segments by walking over the file's outer records."""
-    segments: list[Segment] = []
+    segments: list[RecordingSegment] = []
     base = 0
     while base < file.size:
         begin = _begin(file, base)
@@ -333,19 +335,19 @@ def _collect(file: ByteFile, walk: Walk, declarations: Declarations, limits: Lim
     for item in walk:
         if isinstance(item, End):
             return item
-        if isinstance(item, Run):
+        if isinstance(item, LooseRecords):
             _take(declarations, item.rows.definitions)
-        elif isinstance(item, Chunk) and not _is_known(item, declarations):
+        elif isinstance(item, UnreadChunk) and not _is_known(item, declarations):
             _take(declarations, _definitions_in(file, item, limits))
     raise AssertionError("a walk ends with an End")
 
 
-def _is_known(chunk: Chunk, declarations: Declarations) -> bool:
+def _is_known(chunk: UnreadChunk, declarations: Declarations) -> bool:
     ids = {index.channel_id for index in chunk.messages}
     return bool(ids) and ids <= declarations.complete
 
 
-def _definitions_in(file: ByteFile, chunk: Chunk, limits: Limits) -> list[Definition]:
+def _definitions_in(file: ByteFile, chunk: UnreadChunk, limits: Limits) -> list[Definition]:
     """Return the schemas and channels of a chunk; empty if it cannot be read."""
     head = chunk.head
     if head is None or chunk.fault or max(head.size, head.body_size) > limits.chunk_bytes:
@@ -355,7 +357,7 @@ def _definitions_in(file: ByteFile, chunk: Chunk, limits: Limits) -> list[Defini
         buffer = (
             inflate_prefix(body, head)
             if chunk.is_cut
-            else inflate(body, head, file.buffers.take(head.size + 1))
+            else inflate_chunk(body, head, file.buffers.take(head.size + 1))
         )
         rows = rows_by_scan(buffer, NEVER_IN_A_CHUNK, limits.records_per_chunk)
     except BrokenRecordError:
@@ -375,14 +377,14 @@ def _take(declarations: Declarations, definitions: Sequence[Definition]) -> None
 
 def _close(
     file: ByteFile, base: int, begin: int, end: End, limits: Limits
-) -> tuple[Segment, int | None]:
+) -> tuple[RecordingSegment, int | None]:
     """Return a segment whose data section ends at ``end``, and the possible start of the next."""
     if end.how not in (How.DATA_END, How.FOOTER):
         after = end.at if end.how is How.REPORTED and end.at < file.size else None
-        return Segment(base, begin, after or file.size, has_end=False), after
+        return RecordingSegment(base, begin, after or file.size, has_end=False), after
     data_crc = _data_end(file, end.at) or 0
     summary_at = end.at + (DATA_END_SIZE if end.how is How.DATA_END else 0)
-    segment = Segment(base, begin, end.at, True, data_crc)
+    segment = RecordingSegment(base, begin, end.at, True, data_crc)
     footer_at = _footer_after(file, summary_at)
     if footer_at is None:
         if bytes(file.peek(file.size - len(MAGIC), len(MAGIC))) != MAGIC:

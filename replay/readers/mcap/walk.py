@@ -25,7 +25,7 @@ from crosscue.replay.readers.mcap.damage.find import (
     is_doubtful,
     verified_head,
 )
-from crosscue.replay.readers.mcap.damage.resync import Plausible, Resync, is_definition
+from crosscue.replay.readers.mcap.damage.resync import McapResync, Plausible, is_definition
 
 from .bytes import ByteFile
 from .records import (
@@ -65,7 +65,7 @@ SMALL: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chunk:
+class UnreadChunk:
     """A chunk that is not yet read, with the message indexes that follow it.
 
     Attributes:
@@ -92,7 +92,7 @@ class Chunk:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class LooseRecords:
     """Messages, schemas and channels outside chunks, from byte ``at`` on."""
 
     at: int
@@ -135,7 +135,7 @@ class Stray:
 
 
 @dataclass(frozen=True, slots=True)
-class Gap:
+class UnreadableBytes:
     """Bytes from ``at`` to ``to`` that cannot be read as records.
 
     A run before it may extend beyond ``at``. Its records from ``at`` on cannot be trusted.
@@ -164,7 +164,9 @@ class End:
     how: How
 
 
-Item: TypeAlias = Chunk | Run | Oversized | Attachment | Ignored | Stray | Gap | End
+Item: TypeAlias = (
+    UnreadChunk | LooseRecords | Oversized | Attachment | Ignored | Stray | UnreadableBytes | End
+)
 
 
 class Walk:
@@ -200,8 +202,8 @@ class Walk:
         self._run_bytes = 0
         self._is_over = False
         self._last_at = begin
-        self._resync = Resync(file, end, self._has_end, self._known, plausible or Plausible())
-        self._before: Run | None = None
+        self._resync = McapResync(file, end, self._has_end, self._known, plausible or Plausible())
+        self._before: LooseRecords | None = None
         self._has_bare = not self._known
 
     def __iter__(self) -> Iterator[Item]:
@@ -217,7 +219,7 @@ class Walk:
                 yield item
             if isinstance(item, End):
                 return
-            since = item.at if isinstance(item, Gap) else before
+            since = item.at if isinstance(item, UnreadableBytes) else before
             assert self._at > since or self._is_over, "a walk must go forward"
         how = How.DATA_END if self._has_end else How.REPORTED if self._is_over else How.BARE
         yield End(self._end, how)
@@ -259,7 +261,7 @@ class Walk:
         since, record = self._next_record(at, bound)
         if bound < self._end:
             self._at = bound if record is None else record
-            return Gap(since, self._at, why)
+            return UnreadableBytes(since, self._at, why)
         self._at = self._end if record is None else record
         after = min(self._last_at, since) + 1
         found = find_chunk(self._file, after, since + 1, self._at, self._end, self._limits)
@@ -268,7 +270,7 @@ class Walk:
             self._at = place
         elif not self._has_end:
             self._at, self._end, self._is_over = max(place, since), place, True
-        return Gap(since, self._at, why)
+        return UnreadableBytes(since, self._at, why)
 
     def _next_record(self, at: int, bound: int) -> tuple[int, int | None]:
         """Return where records outside chunks become untrustworthy, and where they resume."""
@@ -370,7 +372,7 @@ class Walk:
         self._run_bytes = 0 if is_stopped else min(2 * len(buffer), RUN_BYTES)
         self._at = at + rows.end
         self._has_bare = True
-        self._before = Run(at, rows)
+        self._before = LooseRecords(at, rows)
         self._resync.plausible.learn(rows)
         return self._before
 
@@ -438,7 +440,7 @@ class Walk:
             end, differs = inner_end, f"its record states {length} bytes"
         elif not self._has_end and bound == self._end and outer_end == inner_end:
             self._at, self._is_over = self._end, True
-            return Chunk(at, body_at, head, None, fault, is_cut=True)
+            return UnreadChunk(at, body_at, head, None, fault, is_cut=True)
         else:
             raise BrokenRecordError(f"a chunk of {length} bytes is too long")
         if inner_end < end and not differs:
@@ -448,15 +450,15 @@ class Walk:
         messages, index_fault = self._message_indexes(end, index)
         # A search for records after damage would find those inside an uncompressed chunk.
         self._has_bare &= self._before is not None
-        return Chunk(at, body_at, head, index, fault, differs, False, messages, index_fault)
+        return UnreadChunk(at, body_at, head, index, fault, differs, False, messages, index_fault)
 
-    def _repaired(self, index: ChunkIndex, head: ChunkHead, bound: int) -> Chunk:
+    def _repaired(self, index: ChunkIndex, head: ChunkHead, bound: int) -> UnreadChunk:
         """Return a chunk that is read by its entry in the summary."""
         at = self._at
         messages, index_fault = self._message_indexes(min(at + index.length, bound), index)
         self._has_bare &= self._before is not None
         body_at = at + PREFIX.size + head.body_at
-        return Chunk(at, body_at, head, index, "", REPAIRED, False, messages, index_fault)
+        return UnreadChunk(at, body_at, head, index, "", REPAIRED, False, messages, index_fault)
 
     def _chunk_without_head(
         self, index: ChunkIndex | None, outer_end: int, bound: int, why: str
@@ -466,7 +468,7 @@ class Walk:
             return self._cut("its fields") if bound == self._end else self._gap(why)
         end = outer_end if index is None else min(at + index.length, bound)
         messages, index_fault = self._message_indexes(end, index)
-        return Chunk(at, at, None, index, why, "", False, messages, index_fault)
+        return UnreadChunk(at, at, None, index, why, "", False, messages, index_fault)
 
     def _message_indexes(
         self, at: int, index: ChunkIndex | None

@@ -25,14 +25,14 @@ from crosscue.replay.readers.mcap.chunks.chunk_table import ChunkTable
 
 from .bytes import ByteFile
 from .channels import Declarations
-from .segments import Segment, Summary
+from .segments import RecordingSegment, Summary
 from .walk import End, Item, Walk
 
 LATEST: Final = np.uint64((1 << 63) - 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Window:
+class ChunkWindow:
     """The location of a part of a recording.
 
     Attributes:
@@ -103,7 +103,9 @@ class Window:
         return +rest
 
 
-def find_window(segment: Segment, declarations: Declarations, selection: Selection) -> Window | str:
+def find_window(
+    segment: RecordingSegment, declarations: Declarations, selection: Selection
+) -> ChunkWindow | str:
     """Locate the selected part, or return the reason why the index cannot be used."""
     summary = segment.summary
     if summary is None or not len(summary.chunks):
@@ -121,10 +123,10 @@ def find_window(segment: Segment, declarations: Declarations, selection: Selecti
         if not (_is_rising(chunks.start) and _is_rising(chunks.end)):
             return "its index of chunks has no checksum, and is not in order of time"
         is_asked = _with_neighbours(is_asked)
-    return Window(chunks, is_asked, segment.begin, segment.end)
+    return ChunkWindow(chunks, is_asked, segment.begin, segment.end)
 
 
-def _doubt(segment: Segment, summary: Summary) -> str:
+def _doubt(segment: RecordingSegment, summary: Summary) -> str:
     """Return the problem of the index; empty for none."""
     statistics, chunks = summary.statistics, summary.chunks
     if statistics is None or not summary.counts_channels:

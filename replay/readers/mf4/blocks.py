@@ -70,7 +70,7 @@ class Conversion:
 
 
 @dataclass(frozen=True, slots=True)
-class Channel:
+class Mf4Channel:
     """A channel of a group; offsets count within the record, after the record identifier."""
 
     name: str
@@ -89,7 +89,7 @@ class Channel:
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class ChannelGroup:
     """A channel group.
 
     Attributes:
@@ -109,7 +109,7 @@ class Group:
     flags: int
     value_bytes: int
     invalid_bytes: int
-    channels: tuple[Channel, ...]
+    channels: tuple[Mf4Channel, ...]
     at: int = 0
 
     @property
@@ -124,11 +124,11 @@ class DataGroup:
 
     id_bytes: int
     data: int
-    groups: tuple[Group, ...]
+    groups: tuple[ChannelGroup, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
+class StoredPart:
     """A stored part of a data stream.
 
     Attributes:
@@ -255,7 +255,7 @@ class Blocks:
             )
             yield DataGroup(block.body[0], block.links[2], groups)
 
-    def stretches(self, link: int, unfinished: int) -> Iterator[Stretch]:
+    def stretches(self, link: int, unfinished: int) -> Iterator[StoredPart]:
         """Yield the stretches of a data link in order, by reading only their headers.
 
         Args:
@@ -315,7 +315,7 @@ class Blocks:
                 return
             yield at
 
-    def _stretch(self, at: int, start: int, is_open: bool) -> Iterator[Stretch]:
+    def _stretch(self, at: int, start: int, is_open: bool) -> Iterator[StoredPart]:
         kind, length, count = self._head(at)
         if kind == b"##DZ":
             yield self._compressed(at, start)
@@ -326,16 +326,16 @@ class Blocks:
         end = self._following(at) if is_open else at + length
         there = max(min(end, self.size) - content, 0)
         if there:
-            yield Stretch(start, there, content, there)
+            yield StoredPart(start, there, content, there)
         if content + there < end:
             damage = f"data block at byte {at} is cut by the file's end"
-            yield Stretch(start + there, end - content - there, content, 0, damage=damage)
+            yield StoredPart(start + there, end - content - there, content, 0, damage=damage)
 
     def _following(self, at: int) -> int:
         """Return the start of the next linked block, or the file's end."""
         return min((link for link in self._linked if link > at), default=self.size)
 
-    def _compressed(self, at: int, start: int) -> Stretch:
+    def _compressed(self, at: int, start: int) -> StoredPart:
         _, length, _ = self._head(at)
         head = self._near(at + HEAD_BYTES, 24)
         if len(head) < 24:
@@ -349,7 +349,7 @@ class Blocks:
             )
         if length < HEAD_BYTES + 24 + stored:
             raise BrokenBlockError(f"compressed block at byte {at} has impossible sizes")
-        return Stretch(start, original, at + HEAD_BYTES + 24, stored, method, parameter)
+        return StoredPart(start, original, at + HEAD_BYTES + 24, stored, method, parameter)
 
     def _head(self, at: int) -> tuple[bytes, int, int]:
         if at % 2 or at + HEAD_BYTES > self.size:
@@ -392,7 +392,7 @@ class Blocks:
             return True  # reading the data reports the damage
         return kind not in _DATA or length != HEAD_BYTES
 
-    def _group(self, block: RawBlock, at: int, may_hold: bool) -> Group:
+    def _group(self, block: RawBlock, at: int, may_hold: bool) -> ChannelGroup:
         record_id, records, flags, _, value_bytes, invalid_bytes = struct.unpack_from(
             "<QQHH4xLL", block.body
         )
@@ -401,9 +401,11 @@ class Blocks:
         name = self._text(block.links[2]) or self._source(block.links[3])
         is_needed = may_hold or records or not value_bytes
         channels = tuple(self._channels(block.links[1], depth=0)) if is_needed else ()
-        return Group(name, record_id, records, flags, value_bytes, invalid_bytes, channels, at)
+        return ChannelGroup(
+            name, record_id, records, flags, value_bytes, invalid_bytes, channels, at
+        )
 
-    def _channels(self, first: int, depth: int) -> Iterator[Channel]:
+    def _channels(self, first: int, depth: int) -> Iterator[Mf4Channel]:
         for block in self._chain(first, b"##CN", 8, 24):
             links = block.links
             type_, sync, data_type, bit_offset, byte_offset, bits, flags, invalid = (
@@ -411,7 +413,7 @@ class Blocks:
             )
             part_kind = self._head(links[1])[0] if links[1] else b""
             conversion = self._conversion(links[4])
-            yield Channel(
+            yield Mf4Channel(
                 self._text(links[2]),
                 type_,
                 sync,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import DATA, ERROR, REMOTE, Bytes, CanFrames, Int64s
 from crosscue.replay.readers.can_rows import FD_LENGTHS, IS_FD_LENGTH, FrameRows
 
-from .blocks import VARIABLE, VARIABLE_COMPACT, Channel, Group
+from .blocks import VARIABLE, VARIABLE_COMPACT, ChannelGroup, Mf4Channel
 from .records import Records
 from .values import Words, invalid, is_applied, is_numeric, is_plain, physical, raw
 from .variable import VariableValues
@@ -30,7 +30,7 @@ _VALID_PARTS: Final = ("", "ID", "DataBytes", "DataLength")
 _NUMBER: Final = re.compile(r"CAN[ _-]*(\d+)", re.IGNORECASE)
 
 
-def can_layout(group: Group) -> CanLayout | None:
+def can_layout(group: ChannelGroup) -> CanLayout | None:
     """Return the layout of CAN frames in ``group``; None if it has no CAN frames."""
     for name, kind in _KINDS.items():
         parts = {
@@ -44,7 +44,7 @@ def can_layout(group: Group) -> CanLayout | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FrameBatch:
     """Frames of some records, and the number of records without a frame.
 
     Attributes:
@@ -67,7 +67,7 @@ class CanLayout:
         variable: Channel of the payloads, if they have variable length.
     """
 
-    def __init__(self, group: Group, kind: int, parts: Mapping[str, Channel]) -> None:
+    def __init__(self, group: ChannelGroup, kind: int, parts: Mapping[str, Mf4Channel]) -> None:
         self._group, self._kind, self._parts = group, kind, parts
         self._numbers = {
             name: one for name, one in parts.items() if is_numeric(one, group.value_bytes)
@@ -109,7 +109,7 @@ class CanLayout:
 
     def frames(
         self, records: Records, words: Words, log_ns: Int64s, values: VariableValues | None
-    ) -> Found:
+    ) -> FrameBatch:
         """Parse the records into frames."""
         identifier = self._values("ID", words, 0)
         number = identifier & 0x1FFFFFFF
@@ -151,15 +151,17 @@ class CanLayout:
         ok: NDArray[np.bool_],
         whole: NDArray[np.bool_],
         marked: NDArray[np.bool_] | None,
-    ) -> Found:
+    ) -> FrameBatch:
         is_valid = ok & whole if marked is None else ok & whole & ~marked
         if bool(is_valid.all()):
-            return Found(rows, 0, 0, 0)
+            return FrameBatch(rows, 0, 0, 0)
         invalid_count = 0 if marked is None else int(np.count_nonzero(marked))
         if marked is not None:
             ok, whole = ok | marked, whole | marked
         unreadable = int(np.count_nonzero(ok & ~whole))
-        return Found(rows.take(is_valid), int(np.count_nonzero(~ok)), unreadable, invalid_count)
+        return FrameBatch(
+            rows.take(is_valid), int(np.count_nonzero(~ok)), unreadable, invalid_count
+        )
 
     def _marked(self, words: Words) -> NDArray[np.bool_] | None:
         """Return a mask of the records marked as invalid by the logger; None for none."""

@@ -31,7 +31,7 @@ from crosscue.replay.readers.can_rows import (
     bus_topic,
     in_time,
     keep_memory,
-    merged,
+    merge_rows,
     merged_by_time,
 )
 from crosscue.replay.seal.touched import Touched
@@ -46,13 +46,13 @@ from .blocks import (
     VLSD_GROUP,
     Blocks,
     BrokenBlockError,
-    Channel,
+    ChannelGroup,
     DataGroup,
-    Group,
+    Mf4Channel,
 )
 from .frames import CanLayout, can_layout
 from .records import LAST_CUT, Records, UnsortedData, Walked, sorted_records
-from .stream import Stream
+from .stream import LinkedData
 from .values import Words, invalid, is_applied, is_numeric, physical, raw, times_ns
 from .variable import GroupValues, StoredValues, VariableValues
 
@@ -72,8 +72,8 @@ class _Source:
     """
 
     index: int
-    group: Group
-    master: Channel | None
+    group: ChannelGroup
+    master: Mf4Channel | None
     can: CanLayout | None
     topic: str
     refusal: str
@@ -103,7 +103,7 @@ class _Stored:
         values: Payloads of a source that are not in its records, by the source's index.
     """
 
-    stream: Stream
+    stream: LinkedData
     unsorted: UnsortedData | None
     sources: tuple[_Source, ...]
     values: Mapping[int, VariableValues]
@@ -251,7 +251,7 @@ class Mf4Log(Closing):
                 else:
                     frames.append(self._frames(stored, source, data.rows(k, source.index), ledger))
             if frames:
-                yield from self._handed_on(merged(frames), ledger, selection)
+                yield from self._handed_on(merge_rows(frames), ledger, selection)
         if last is not None and last.damage:
             self._drop_rest(stored, last, accounts, ledger)
 
@@ -533,7 +533,7 @@ class Mf4Log(Closing):
         names: dict[str, NDArray[np.generic]] = {}
         try:
             for data in self._blocks.data_groups(self._header.first_group, self._header.unfinished):
-                stream = Stream(self._blocks, data.data, self._header.unfinished)
+                stream = LinkedData(self._blocks, data.data, self._header.unfinished)
                 unsorted = None
                 if data.id_bytes:
                     unsorted = UnsortedData(stream, data, self._limits.message_bytes)
@@ -548,27 +548,31 @@ class Mf4Log(Closing):
             self._broken = str(broken)
 
     def _values(
-        self, channel: Channel, data: DataGroup, unsorted: UnsortedData | None
+        self, channel: Mf4Channel, data: DataGroup, unsorted: UnsortedData | None
     ) -> VariableValues:
         for k, group in enumerate(data.groups):
             if unsorted and group.flags & VLSD_GROUP and group.at == channel.data:
                 by_order = bool(self._header.unfinished & VARIABLE_OFFSETS)
                 return GroupValues(unsorted, k, by_order)
-        return StoredValues(Stream(self._blocks, channel.data, self._header.unfinished))
+        return StoredValues(LinkedData(self._blocks, channel.data, self._header.unfinished))
 
     def _sources_of(
-        self, data: DataGroup, stream: Stream, names: dict[str, NDArray[np.generic]]
+        self, data: DataGroup, stream: LinkedData, names: dict[str, NDArray[np.generic]]
     ) -> Iterator[_Source]:
         for k, group in enumerate(data.groups):
             is_empty = stream.size < group.record_bytes + data.id_bytes and not stream.broken
             if not group.flags & VLSD_GROUP and (self._declared(group) or not is_empty):
                 yield self._source(k, data, group, names)
 
-    def _declared(self, group: Group) -> int | None:
+    def _declared(self, group: ChannelGroup) -> int | None:
         return None if self._header.unfinished & CYCLE_COUNTERS else group.records
 
     def _source(
-        self, index: int, data: DataGroup, group: Group, names: dict[str, NDArray[np.generic]]
+        self,
+        index: int,
+        data: DataGroup,
+        group: ChannelGroup,
+        names: dict[str, NDArray[np.generic]],
     ) -> _Source:
         masters = [c for c in group.channels if c.type in (MASTER, VIRTUAL_MASTER)]
         master = next((c for c in masters if c.sync == TIME), None)
@@ -621,7 +625,7 @@ def _settle(source: _Source, account: _Account, ledger: Ledger) -> None:
         ledger.notice(f"{name}: {source.declared} records declared, {account.met} in the file")
 
 
-def _refusal(group: Group, master: Channel | None, can: CanLayout | None) -> str:
+def _refusal(group: ChannelGroup, master: Mf4Channel | None, can: CanLayout | None) -> str:
     """Return the reason why a group cannot be read; empty if it can."""
     if group.flags & REMOTE_MASTER:
         return "column-oriented storage, not supported"
@@ -638,7 +642,7 @@ def _refusal(group: Group, master: Channel | None, can: CanLayout | None) -> str
     return can.refusal
 
 
-def _is_column(channel: Channel, group: Group) -> bool:
+def _is_column(channel: Mf4Channel, group: ChannelGroup) -> bool:
     return not channel.is_array and is_numeric(channel, group.value_bytes)
 
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import BLOCK_ROWS, Bytes, Int64s
 
-from .blocks import VLSD_GROUP, DataGroup, Group
-from .stream import Stream
+from .blocks import VLSD_GROUP, ChannelGroup, DataGroup
+from .stream import LinkedData
 
 _WALK_BYTES: Final = 1 << 20
 # Number of parsed pieces kept in memory, because values are close to their records.
@@ -60,7 +60,7 @@ _NO_PLACE: Final = np.zeros(0, np.int64)
 
 
 def sorted_records(
-    stream: Stream, group: Group, first: int = 0, stop: int | None = None
+    stream: LinkedData, group: ChannelGroup, first: int = 0, stop: int | None = None
 ) -> Iterator[Records]:
     """Yield the records ``first`` to ``stop`` of a group with a separate data stream."""
     size = group.record_bytes
@@ -152,7 +152,7 @@ class UnsortedData:
     to them can thus be found in bounded memory.
     """
 
-    def __init__(self, stream: Stream, data: DataGroup, max_record: int) -> None:
+    def __init__(self, stream: LinkedData, data: DataGroup, max_record: int) -> None:
         """Prepare a stream for parsing.
 
         Args:

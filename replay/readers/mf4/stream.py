@@ -9,7 +9,7 @@ from typing import Final, cast
 import numpy as np
 from isal import isal_zlib
 
-from .blocks import Blocks, BrokenBlockError, Stretch
+from .blocks import Blocks, BrokenBlockError, StoredPart
 
 _DAMAGED: Final = cast("type[Exception]", isal_zlib.error)
 # Number of decompressed blocks kept, because a record may extend over two blocks.
@@ -24,7 +24,7 @@ class Hole:
     damage: str
 
 
-class Stream:
+class LinkedData:
     """All bytes of one data link, independent of their division into blocks.
 
     Attributes:
@@ -35,7 +35,7 @@ class Stream:
     def __init__(self, blocks: Blocks, link: int, unfinished: int) -> None:
         """Find the blocks by reading their headers."""
         self._blocks = blocks
-        self._stretches: list[Stretch] = []
+        self._stretches: list[StoredPart] = []
         self.broken = ""
         try:
             self._stretches.extend(
@@ -107,7 +107,7 @@ class Stream:
         return self._inflated[k]
 
 
-def _inflated(one: Stretch, stored: bytes) -> tuple[bytes, str]:
+def _inflated(one: StoredPart, stored: bytes) -> tuple[bytes, str]:
     """Decompress a block; return its content, or empty bytes and the problem."""
     if one.method not in (0, 1):
         return b"", f"has the unknown method {one.method}"

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .blocks import VIRTUAL, VIRTUAL_MASTER, Channel, Conversion
+from .blocks import VIRTUAL, VIRTUAL_MASTER, Conversion, Mf4Channel
 
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 ALL_INVALID = 1
 HAS_INVALID_BIT = 2
 
 
-def is_numeric(channel: Channel, value_bytes: int) -> bool:
+def is_numeric(channel: Mf4Channel, value_bytes: int) -> bool:
     """Return whether ``raw`` supports a channel."""
     if channel.type in (VIRTUAL_MASTER, VIRTUAL):
         return True
@@ -23,7 +23,7 @@ def is_numeric(channel: Channel, value_bytes: int) -> bool:
     return channel.data_type <= 3 and channel.bit_count > 0 and fits
 
 
-def is_plain(channel: Channel) -> bool:
+def is_plain(channel: Mf4Channel) -> bool:
     """Return whether a channel's raw value is an unsigned little-endian number in the record."""
     return channel.type not in (VIRTUAL_MASTER, VIRTUAL) and channel.data_type == 0
 
@@ -71,7 +71,7 @@ class Words:
         return view.astype(np.uint64)  # a copy, which is aligned
 
 
-def raw(channel: Channel, words: Words) -> NDArray[np.generic]:
+def raw(channel: Mf4Channel, words: Words) -> NDArray[np.generic]:
     """Return the stored values of a numeric channel; the record's index for a virtual channel."""
     if channel.type in (VIRTUAL_MASTER, VIRTUAL):
         return np.arange(words.first, words.first + len(words), dtype=np.int64)
@@ -148,7 +148,7 @@ def is_applied(conversion: Conversion) -> bool:
 
 
 def invalid(
-    channel: Channel, records: NDArray[np.uint8], value_bytes: int
+    channel: Mf4Channel, records: NDArray[np.uint8], value_bytes: int
 ) -> NDArray[np.bool_] | None:
     """Return a mask of the values marked as invalid by the recorder; None for none."""
     if channel.flags & ALL_INVALID:
@@ -160,7 +160,7 @@ def invalid(
     return marked if bool(marked.any()) else None
 
 
-def times_ns(channel: Channel, values: NDArray[np.generic]) -> NDArray[np.int64] | None:
+def times_ns(channel: Mf4Channel, values: NDArray[np.generic]) -> NDArray[np.int64] | None:
     """Convert master values to nanoseconds since the start, exactly if stored as integer steps.
 
     Returns:

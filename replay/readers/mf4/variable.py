@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .records import UnsortedData
-from .stream import Stream
+from .stream import LinkedData
 
 Bytes: TypeAlias = NDArray[np.uint8]
 Int64s: TypeAlias = NDArray[np.int64]
@@ -40,7 +40,7 @@ class VariableValues(Protocol):
 class StoredValues:
     """Values in a separate data block, each after its length, found by their offsets."""
 
-    def __init__(self, stream: Stream) -> None:
+    def __init__(self, stream: LinkedData) -> None:
         self._stream = stream
 
     def fetch(self, key: Int64s, first: int, width: int) -> tuple[Bytes, Int64s]:

@@ -15,16 +15,16 @@ from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mixed import MixedRows, blocks_of
 
-from .chunk import CUT, TOO_LARGE, ChunkRows, Inflated, inflate, read_chunk
-from .index import ChunkUnit, Contents, Gap, units
+from .chunk import CUT, TOO_LARGE, ChunkRows, Inflated, inflate_records, read_chunk
+from .index import BytesBetween, ChunkUnit, Contents, units
 from .records import (
     CHUNK_INFO,
     CONNECTION,
     MESSAGE,
     BagFile,
+    BagRecord,
     ChunkInfo,
     Connection,
-    Record,
     connection_of,
     tally,
 )
@@ -254,14 +254,16 @@ class Pass:
             self._checked.left += 1
             self._pass_over(info, self._selection)
 
-    def _taken(self, found: Iterator[ChunkUnit | Record | Gap], index_at: int) -> Iterator[Block]:
+    def _taken(
+        self, found: Iterator[ChunkUnit | BagRecord | BytesBetween], index_at: int
+    ) -> Iterator[Block]:
         for unit in found:
             taken = None
-            if not isinstance(unit, Record):
+            if not isinstance(unit, BagRecord):
                 self._settle_owed()
             if isinstance(unit, ChunkUnit):
                 taken = self._chunk(unit)
-            elif isinstance(unit, Gap):
+            elif isinstance(unit, BytesBetween):
                 self._doubt = self._doubt or f"bytes {unit.at} to {unit.stop} are damaged"
                 self._gap(unit, index_at)
             else:
@@ -280,7 +282,7 @@ class Pass:
             reason = NOT_ASKED_TIME if asked.wants(name) else NOT_ASKED_TOPIC
             self._ledger.skip(name, reason, count)
 
-    def _record(self, record: Record) -> tuple[bytes, ChunkRows] | None:
+    def _record(self, record: BagRecord) -> tuple[bytes, ChunkRows] | None:
         """Process a record outside chunks; return a message as a separate chunk."""
         if record.op == MESSAGE:
             self._checked.loose += 1
@@ -337,7 +339,7 @@ class Pass:
                 f"as {connection.published}: renamed, or damaged"
             )
 
-    def _gap(self, gap: Gap, index_at: int) -> None:
+    def _gap(self, gap: BytesBetween, index_at: int) -> None:
         where = f"bytes {gap.at} to {gap.stop}"
         within = [info for at, info in self._contents.infos.items() if gap.at <= at < gap.stop]
         if (
@@ -384,7 +386,7 @@ class Pass:
             return None
         stop = min(unit.stored_stop, unit.record.body + self._limits.chunk_bytes)
         stored = self._file.bytes_at(unit.record.body, stop)
-        inflated = inflate(unit.record.fields[b"compression"], stored, size, unit.is_framed)
+        inflated = inflate_records(unit.record.fields[b"compression"], stored, size, unit.is_framed)
         limits = self._limits
         rows = read_chunk(inflated, unit.entries, limits.schema_bytes, limits.records_per_chunk)
         for connection in rows.connections:

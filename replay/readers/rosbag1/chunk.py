@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from .records import (
     CONNECTION,
     MESSAGE,
+    BagRecord,
     Connection,
     Entries,
-    Record,
     connection_of,
-    kind_of,
     parse_fields,
     record_at,
+    record_kind,
     tally,
     time_ns,
 )
@@ -70,7 +70,7 @@ class Inflated:
     unused: int = 0
 
 
-def inflate(compression: bytes, stored: bytes, size: int, is_framed: bool) -> Inflated:
+def inflate_records(compression: bytes, stored: bytes, size: int, is_framed: bool) -> Inflated:
     """Decompress at most ``size`` bytes of a chunk's records.
 
     Args:
@@ -172,7 +172,7 @@ def _layout_of(head: bytes) -> _Layout | None:
     if len(head) < _HEAD or _U32.unpack_from(head, 0)[0] != _HEADER:
         return None
     header = head[4 : 4 + _HEADER]
-    if kind_of(parse_fields(header)) != MESSAGE:
+    if record_kind(parse_fields(header)) != MESSAGE:
         return None
     places: dict[bytes, int] = {}
     at = 4
@@ -446,7 +446,7 @@ def _is_consecutive(raw: bytes, at: int, known: set[int], near_ns: int | None) -
     return True
 
 
-def _is_confirmed(raw: bytes, entries: Entries, i: int) -> Record | None:
+def _is_confirmed(raw: bytes, entries: Entries, i: int) -> BagRecord | None:
     record = record_at(memoryview(raw), int(entries.offset[i]))
     if record is None or record.op != MESSAGE or record.end > len(raw):
         return None

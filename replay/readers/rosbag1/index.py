@@ -8,7 +8,7 @@ from typing import Final
 
 from crosscue.replay.limits import Limits
 
-from .chunk import inflate, read_chunk
+from .chunk import inflate_records, read_chunk
 from .records import (
     CHUNK,
     CHUNK_INFO,
@@ -16,16 +16,16 @@ from .records import (
     INDEX,
     AheadBagFile,
     BagFile,
+    BagRecord,
     ChunkInfo,
     Connection,
     Entries,
-    Record,
     chunk_info_of,
     connection_of,
-    entries_of,
+    join_index_records,
     record_at,
 )
-from .resync import Resync
+from .resync import BagResync
 
 ENTRY_BYTES: Final = 12
 _SEARCHED_AT_ONCE: Final = 4 << 20
@@ -45,7 +45,7 @@ class ChunkUnit:
         entries: Index records, or None if they are missing or damaged.
     """
 
-    record: Record
+    record: BagRecord
     stored_stop: int
     is_framed: bool
     end: int
@@ -53,7 +53,7 @@ class ChunkUnit:
 
 
 @dataclass(frozen=True, slots=True)
-class Gap:
+class BytesBetween:
     """Bytes that are not a record.
 
     Attributes:
@@ -89,13 +89,13 @@ def read_index(file: BagFile, index_at: int, largest: int) -> Contents | None:
     file = AheadBagFile(file.fd, file.size, file)
     while at < file.size:
         record = file.whole_record(at)
-        if record is None or not learn(file, record, contents, largest):
+        if record is None or not add_index_record(file, record, contents, largest):
             return None
         at = record.end
     return contents if at == file.size else None
 
 
-def learn(file: BagFile, record: Record, contents: Contents, largest: int) -> bool:
+def add_index_record(file: BagFile, record: BagRecord, contents: Contents, largest: int) -> bool:
     """Add a connection or chunk info record; return False for other or damaged records."""
     if record.size > 2 * largest:
         return False
@@ -111,7 +111,7 @@ def learn(file: BagFile, record: Record, contents: Contents, largest: int) -> bo
 
 def units(
     file: BagFile, first: int, known: list[int], limits: Limits, connections: Collection[int]
-) -> Iterator[ChunkUnit | Record | Gap]:
+) -> Iterator[ChunkUnit | BagRecord | BytesBetween]:
     """Yield the file's contents in order: chunks with their index, other records, gaps.
 
     Args:
@@ -121,7 +121,7 @@ def units(
         limits: Limits on the size of an index.
         connections: Numbers of the connections known so far; may be extended later.
     """
-    at, resync = first, Resync(file, known, connections)
+    at, resync = first, BagResync(file, known, connections)
     while at < file.size:
         record = file.record(at)
         if record is not None and record.op == CHUNK:
@@ -134,12 +134,12 @@ def units(
         else:
             after = resync.next(at + 1)
             stop = file.size if after is None else after
-            yield Gap(at, stop)
+            yield BytesBetween(at, stop)
             at = stop
 
 
 def _chunk_unit(
-    file: BagFile, record: Record, known: list[int], limits: Limits, resync: Resync
+    file: BagFile, record: BagRecord, known: list[int], limits: Limits, resync: BagResync
 ) -> ChunkUnit:
     is_plain = record.fields[b"compression"] == b"none"
     ends = [record.end, record.body + record.u32(b"size")] if is_plain else [record.end]
@@ -172,7 +172,7 @@ def _index_records(file: BagFile, at: int, limits: Limits) -> tuple[Entries | No
         else:
             is_sound = False
         at = record.end
-    return (entries_of(parts) if is_sound and parts else None), at
+    return (join_index_records(parts) if is_sound and parts else None), at
 
 
 def next_chunk(file: BagFile, at: int, known: list[int]) -> int | None:
@@ -204,7 +204,7 @@ def _heads_chunk(window: bytes, start: int, op_at: int) -> bool:
     return record is not None and record.op == CHUNK
 
 
-def walk(file: BagFile, first: int, limits: Limits) -> Contents:
+def scan_records(file: BagFile, first: int, limits: Limits) -> Contents:
     """Collect the contents without an index section; decompress only for new connections."""
     contents = Contents()
     chunks: set[int] = set()
@@ -219,11 +219,11 @@ def walk(file: BagFile, first: int, limits: Limits) -> Contents:
                 contents.connections.keys()
             ):
                 _learn_from_chunk(file, unit, contents, limits)
-        elif isinstance(unit, Gap):
+        elif isinstance(unit, BytesBetween):
             is_whole = False
             contents.gaps.append((unit.at, unit.stop))
         elif unit.op in (CONNECTION, CHUNK_INFO):
-            is_whole &= learn(file, unit, contents, limits.schema_bytes)
+            is_whole &= add_index_record(file, unit, contents, limits.schema_bytes)
     contents.is_complete = is_whole and bool(chunks) and chunks == contents.infos.keys()
     return contents
 
@@ -233,7 +233,7 @@ def _learn_from_chunk(file: BagFile, unit: ChunkUnit, contents: Contents, limits
     if size > limits.chunk_bytes or unit.record.size > limits.chunk_bytes:
         return
     stored = file.bytes_at(unit.record.body, unit.stored_stop)
-    inflated = inflate(unit.record.fields[b"compression"], stored, size, unit.is_framed)
+    inflated = inflate_records(unit.record.fields[b"compression"], stored, size, unit.is_framed)
     rows = read_chunk(inflated, unit.entries, limits.schema_bytes, limits.records_per_chunk)
     for connection in rows.connections:
         contents.connections.setdefault(connection.conn, connection)

@@ -22,8 +22,8 @@ from crosscue.replay.seal.touched import Touched
 
 from .bag_pass import DAMAGED_RECORD, Pass, Roster
 from .chunk import CUT
-from .index import Contents, read_index, walk
-from .records import BAG_HEADER, MAGIC, BagFile, RangedBagFile, Record
+from .index import Contents, read_index, scan_records
+from .records import BAG_HEADER, MAGIC, BagFile, BagRecord, RangedBagFile
 from .window import find_bag_window
 
 
@@ -124,7 +124,7 @@ class BagLog(Closing):
         if fd >= 0:
             os.close(fd)
 
-    def _bag_header(self) -> tuple[int, Record | None]:
+    def _bag_header(self) -> tuple[int, BagRecord | None]:
         """Return the offset of the first record, and the bag header if it can be read."""
         start = self._file.bytes_at(0, len(MAGIC))
         if start != MAGIC:
@@ -144,7 +144,7 @@ class BagLog(Closing):
             )
         return record.end, record
 
-    def _learn(self, header: Record | None) -> Contents:
+    def _learn(self, header: BagRecord | None) -> Contents:
         self._chunk_count = header.u32(b"chunk_count") if header is not None else -1
         self._index_at = header.u64(b"index_pos") if header is not None else 0
         largest = self._limits.schema_bytes
@@ -153,7 +153,7 @@ class BagLog(Closing):
             if contents is not None and (contents.connections or self._index_at == self._first):
                 self._compare_counts(header, contents)
                 return contents
-        contents = walk(self._file, self._first, self._limits)
+        contents = scan_records(self._file, self._first, self._limits)
         self._say_why_walked(header, contents)
         if not contents.connections and header is None:
             raise LogFormatError(
@@ -161,7 +161,7 @@ class BagLog(Closing):
             )
         return contents
 
-    def _compare_counts(self, header: Record | None, contents: Contents) -> None:
+    def _compare_counts(self, header: BagRecord | None, contents: Contents) -> None:
         if header is None:
             return
         for name, held in (("conn", contents.connections), ("chunk", contents.infos)):
@@ -172,7 +172,7 @@ class BagLog(Closing):
                     "the index was used"
                 )
 
-    def _say_why_walked(self, header: Record | None, contents: Contents) -> None:
+    def _say_why_walked(self, header: BagRecord | None, contents: Contents) -> None:
         if header is None:
             return
         if self._index_at == 0:
@@ -198,7 +198,7 @@ def open_bag(path: Path, limits: Limits = DEFAULT_LIMITS) -> BagLog:
     return BagLog(path, limits)
 
 
-def open_ranged(name: Path, ranged: RangedFile, limits: Limits) -> BagLog | None:
+def open_remote_bag(name: Path, ranged: RangedFile, limits: Limits) -> BagLog | None:
     """Open a remote bag by its index section; None if the index is unusable.
 
     Args:

@@ -46,7 +46,7 @@ _NEEDED: Final[dict[int, dict[bytes, int | None]]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class BagRecord:
     """The header of a record, and the position of its body.
 
     Attributes:
@@ -102,7 +102,7 @@ def parse_fields(header: bytes) -> dict[bytes, bytes] | None:
     return fields
 
 
-def kind_of(fields: dict[bytes, bytes] | None) -> int | None:
+def record_kind(fields: dict[bytes, bytes] | None) -> int | None:
     """Return the kind of a record with these header fields; None if they are invalid."""
     if fields is None or len(fields.get(b"op", b"")) != 1:
         return None
@@ -116,7 +116,7 @@ def kind_of(fields: dict[bytes, bytes] | None) -> int | None:
     return op
 
 
-def record_at(source: bytes | memoryview, at: int, base: int = 0) -> Record | None:
+def record_at(source: bytes | memoryview, at: int, base: int = 0) -> BagRecord | None:
     """Parse the record at ``at`` of ``source``; None if its header is invalid.
 
     The body may extend beyond ``source``.
@@ -132,11 +132,11 @@ def record_at(source: bytes | memoryview, at: int, base: int = 0) -> Record | No
     if body > len(source) or body - at > HEADER_BYTES:
         return None
     fields = parse_fields(bytes(source[at + 4 : body - 4]))
-    op = kind_of(fields)
+    op = record_kind(fields)
     if op is None or fields is None:
         return None
     size = int(_U32.unpack_from(source, body - 4)[0])
-    return Record(base + at, op, fields, base + body, size)
+    return BagRecord(base + at, op, fields, base + body, size)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,7 +167,7 @@ class BagFile:
     def expect(self, ranges: Sequence[tuple[int, int]]) -> None:
         """Announce sorted ranges that are going to be read; a local file ignores them."""
 
-    def record(self, at: int) -> Record | None:
+    def record(self, at: int) -> BagRecord | None:
         """Read the record at byte ``at``; None if it is invalid or does not fit into the file."""
         look = self.bytes_at(at, at + _FIRST_LOOK)
         if len(look) >= 4:
@@ -176,7 +176,7 @@ class BagFile:
                 look = self.bytes_at(at, at + header + 8)
         return record_at(look, 0, at)
 
-    def whole_record(self, at: int) -> Record | None:
+    def whole_record(self, at: int) -> BagRecord | None:
         """Read the record at byte ``at``; None unless its complete body is in the file."""
         record = self.record(at)
         return record if record is not None and record.end <= self.size else None
@@ -242,7 +242,7 @@ class Connection:
     published: str
 
 
-def connection_of(record: Record, body: bytes, largest: int) -> Connection | None:
+def connection_of(record: BagRecord, body: bytes, largest: int) -> Connection | None:
     """Parse a connection record; None if its body is damaged or exceeds ``largest`` bytes."""
     fields = parse_fields(body)
     if fields is None or not {b"type", b"message_definition"} <= fields.keys():
@@ -281,7 +281,7 @@ class ChunkInfo:
     counts: dict[int, int]
 
 
-def chunk_info_of(record: Record, body: bytes) -> ChunkInfo | None:
+def chunk_info_of(record: BagRecord, body: bytes) -> ChunkInfo | None:
     """Parse a chunk info record; None if its body contradicts its header."""
     if record.u32(b"ver") != 1 or len(body) != 8 * record.u32(b"count"):
         return None
@@ -328,7 +328,7 @@ def tally(conn: NDArray[np.int64]) -> dict[int, int]:
 _ENTRY: Final = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
 
 
-def entries_of(parts: list[tuple[int, bytes]]) -> Entries:
+def join_index_records(parts: list[tuple[int, bytes]]) -> Entries:
     """Join index records, passed as connection and body."""
     tables: list[NDArray[np.void]] = [np.frombuffer(body, dtype=_ENTRY) for _, body in parts]
     joined = np.concatenate(tables) if tables else np.empty(0, dtype=_ENTRY)

@@ -19,7 +19,7 @@ from .records import (
     INDEX,
     MESSAGE,
     BagFile,
-    Record,
+    BagRecord,
     record_at,
 )
 
@@ -37,7 +37,7 @@ _FIELD: Final = re.compile(
 )
 
 
-class Resync:
+class BagResync:
     """Checks records outside chunks, and finds the next records after damage."""
 
     def __init__(self, file: BagFile, known: Sequence[int], connections: Collection[int]) -> None:
@@ -54,7 +54,7 @@ class Resync:
         self._connections = connections
         self._near_ns: int | None = None
 
-    def is_believed(self, record: Record) -> bool:
+    def is_believed(self, record: BagRecord) -> bool:
         """Return whether the length of a record outside chunks is confirmed."""
         if record.end > self._file.size:
             return False
@@ -112,7 +112,7 @@ class Resync:
             at = record.end
         return True
 
-    def _is_plausible(self, record: Record, near_ns: int | None) -> bool:
+    def _is_plausible(self, record: BagRecord, near_ns: int | None) -> bool:
         if record.op == INDEX:
             return record.u32(b"ver") == 1 and record.size == 12 * record.u32(b"count")
         if record.op == CHUNK_INFO:

@@ -15,8 +15,8 @@ from itertools import pairwise
 from crosscue.replay.base import Selection
 from crosscue.replay.limits import Limits
 
-from .index import ChunkUnit, Contents, Gap, units
-from .records import BagFile, ChunkInfo, Record
+from .index import BytesBetween, ChunkUnit, Contents, units
+from .records import BagFile, BagRecord, ChunkInfo
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +52,14 @@ class BagWindow:
         connections: Collection[int],
         *,
         is_read: bool = True,
-    ) -> Iterator[ChunkUnit | Record | Gap]:
+    ) -> Iterator[ChunkUnit | BagRecord | BytesBetween]:
         """Yield the units of the chunks that are read, or of the others, in stored order."""
         known = [info.at for info in self.infos]
         after = dict(pairwise([*known, self.index_at]))
         for info in self._those(is_read=is_read):
             for unit in units(file, info.at, known, limits, connections):
                 yield unit
-                end = unit.stop if isinstance(unit, Gap) else unit.end
+                end = unit.stop if isinstance(unit, BytesBetween) else unit.end
                 if end >= after[info.at]:
                     break
 

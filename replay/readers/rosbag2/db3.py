@@ -26,7 +26,7 @@ from .inflate import DAMAGED, inflated
 from .pages import page_rows
 from .rows import FIRST_ROWID, LAST_ROWID, Row, RowColumns, RowScan, index_times
 from .sqlite import FAULTS, Database, open_database
-from .tables import Tables, fetched, read_tables
+from .tables import StorageTables, fetched, read_storage_tables
 
 DAMAGED_PAGE: Final = "damaged page in the database"
 DISORDER: Final = "row out of order in a damaged page"
@@ -56,7 +56,7 @@ class Db3Log(Closing):
         self._stamp = _stamp(path)
         self._database = open_database(path, limits)
         try:
-            self._tables = read_tables(self._database, path, limits)
+            self._tables = read_storage_tables(self._database, path, limits)
         except BaseException:
             self.close()
             raise
@@ -109,7 +109,7 @@ class _Pass:
     def __init__(
         self,
         database: Database,
-        tables: Tables,
+        tables: StorageTables,
         limits: Limits,
         ledger: Ledger,
         selection: Selection,

@@ -23,9 +23,9 @@ from crosscue.replay.ledger import DETAILS_KEPT, Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 from .inflate import DAMAGED, inflated
-from .merge import Stream, merged
+from .merge import StorageStream, merge_streams
 from .metadata import SplitHint, read_metadata
-from .split import PACKED, PACKED_DAMAGED, Split, examined, opened, stored_files
+from .split import PACKED, PACKED_DAMAGED, Split, examined, open_storage, stored_files
 
 MISSING: Final = "storage file is missing"
 UNREADABLE: Final = "storage file cannot be opened"
@@ -91,7 +91,7 @@ class FolderLog(Closing):
                     for split, one in zip(group, own, strict=True)
                 ]
                 try:
-                    yield from merged(streams)
+                    yield from merge_streams(streams)
                 finally:
                     for split, one in zip(group, own, strict=True):
                         _absorb(ledger, one, split.path.name)
@@ -117,8 +117,8 @@ class FolderLog(Closing):
 
     def _stream(
         self, split: Split, ledger: Ledger, selection: Selection, stack: ExitStack
-    ) -> Stream:
-        log, fault = stack.enter_context(opened(split.path, self._limits))
+    ) -> StorageStream:
+        log, fault = stack.enter_context(open_storage(split.path, self._limits))
         if fault:
             ledger.drop("", PACKED_DAMAGED, None, fault)
         elif split.path.name.endswith(PACKED):
@@ -128,7 +128,7 @@ class FolderLog(Closing):
             t.name for t in split.topics if t.type_name != self._topics[t.name].type_name
         )
         blocks = self._blocks(log.read(ledger, selection), odd, ledger)
-        return Stream(blocks, names)
+        return StorageStream(blocks, names)
 
     def _blocks(
         self, blocks: Iterator[Block], odd: frozenset[str], ledger: Ledger

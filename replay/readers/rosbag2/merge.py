@@ -20,7 +20,7 @@ _LATEST: Final = 2**63 - 1
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
+class StorageStream:
     """The blocks of one storage file.
 
     Attributes:
@@ -56,7 +56,7 @@ class _Front:
             self.latest_ns = max(self.latest_ns, int(block.log_ns.max()))
 
 
-def merged(streams: Sequence[Stream]) -> Iterator[Block]:
+def merge_streams(streams: Sequence[StorageStream]) -> Iterator[Block]:
     """Yield all blocks; topics that occur in several streams are in order of log time."""
     many = Counter(chain.from_iterable(stream.topics for stream in streams))
     shared = {name for name, count in many.items() if count > 1}

@@ -82,7 +82,7 @@ def examined(path: Path, metadata: Metadata, limits: Limits) -> Split:
     """Open a storage file briefly to find its topics and time range."""
     hint = next((hint for hint in metadata.splits if hint.name == path.name), None)
     try:
-        with opened(path, limits, open_unsealed) as (log, fault):
+        with open_storage(path, limits, open_unsealed) as (log, fault):
             range_ns = log.time_range_ns if isinstance(log, Db3Log) else None
             ledger = Ledger(str(path))
             if fault:
@@ -101,7 +101,7 @@ def _open_part(path: Path, limits: Limits) -> Log:
 
 
 @contextmanager
-def opened(
+def open_storage(
     path: Path, limits: Limits, open_one: Callable[[Path, Limits], Log] = _open_part
 ) -> Iterator[tuple[Log, str]]:
     """Open the log in a storage file; yield it with the problem of its decompression, or empty."""

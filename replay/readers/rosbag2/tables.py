@@ -22,7 +22,7 @@ _DEFINITIONS: Final = frozenset({"topic_type", "encoding", "encoded_message_defi
 
 
 @dataclass(frozen=True, slots=True)
-class Stored:
+class StoredTopic:
     """One row of the topics table."""
 
     number: int
@@ -32,7 +32,7 @@ class Stored:
 
 
 @dataclass(frozen=True, slots=True)
-class Tables:
+class StorageTables:
     """Contents of the tables other than the messages.
 
     Attributes:
@@ -42,7 +42,7 @@ class Tables:
         notices: Remarks on the tables, one sentence each.
     """
 
-    stored: tuple[Stored, ...]
+    stored: tuple[StoredTopic, ...]
     topics: dict[str, Topic]
     index: str | None
     notices: tuple[str, ...]
@@ -74,7 +74,7 @@ class Tables:
         return counts
 
 
-def read_tables(database: Database, path: Path, limits: Limits) -> Tables:
+def read_storage_tables(database: Database, path: Path, limits: Limits) -> StorageTables:
     """Read all tables except the messages.
 
     Raises:
@@ -92,7 +92,7 @@ def read_tables(database: Database, path: Path, limits: Limits) -> Tables:
         index = _time_index(database)
     except FAULTS as error:
         raise LogFormatError(f"{path}: {explained(error)}") from None
-    return Tables(tuple(stored), topics, index, tuple(notices))
+    return StorageTables(tuple(stored), topics, index, tuple(notices))
 
 
 def fetched(database: Database, query: str, values: Sequence[int] = ()) -> list[Any]:
@@ -124,14 +124,14 @@ def _require(database: Database, kinds: dict[str, str], path: Path) -> None:
             )
 
 
-def _stored(database: Database, notices: list[str]) -> list[Stored]:
+def _stored(database: Database, notices: list[str]) -> list[StoredTopic]:
     has_format = "serialization_format" in _columns(database, "topics")
     coding = "serialization_format" if has_format else "'cdr'"
-    stored: list[Stored] = []
+    stored: list[StoredTopic] = []
     query = f"SELECT id, name, type, {coding} FROM topics ORDER BY id"  # noqa: S608
     for number, name, type_name, encoding in fetched(database, query):
         if isinstance(number, int) and isinstance(name, str) and name:
-            stored.append(Stored(number, name, str(type_name or ""), str(encoding or "cdr")))
+            stored.append(StoredTopic(number, name, str(type_name or ""), str(encoding or "cdr")))
         else:
             notices.append(f"the topics table has a row without a name: id {number!r:.40}")
     return stored
@@ -166,7 +166,7 @@ def _definitions(
 
 
 def _topics(
-    stored: list[Stored],
+    stored: list[StoredTopic],
     count: int | None,
     definitions: dict[str, tuple[str, bytes]],
     notices: list[str],

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from .series import WINDOW_S, Grid, Series, Track
+from .series import WINDOW_S, Grid, GroundTrack, Series
 
 DEGREE: Final = math.pi / 180.0
 MAX_SPEED_MPS: Final = 100.0
@@ -58,7 +58,7 @@ class Turning:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class SignalVerdict:
     """Result of the consistency checks of a signal.
 
     Attributes:
@@ -85,7 +85,7 @@ class Verdict:
 
 def judge_speed(
     series: Series, reference: Series | None, grid: Grid, radius_known: bool
-) -> Verdict:
+) -> SignalVerdict:
     """Check a speed, or a wheel's angular rate if its radius is unknown, against a reference.
 
     Args:
@@ -99,16 +99,16 @@ def judge_speed(
     facts = [f"{series.rate_hz:.3g} Hz", f"{low:.1f} to {high:.1f} {unit}"]
     limit = MAX_SPEED_MPS if radius_known else MAX_SPEED_MPS / 0.2
     if max(abs(low), abs(high)) > limit:
-        return Verdict(tuple(facts), (f"reaches {max(abs(low), abs(high)):.0f} {unit}",))
+        return SignalVerdict(tuple(facts), (f"reaches {max(abs(low), abs(high)):.0f} {unit}",))
     if reference is None:
-        return Verdict(tuple(facts))
+        return SignalVerdict(tuple(facts))
     measured, true = series.at(grid), reference.at(grid)
     both = np.isfinite(measured) & np.isfinite(true)
     if both.sum() < 50 or float(np.abs(true[both]).max()) < MOVING_MPS:
-        return Verdict((*facts, f"too little motion in common with {reference.name}"))
+        return SignalVerdict((*facts, f"too little motion in common with {reference.name}"))
     measured, true = np.abs(measured[both]), np.abs(true[both])
     if not measured.any():
-        return Verdict(tuple(facts), (f"is 0 while {reference.name} moves",))
+        return SignalVerdict(tuple(facts), (f"is 0 while {reference.name} moves",))
     scale = float((true * measured).sum() / (measured * measured).sum())
     rms_mps = float(np.sqrt(np.mean((scale * measured - true) ** 2)))
     if radius_known:
@@ -118,8 +118,8 @@ def judge_speed(
         facts.append(f"{rms_mps:.2g} m/s from {reference.name} with a radius of {scale:.4g} m")
         wrong = not 0.2 <= scale <= 0.6
     if wrong or rms_mps > max(0.5, 0.05 * float(true.max())):
-        return Verdict(tuple(facts), ("contradicts it",), error=rms_mps, is_judged=True)
-    return Verdict(tuple(facts), agrees_with=1, error=rms_mps, is_judged=True)
+        return SignalVerdict(tuple(facts), ("contradicts it",), error=rms_mps, is_judged=True)
+    return SignalVerdict(tuple(facts), agrees_with=1, error=rms_mps, is_judged=True)
 
 
 def spread_mps(wheels: Sequence[Series], grid: Grid) -> float:
@@ -132,7 +132,7 @@ def spread_mps(wheels: Sequence[Series], grid: Grid) -> float:
     return float(np.sqrt(np.mean(off**2)))
 
 
-def of_course(track: Track, grid: Grid) -> Turning | None:
+def of_course(track: GroundTrack, grid: Grid) -> Turning | None:
     """Return the course over ground as a reference; None if the car was too slow."""
     if track.course is None:
         return None
@@ -164,7 +164,7 @@ def of_rate(rate: Series, sign: int, grid: Grid) -> Turning:
 
 def judge_yaw_rate(
     series: Series, references: Sequence[Turning], speed: Series | None, grid: Grid
-) -> Verdict:
+) -> SignalVerdict:
     """Check a yaw rate against references.
 
     Args:
@@ -186,7 +186,7 @@ def judge_yaw_rate(
 
 def judge_steering(
     series: Series, references: Sequence[Turning], speed: Series | None, grid: Grid
-) -> Verdict:
+) -> SignalVerdict:
     """Check a steering angle of unknown steering ratio against references."""
     found = _range_verdict(series, MAX_STEERING_RAD, "deg")
     if found.wrong or speed is None:
@@ -197,14 +197,14 @@ def judge_steering(
     return _judged(found, as_turn.turned_rad, scaleless, math.inf)
 
 
-def _range_verdict(series: Series, limit_rad: float, unit: str) -> Verdict:
+def _range_verdict(series: Series, limit_rad: float, unit: str) -> SignalVerdict:
     low, high = float(series.values.min()) / DEGREE, float(series.values.max()) / DEGREE
     facts = (f"{series.rate_hz:.3g} Hz", f"{low:.1f} to {high:.1f} {unit}")
     if max(abs(low), abs(high)) * DEGREE > limit_rad:
-        return Verdict(facts, (f"reaches {max(abs(low), abs(high)):.0f} {unit}",))
+        return SignalVerdict(facts, (f"reaches {max(abs(low), abs(high)):.0f} {unit}",))
     if low == high:
-        return Verdict(facts, ("never changes",))
-    return Verdict(facts)
+        return SignalVerdict(facts, ("never changes",))
+    return SignalVerdict(facts)
 
 
 def _bias(series: Series, speed: Series, grid: Grid) -> float | None:
@@ -216,8 +216,11 @@ def _bias(series: Series, speed: Series, grid: Grid) -> float | None:
 
 
 def _judged(
-    found: Verdict, turned: NDArray[np.float64], references: Sequence[Turning], bias_radps: float
-) -> Verdict:
+    found: SignalVerdict,
+    turned: NDArray[np.float64],
+    references: Sequence[Turning],
+    bias_radps: float,
+) -> SignalVerdict:
     facts, wrong = [*found.facts], [*found.wrong]
     agrees, error, sign, is_judged = 0, math.inf, 1, False
     for reference in references:
@@ -257,7 +260,7 @@ def _judged(
                     f"{off / DEGREE:+.2f} deg/s off {reference.name} on average, "
                     f"over {both.sum() * WINDOW_S:.0f} s"
                 )
-    return Verdict(tuple(facts), tuple(wrong), agrees, error, sign, is_judged)
+    return SignalVerdict(tuple(facts), tuple(wrong), agrees, error, sign, is_judged)
 
 
 def _correlation(mine: NDArray[np.float64], other: NDArray[np.float64]) -> float:

@@ -22,14 +22,14 @@ class Intrinsics(NamedTuple):
     size_px: tuple[int, int] | None = None
 
 
-class Measured(NamedTuple):
+class MountingParameter(NamedTuple):
     """A parameter of the mounting, and its source."""
 
     value: float
     source: str
 
 
-class Mounting(NamedTuple):
+class CameraMounting(NamedTuple):
     """Mounting of the camera, where known; names are those of the vehicle file.
 
     Attributes:
@@ -41,11 +41,11 @@ class Mounting(NamedTuple):
         notes: Remarks on known or unknown parameters, one sentence each.
     """
 
-    x_m: Measured | None = None
-    y_m: Measured | None = None
-    z_m: Measured | None = None
-    pitch_rad: Measured | None = None
-    yaw_rad: Measured | None = None
+    x_m: MountingParameter | None = None
+    y_m: MountingParameter | None = None
+    z_m: MountingParameter | None = None
+    pitch_rad: MountingParameter | None = None
+    yaw_rad: MountingParameter | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -90,9 +90,9 @@ AFTER_CAMERA: Final = """\
 """
 
 
-def camera_lines(logs: Sequence[Log], mounting: Mounting) -> Iterator[str]:
+def camera_lines(logs: Sequence[Log], mounting: CameraMounting) -> Iterator[str]:
     """Yield the lines of the section ``[camera]``; none for logs without a camera."""
-    camera = camera_of(logs)
+    camera = first_camera(logs)
     if camera is None:
         return
     _, _, found = camera
@@ -113,7 +113,7 @@ def camera_lines(logs: Sequence[Log], mounting: Mounting) -> Iterator[str]:
         ("pitch_rad", 0.0),
         ("yaw_rad", 0.0),
     ):
-        given: Measured | None = getattr(mounting, name)
+        given: MountingParameter | None = getattr(mounting, name)
         if given is None:
             yield f"# {name} = {default}  # {MEASURE[name]}"
         else:
@@ -122,7 +122,7 @@ def camera_lines(logs: Sequence[Log], mounting: Mounting) -> Iterator[str]:
     yield ""
 
 
-def camera_of(logs: Sequence[Log]) -> tuple[Log, str, Intrinsics | None] | None:
+def first_camera(logs: Sequence[Log]) -> tuple[Log, str, Intrinsics | None] | None:
     """Return the first camera's log, topic and intrinsics; None for logs without a camera."""
     for log in logs:
         for topic in log.topics:

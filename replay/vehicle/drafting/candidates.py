@@ -48,7 +48,7 @@ OF_STEERING: Final = (
 OF_GNSS: Final = ("GPS", "GNSS")
 
 
-class Kind(Enum):
+class SignalKind(Enum):
     """The possible meaning of a signal."""
 
     WHEEL = "wheel speed"
@@ -74,7 +74,7 @@ class Candidate:
 
     message: str
     signal: str
-    kind: Kind
+    kind: SignalKind
     unit: str
     scale: float
     wheel: str = ""
@@ -88,7 +88,7 @@ class Candidate:
     @property
     def is_turning(self) -> bool:
         """True for a wheel's angular rate, whose conversion to a speed needs a radius."""
-        return self.kind is Kind.WHEEL and _unit(self.unit) in _TURNING
+        return self.kind is SignalKind.WHEEL and _unit(self.unit) in _TURNING
 
 
 _TURNING: Final = frozenset({"rad/s", "radians/second", "rad/sec"})
@@ -115,18 +115,22 @@ def _candidate(message: CanMessage, signal: CanSignal) -> Candidate | None:
             stem = "_".join([message.topic_name, *_without(of_signal, WHEELS[wheel])])
             scale = 1.0 if unit in _TURNING else SPEED_UNITS[unit]
             return Candidate(
-                message.topic_name, signal.name, Kind.WHEEL, signal.unit, scale, wheel, stem
+                message.topic_name, signal.name, SignalKind.WHEEL, signal.unit, scale, wheel, stem
             )
         if unit in SPEED_UNITS and _mentions(both, OF_SPEED):
-            kind = Kind.GNSS_SPEED if _mentions(both, OF_GNSS) else Kind.SPEED
+            kind = SignalKind.GNSS_SPEED if _mentions(both, OF_GNSS) else SignalKind.SPEED
             return Candidate(message.topic_name, signal.name, kind, signal.unit, SPEED_UNITS[unit])
     if unit in ANGLE_UNITS:
         is_rate = unit.endswith(("/s", "/sec", "/second", "persecon"))
         scale = ANGLE_UNITS[unit]
         if is_rate and _mentions(of_signal, OF_YAW):
-            return Candidate(message.topic_name, signal.name, Kind.YAW_RATE, signal.unit, scale)
+            return Candidate(
+                message.topic_name, signal.name, SignalKind.YAW_RATE, signal.unit, scale
+            )
         if not is_rate and _mentions(both, OF_STEERING) and not _mentions(of_signal, OF_YAW):
-            return Candidate(message.topic_name, signal.name, Kind.STEERING, signal.unit, scale)
+            return Candidate(
+                message.topic_name, signal.name, SignalKind.STEERING, signal.unit, scale
+            )
     return None
 
 

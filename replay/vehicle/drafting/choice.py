@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .agreement import (
+    SignalVerdict,
     Turning,
-    Verdict,
     judge_speed,
     judge_steering,
     judge_yaw_rate,
@@ -22,7 +22,7 @@ from .agreement import (
     of_wheels,
     spread_mps,
 )
-from .candidates import WHEELS, Candidate, Kind
+from .candidates import WHEELS, Candidate, SignalKind
 from .observed import Bus, Observed
 from .series import Grid, Series
 
@@ -31,7 +31,7 @@ USUAL_RADIUS_M: Final = 0.32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Choice:
+class ChosenSignal:
     """A candidate signal, of a bus or of an inertial unit, with its verdict.
 
     Attributes:
@@ -44,7 +44,7 @@ class Choice:
     name: str
     bus: str
     series: Series
-    verdict: Verdict
+    verdict: SignalVerdict
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +63,7 @@ class WheelSet:
     bus: str
     wheels: dict[str, Candidate]
     series: dict[str, Series]
-    verdict: Verdict
+    verdict: SignalVerdict
     radius_m: float | None
     is_turning: bool
 
@@ -96,16 +96,16 @@ class Choices:
     """
 
     wheels: tuple[WheelSet, ...]
-    speeds: tuple[Choice, ...]
-    yaw_rates: tuple[Choice, ...]
-    steering: tuple[Choice, ...]
-    tables: tuple[Choice, ...]
+    speeds: tuple[ChosenSignal, ...]
+    yaw_rates: tuple[ChosenSignal, ...]
+    steering: tuple[ChosenSignal, ...]
+    tables: tuple[ChosenSignal, ...]
     reference: str
     speed: Series | None
 
-    def is_chosen(self, choice: Choice | WheelSet) -> bool:
+    def is_chosen(self, choice: ChosenSignal | WheelSet) -> bool:
         """Return whether it is the best of its kind and free of contradictions."""
-        of_kind: Sequence[Choice | WheelSet] = next(
+        of_kind: Sequence[ChosenSignal | WheelSet] = next(
             kind
             for kind in (self.wheels, self.speeds, self.yaw_rates, self.steering, self.tables)
             if choice in kind
@@ -113,7 +113,7 @@ class Choices:
         return choice is of_kind[0] and not choice.verdict.wrong
 
 
-def choose(seen: Observed) -> Choices:
+def rank_candidates(seen: Observed) -> Choices:
     """Compare every candidate with the others and rank them."""
     grid = Grid.over(seen.start_ns, seen.end_ns)
     reference = _reference_speed(seen, grid)
@@ -121,11 +121,11 @@ def choose(seen: Observed) -> Choices:
     chosen = next((one for one in wheels if one.has_axle and not one.verdict.wrong), None)
     speed = chosen.speed if chosen is not None else reference
     speeds = _ranked(
-        Choice(one.name, bus.topic, series, judge_speed(series, speed, grid, True))
-        for bus, one, series in seen.of_kind(Kind.SPEED)
+        ChosenSignal(one.name, bus.topic, series, judge_speed(series, speed, grid, True))
+        for bus, one, series in seen.of_kind(SignalKind.SPEED)
     )
     tables = _ranked(
-        Choice(one.name, "", one, judge_speed(one, speed, grid, True))
+        ChosenSignal(one.name, "", one, judge_speed(one, speed, grid, True))
         for one in seen.tables
         if chosen is None and len(one) > 1
     )
@@ -149,13 +149,13 @@ def choose(seen: Observed) -> Choices:
         if not one.verdict.wrong and (one.verdict.agrees_with or not one.bus)
     ]
     steering = _ranked(
-        Choice(
+        ChosenSignal(
             one.name,
             bus.topic,
             series,
             judge_steering(series, [*turnings[:1], *by_rate, *turnings[1:]], speed, grid),
         )
-        for bus, one, series in seen.of_kind(Kind.STEERING)
+        for bus, one, series in seen.of_kind(SignalKind.STEERING)
     )
     if speed is not None and steering and steering[0].verdict.agrees_with:
         best = steering[0]
@@ -177,11 +177,11 @@ def _reference_speed(seen: Observed, grid: Grid) -> Series | None:
     for track in seen.tracks:
         if np.isfinite(track.speed.at(grid)).sum() > 50:
             return replace(track.speed, name=f"GNSS {track.speed.name}")
-    for bus, one, series in seen.of_kind(Kind.GNSS_SPEED):
+    for bus, one, series in seen.of_kind(SignalKind.GNSS_SPEED):
         return replace(series, name=f"GNSS {bus.topic} {one.name}")
     others = [
         series
-        for kind in (Kind.WHEEL, Kind.SPEED)
+        for kind in (SignalKind.WHEEL, SignalKind.SPEED)
         for _, one, series in seen.of_kind(kind)
         if not one.is_turning
     ]
@@ -199,7 +199,7 @@ def _reference_speed(seen: Observed, grid: Grid) -> Series | None:
 
 def _wheel_sets(seen: Observed, reference: Series | None, grid: Grid) -> Iterator[WheelSet]:
     groups: dict[tuple[str, str, bool], dict[str, tuple[Candidate, Series]]] = {}
-    for bus, one, series in seen.of_kind(Kind.WHEEL):
+    for bus, one, series in seen.of_kind(SignalKind.WHEEL):
         group = groups.setdefault((bus.topic, one.stem, one.is_turning), {})
         group.setdefault(one.wheel, (one, series))
     for (bus_name, _, is_turning), group in groups.items():
@@ -211,12 +211,12 @@ def _wheel_sets(seen: Observed, reference: Series | None, grid: Grid) -> Iterato
 
 
 def _combined(
-    verdicts: Sequence[Verdict],
+    verdicts: Sequence[SignalVerdict],
     series: dict[str, Series],
     reference: Series | None,
     grid: Grid,
     is_turning: bool,
-) -> tuple[Verdict, float | None]:
+) -> tuple[SignalVerdict, float | None]:
     """Return the worst wheel's verdict, with the spread of the wheels, and the fitted radius."""
     worst = max(verdicts, key=lambda one: (len(one.wrong), one.rank))
     facts = [*worst.facts]
@@ -252,17 +252,20 @@ def _wheel_rank(one: WheelSet) -> tuple[object, ...]:
 
 def _yaw_rates(
     seen: Observed, turnings: Sequence[Turning], speed: Series | None, grid: Grid
-) -> tuple[Choice, ...]:
+) -> tuple[ChosenSignal, ...]:
     return _ranked(
-        Choice(name, bus, series, judge_yaw_rate(series, turnings, speed, grid))
+        ChosenSignal(name, bus, series, judge_yaw_rate(series, turnings, speed, grid))
         for name, bus, series in (
-            *((one.name, bus.topic, series) for bus, one, series in seen.of_kind(Kind.YAW_RATE)),
+            *(
+                (one.name, bus.topic, series)
+                for bus, one, series in seen.of_kind(SignalKind.YAW_RATE)
+            ),
             *((series.name, "", series) for series in seen.yaw_rates if len(series) > 1),
         )
     )
 
 
-def _ranked(choices: Iterator[Choice]) -> tuple[Choice, ...]:
+def _ranked(choices: Iterator[ChosenSignal]) -> tuple[ChosenSignal, ...]:
     return tuple(
         sorted(choices, key=lambda one: (bool(one.verdict.wrong), *one.verdict.rank, one.name))
     )

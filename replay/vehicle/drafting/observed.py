@@ -14,8 +14,8 @@ from crosscue.replay.decode import decoder_for
 from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.vehicle.roles import Role, is_table, role_of
 
-from .candidates import Candidate, Kind, candidates
-from .series import Series, Track
+from .candidates import Candidate, SignalKind, candidates
+from .series import GroundTrack, Series
 
 if TYPE_CHECKING:
     from crosscue.replay.can.database import CanDatabase
@@ -77,14 +77,14 @@ class Observed:
     """
 
     buses: tuple[Bus, ...]
-    tracks: tuple[Track, ...]
+    tracks: tuple[GroundTrack, ...]
     yaw_rates: tuple[Series, ...]
     speeds: tuple[Series, ...]
     start_ns: int
     end_ns: int
     tables: tuple[Series, ...] = ()
 
-    def of_kind(self, kind: Kind) -> list[tuple[Bus, Candidate, Series]]:
+    def of_kind(self, kind: SignalKind) -> list[tuple[Bus, Candidate, Series]]:
         """Return the candidate signals of a kind with their buses."""
         return [
             (bus, candidate, series)
@@ -280,15 +280,15 @@ def _series(
             yield Series.of(topic, *found[name])
 
 
-def _track(topic: str, found: _Columns) -> Track | None:
+def _track(topic: str, found: _Columns) -> GroundTrack | None:
     """Return the track that a topic reports, or one derived from its positions."""
     if {"speed_mps", "course_rad"} <= found.keys():
         t_ns, speed = found["speed_mps"]
-        return Track.of_course(topic, t_ns, speed, found["course_rad"][1])
+        return GroundTrack.of_course(topic, t_ns, speed, found["course_rad"][1])
     if {"velocity_east_mps", "velocity_north_mps"} <= found.keys():
         t_ns, east = found["velocity_east_mps"]
-        return Track.of_velocity(topic, t_ns, east, found["velocity_north_mps"][1])
+        return GroundTrack.of_velocity(topic, t_ns, east, found["velocity_north_mps"][1])
     if {"latitude_deg", "longitude_deg"} <= found.keys():
         t_ns, latitude = found["latitude_deg"]
-        return Track.of_positions(topic, t_ns, latitude, found["longitude_deg"][1])
+        return GroundTrack.of_positions(topic, t_ns, latitude, found["longitude_deg"][1])
     return None

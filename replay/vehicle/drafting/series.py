@@ -127,7 +127,7 @@ class Grid:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Track:
+class GroundTrack:
     """Speed and course over ground from GNSS.
 
     Attributes:
@@ -141,7 +141,7 @@ class Track:
     @classmethod
     def of_positions(
         cls, name: str, t_ns: Int64s, latitude_deg: Floats, longitude_deg: Floats
-    ) -> Track | None:
+    ) -> GroundTrack | None:
         """Derive a track from fixes about one second apart; None for too few fixes."""
         keep = np.isfinite(latitude_deg) & np.isfinite(longitude_deg)
         t_ns, lat, lon = t_ns[keep], latitude_deg[keep], longitude_deg[keep]
@@ -157,13 +157,17 @@ class Track:
         return cls.of_velocity(name, middle_ns, east / dt_s, north / dt_s)
 
     @classmethod
-    def of_velocity(cls, name: str, t_ns: Int64s, east_mps: Floats, north_mps: Floats) -> Track:
+    def of_velocity(
+        cls, name: str, t_ns: Int64s, east_mps: Floats, north_mps: Floats
+    ) -> GroundTrack:
         """Derive a track from velocities over ground."""
         course = np.arctan2(north_mps, east_mps)
         return cls.of_course(name, t_ns, np.hypot(east_mps, north_mps), course)
 
     @classmethod
-    def of_course(cls, name: str, t_ns: Int64s, speed_mps: Floats, course_rad: Floats) -> Track:
+    def of_course(
+        cls, name: str, t_ns: Int64s, speed_mps: Floats, course_rad: Floats
+    ) -> GroundTrack:
         """Create a track from reported values, with courses only where the car clearly moves."""
         moves = np.isfinite(course_rad) & (speed_mps > 3.0)
         course = Series.of(name, t_ns[moves], np.unwrap(course_rad[moves]))

@@ -13,10 +13,10 @@ from crosscue.replay.errors import EmptyResultError, SchemaError
 from crosscue.replay.files.tree_text import spelled
 from crosscue.replay.vehicle.roles import Role, role_of
 
-from .agreement import Verdict
-from .camera import AFTER_CAMERA, Mounting, camera_lines
+from .agreement import SignalVerdict
+from .camera import AFTER_CAMERA, CameraMounting, camera_lines
 from .candidates import WHEELS
-from .choice import Choice, Choices, bus_of, choose
+from .choice import Choices, ChosenSignal, bus_of, rank_candidates
 from .observed import Bus, Observed, observe
 
 if TYPE_CHECKING:
@@ -74,10 +74,10 @@ def examine(logs: Sequence[Log], dbc: Sequence[Path]) -> Examined:
         )
     if not dbc:
         seen = observe(logs, None)
-        return Examined(logs, (), None, seen, choose(seen))
+        return Examined(logs, (), None, seen, rank_candidates(seen))
     kept, database, left_out = _agreeing(logs, dbc)
     seen = observe(logs, database)
-    return Examined(logs, kept, database, seen, choose(seen), left_out)
+    return Examined(logs, kept, database, seen, rank_candidates(seen), left_out)
 
 
 def _agreeing(
@@ -103,7 +103,7 @@ def _agreeing(
 
     def worth(path: Path) -> tuple[bool, int]:
         has_wheels = any(
-            one.has_axle and not one.verdict.wrong for one in choose(seen[path]).wheels
+            one.has_axle and not one.verdict.wrong for one in rank_candidates(seen[path]).wheels
         )
         return has_wheels, max((bus.known for bus in seen[path].buses), default=0)
 
@@ -118,7 +118,7 @@ def _agreeing(
     return kept, CanDatabase.load(kept), left_out
 
 
-def draft(examined: Examined, folder: Path, mounting: Mounting) -> str:
+def draft_text(examined: Examined, folder: Path, mounting: CameraMounting) -> str:
     """Return the text of a drafted vehicle file.
 
     Args:
@@ -168,7 +168,7 @@ def _topic_lines(logs: Sequence[Log], choices: Choices) -> Iterator[str]:
         yield from ("[topics]", *chosen, "")
 
 
-def _speed_lines(tables: Sequence[Choice]) -> Iterator[str]:
+def _speed_lines(tables: Sequence[ChosenSignal]) -> Iterator[str]:
     """Yield the topic with the car's speed, which has no role until the vehicle file names it."""
     sound = [one for one in tables if not one.verdict.wrong]
     if sound:
@@ -243,7 +243,7 @@ def _without_wheels(choices: Choices) -> Iterator[str]:
     yield f"# rear_right = {_quoted(speed.name)}"
 
 
-def _angle_lines(key: str, found: Sequence[Choice], main: str) -> Iterator[str]:
+def _angle_lines(key: str, found: Sequence[ChosenSignal], main: str) -> Iterator[str]:
     """Yield the section of the best signal, unless an inertial unit's topic is better."""
     if not any(one.bus for one in found):
         return
@@ -270,7 +270,7 @@ def _angle_lines(key: str, found: Sequence[Choice], main: str) -> Iterator[str]:
     yield ""
 
 
-def _not_chosen(others: Iterator[tuple[str, str, Verdict]]) -> Iterator[str]:
+def _not_chosen(others: Iterator[tuple[str, str, SignalVerdict]]) -> Iterator[str]:
     for number, (name, bus, verdict) in enumerate(others):
         if number == LISTED:
             yield "# and more"
@@ -291,7 +291,7 @@ def _comment(text: str) -> Iterator[str]:
     )
 
 
-def _as_text(verdict: Verdict) -> str:
+def _as_text(verdict: SignalVerdict) -> str:
     """Describe a verdict in one line."""
     wrong = f"WRONG: {', '.join(verdict.wrong)}; " if verdict.wrong else ""
     return wrong + ", ".join(verdict.facts)

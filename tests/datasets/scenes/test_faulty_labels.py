@@ -27,4 +27,4 @@ def test_detector_without_faults_finds_exactly_visible_objects() -> None:
     for label in set(LABELS.values()):
         many = found.labels.count(label)
         assert clear.count(label) <= many <= clear.count(label) + hidden.count(label)
-    assert rle.decode(ground.mask, ground.mask_size_px)[-1].all()
+    assert rle.decode_mask(ground.mask, ground.mask_size_px)[-1].all()

@@ -16,7 +16,7 @@ from crosscue.datasets.scenes.layout import (
     mixed_layout,
 )
 from crosscue.datasets.scenes.motion import lane_y_m
-from crosscue.datasets.scenes.world import build
+from crosscue.datasets.scenes.world import build_world
 
 FEATURES = ("intersection", "left", "right", "straight")
 
@@ -56,7 +56,8 @@ def test_curved_layout_moves_car_and_objects_with_lane() -> None:
     curved = mixed_layout(12)
     straight = replace(curved, curve_per_m=0.0)
     one, other = (
-        build(layout, conditions_of(layout, 1), is_painted=False) for layout in (curved, straight)
+        build_world(layout, conditions_of(layout, 1), is_painted=False)
+        for layout in (curved, straight)
     )
     motion = one.approach.motion
 

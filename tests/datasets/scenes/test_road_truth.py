@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M
-from crosscue.datasets.scenes.rendering.render import Picture
+from crosscue.datasets.scenes.rendering.render import RenderedFrame
 from support.scenes import renderer, when_at, world
 
 
 @cache
-def picture(layout: str, x_m: float) -> Picture:
+def picture(layout: str, x_m: float) -> RenderedFrame:
     of = world(layout)
     return renderer(of).picture(when_at(of, x_m), with_road=True)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from crosscue.datasets.scenes.car_file import vehicle_text
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.car_file import scene_vehicle_text
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.drive import vehicle_text as drive_vehicle_text
 from crosscue.detectors.ranging.height_to_range import range_of
@@ -15,8 +15,8 @@ from support.scenes import picture_at, world
 
 
 def vehicle(width_px: int) -> Vehicle:
-    camera = Camera(width_px=width_px, height_px=width_px * 9 // 16)
-    text = vehicle_text(camera, mounting_yaw_rad=0.1, declination_rad=0.0, heading_rad=0.5)
+    camera = SceneCamera(width_px=width_px, height_px=width_px * 9 // 16)
+    text = scene_vehicle_text(camera, mounting_yaw_rad=0.1, declination_rad=0.0, heading_rad=0.5)
     return parse(text, "vehicle.toml")
 
 
@@ -39,7 +39,7 @@ def test_range_from_height_scales_with_picture_size() -> None:
 
 @pytest.mark.parametrize("x_m", [-12.0, -22.0, -35.0])
 def test_range_from_stop_sign_equals_distance_to_start(x_m: float) -> None:
-    camera = Camera(width_px=1280, height_px=720)
+    camera = SceneCamera(width_px=1280, height_px=720)
     picture = picture_at(world("L204"), x_m, camera)
     curve = vehicle(1280).ranges.stop_sign
     (sign,) = [one for one in picture.seen if one.thing.category == "stop_sign"]

@@ -19,10 +19,10 @@ from crosscue.datasets.scenes.drive import (
     SceneFiles,
     write_scene,
 )
-from crosscue.datasets.scenes.mobileye import SETTINGS, Faults
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.mobileye import SETTINGS, DeviceFaults
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
-from crosscue.datasets.truth.truth import load
+from crosscue.datasets.truth.truth import read_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.detectors import rle
 from crosscue.eval.cli import run
@@ -36,7 +36,7 @@ from crosscue.replay.logs.opening import open_log
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
 
-TINY = Camera(width_px=192, height_px=108)
+TINY = SceneCamera(width_px=192, height_px=108)
 
 
 def settings(layout: str = "C", run: int = 1, seed: int = 0) -> SceneSettings:
@@ -121,7 +121,7 @@ def test_vehicle_file_and_camera_info_match_camera(files: SceneFiles) -> None:
 def test_true_range_decreases_by_travelled_distance_to_zero_at_entry(files: SceneFiles) -> None:
     rows = np.loadtxt(files.log.parent / "ranges.csv", delimiter=",", skiprows=1)
     track = read_tum(files.log.parent / "pose.tum")
-    (approach,) = load(files.truth).approaches
+    (approach,) = read_truth(files.truth).approaches
     travelled = np.hypot(*(track.xyz_m[:, :2] - track.xyz_m[0, :2]).T)
     at = np.interp(rows[:, 0], track.t_ns.astype(float), travelled)
 
@@ -177,7 +177,7 @@ def test_mobileye_obstacles_match_true_vehicles(files: SceneFiles) -> None:
         ):
             middle_m = x_m + long_m / 2
             # The field of view refers to the vehicle's centre, the position to its near end.
-            assert abs(np.arctan2(y_m, middle_m - 3.75)) < Faults().half_view_rad + 0.15
+            assert abs(np.arctan2(y_m, middle_m - 3.75)) < DeviceFaults().half_view_rad + 0.15
             true_m = cars[int(grabbed[np.argmin(np.abs(grabbed - t_ns))])].get(number - 1)
             # Vehicles with too few pixels at this picture size have no annotation.
             if true_m is not None:
@@ -187,7 +187,7 @@ def test_mobileye_obstacles_match_true_vehicles(files: SceneFiles) -> None:
 
 
 def test_truth_is_complete_and_cues_match_visible_objects(files: SceneFiles) -> None:
-    truth = load(files.truth)
+    truth = read_truth(files.truth)
     (approach,) = truth.approaches
     objects = truth_of(files)
     seen = {
@@ -221,7 +221,7 @@ def test_annotation_masks_match_boxes_and_areas(files: SceneFiles) -> None:
     for one in objects["annotations"][::7]:
         wide, high = size[one["image_id"]]
         x, y, w, h = one["bbox"]
-        mask = rle.decode(one["segmentation"]["counts"].encode(), (wide, high))
+        mask = rle.decode_mask(one["segmentation"]["counts"].encode(), (wide, high))
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
         assert [columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1] == [x, y, w, h]
         assert mask.sum() == one["area"]
@@ -287,4 +287,4 @@ def test_inconsistent_truth_is_refused(tmp_path: Path, more: dict[str, Any], mes
     path.write_text(json.dumps(MINIMAL_TRUTH | more))
 
     with pytest.raises(SchemaError, match=message):
-        load(path)
+        read_truth(path)

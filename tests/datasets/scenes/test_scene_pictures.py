@@ -9,22 +9,22 @@ from numpy.typing import NDArray
 from crosscue.datasets.scenes.cars import SHAPES, Look, car
 from crosscue.datasets.scenes.conditions import conditions_of
 from crosscue.datasets.scenes.layout import TABLE_6, any_layout, layout_named
-from crosscue.datasets.scenes.rendering.camera import Camera, view_at
+from crosscue.datasets.scenes.rendering.camera import SceneCamera, view_at
 from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M
-from crosscue.datasets.scenes.rendering.kernels import compiled
-from crosscue.datasets.scenes.rendering.render import Picture, Seen
-from crosscue.datasets.scenes.world import build
+from crosscue.datasets.scenes.rendering.kernels import compile_kernels
+from crosscue.datasets.scenes.rendering.render import RenderedFrame, RenderedObject
+from crosscue.datasets.scenes.world import build_world
 from support.scenes import SMALL, mirrored, picture_at, renderer, when_at, world
 
 
-def only(picture: Picture, category: str) -> Seen:
+def only(picture: RenderedFrame, category: str) -> RenderedObject:
     (found,) = [one for one in picture.seen if one.thing.category == category]
     return found
 
 
 def test_same_seed_yields_same_pixels() -> None:
     plan = layout_named("D")
-    again = build(plan, conditions_of(plan, 1))
+    again = build_world(plan, conditions_of(plan, 1))
 
     one, other = picture_at(world("D"), -20.0), picture_at(again, -20.0)
 
@@ -65,7 +65,7 @@ def test_different_seed_yields_different_picture() -> None:
 
 @pytest.mark.parametrize("x_m", [-45.0, -30.0, -15.0, -8.0])
 def test_sign_box_matches_pinhole_projection(x_m: float) -> None:
-    camera = Camera()
+    camera = SceneCamera()
     sign = only(picture_at(world("D"), x_m, camera), "stop_sign")
     view = view_at(camera, world("D").approach, when_at(world("D"), x_m))
     x0, y0, x1, y1 = sign.box_px
@@ -111,7 +111,7 @@ def test_mirrored_world_yields_mirrored_picture() -> None:
 
 
 def test_vegetation_hides_stop_sign_only_at_distance() -> None:
-    camera = Camera()
+    camera = SceneCamera()
     far = picture_at(world("G"), -55.0, camera)
     hidden = max((s.visible for s in far.seen if s.thing.category == "stop_sign"), default=0.0)
 
@@ -156,7 +156,7 @@ def _side_view(kind: str, *, nose_left: bool) -> NDArray[np.bool_]:
     placed = mesh.placed(15.0, 0.0, np.pi / 2 if nose_left else -np.pi / 2)
     covered = np.zeros((216, 384), np.uint8)
     axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-    compiled().cover(
+    compile_kernels().cover(
         placed.corners,
         np.zeros(3, np.float32),
         axes,

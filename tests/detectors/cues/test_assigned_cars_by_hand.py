@@ -17,13 +17,13 @@ from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.tracked.motion import CarMotion, Observation, motion_of
 from crosscue.detectors.cues.tracked.tracks import CarTracks, are_hidden, past_within_m
 from crosscue.detectors.ranging.ground_plane import GroundPlane
-from crosscue.detectors.ranging.object_tracks import Motion
+from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
 SIZE = (1280, 720)
 CAMERA = Camera(x_m=1.5, z_m=1.5, focal_px=800.0, center_px=(640.0, 360.0), pitch_rad=0.0)
 RULES = Cars(kind="tracks", score=0.5, within_m=100.0, max_gap_s=0.5, max_frames=10)
-STILL = Motion(0.0, 0.0, 0.0, 0.1)
+STILL = CarStep(0.0, 0.0, 0.0, 0.1)
 Box = tuple[float, float, float, float]
 # 20 m ahead; its ends are 40 / 800 to the left and 84 / 800 to the right.
 CAR: Box = (600.0, 300.0, 724.0, 362.0)
@@ -46,7 +46,7 @@ def sized(height: float) -> Box:
     return 600.0, 331.0 - height / 2.0, 724.0, 331.0 + height / 2.0
 
 
-def followed(*frames: Detections, ego: Motion = STILL, rules: Cars = RULES) -> list[CarMotion]:
+def followed(*frames: Detections, ego: CarStep = STILL, rules: Cars = RULES) -> list[CarMotion]:
     """Cars of the last frame."""
     tracks = CarTracks(CAMERA, rules)
     for frame in frames:
@@ -96,7 +96,7 @@ def test_car_is_placed_with_the_cameras_pose() -> None:
 
     The camera is 1.5 m ahead of the axle, along 0.2 and 0.4 rad.
     """
-    ego = Motion(2.0, 0.0, 0.2, 0.1)
+    ego = CarStep(2.0, 0.0, 0.2, 0.1)
     first = 2.0 * math.cos(0.1), 2.0 * math.sin(0.1)
     second = first[0] + 2.0 * math.cos(0.3), first[1] + 2.0 * math.sin(0.3)
     poses = [
@@ -329,9 +329,9 @@ def test_standing_car_is_found_where_the_ego_motion_predicts() -> None:
     """
     nearer = (560.0, 240.0, 808.0, 364.0)
 
-    assert is_same(CAR, nearer, ego=Motion(10.0, 0.0, 0.0, 0.1))
+    assert is_same(CAR, nearer, ego=CarStep(10.0, 0.0, 0.0, 0.1))
     assert not is_same(CAR, nearer)
-    assert not is_same(CAR, nearer, ego=Motion(25.0, 0.0, 0.0, 0.1))  # it would be behind
+    assert not is_same(CAR, nearer, ego=CarStep(25.0, 0.0, 0.0, 0.1))  # it would be behind
 
 
 def test_standing_car_may_be_nearer_than_a_metre() -> None:
@@ -339,7 +339,7 @@ def test_standing_car_may_be_nearer_than_a_metre() -> None:
 
     ln(1.771 / 0.8) = 0.795 < 4 * 0.03 + ln(1 + 3 / 1.771) = 1.11.
     """
-    assert is_same(CAR, (200.0, 10.0, 1000.0, 710.0), ego=Motion(19.2, 0.0, 0.0, 0.1))
+    assert is_same(CAR, (200.0, 10.0, 1000.0, 710.0), ego=CarStep(19.2, 0.0, 0.0, 0.1))
 
 
 def test_place_of_a_standing_car_is_scaled_to_the_distance_of_the_box() -> None:
@@ -414,7 +414,7 @@ def test_nose_and_cover_of_a_car_are_observed() -> None:
     """A mask whose left quarter is lower; a lower box, 3 px below, covers the lower end."""
     drawn = np.ones((62, 124), np.bool_)
     drawn[:40, :31] = False
-    masks = (rle.encode(drawn, (600, 300), SIZE), b"")
+    masks = (rle.encode_mask(drawn, (600, 300), SIZE), b"")
     front = (640.0, 303.0, 764.0, 365.0)
     frame = found(CAR, front, masks=masks)
 

@@ -15,9 +15,9 @@ from crosscue.detectors.cues.candidates import (
     TOO_LITTLE_ROAD,
 )
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import RoadFractions, Seen
+from crosscue.detectors.cues.observed import FrameDetections, RoadFractions
 from crosscue.detectors.cues.tally import CueTally
-from crosscue.detectors.ranging.object_tracks import Motion
+from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Camera, Cars, Cues, OwnCue, Vehicle
 
@@ -50,7 +50,7 @@ def _pass(vehicle: Vehicle = VEHICLE) -> tuple[CuePass, CueTally]:
 def test_lights_below_threshold_are_counted_with_their_max_score() -> None:
     cues, tally = _pass(Vehicle(version=1, cues=Cues(traffic_light_score=0.9)))
     for t, score in enumerate((0.41, 0.62, 0.3)):
-        cues(Seen(t, objects=(_found(t, ("traffic light", score, 20.0)),)))
+        cues(FrameDetections(t, objects=(_found(t, ("traffic light", score, 20.0)),)))
 
     lights = tally.by_cue["traffic_light"]
     assert (lights.seen, lights.used, lights.skipped) == (3, 0, {BELOW_SCORE: 3})
@@ -61,8 +61,10 @@ def test_lights_below_threshold_are_counted_with_their_max_score() -> None:
 def test_car_of_a_pair_is_skipped_for_the_first_rule_it_fails() -> None:
     cues, tally = _pass()
     standing = ("car", 0.99, 100.0)
-    cues(Seen(0, objects=(_found(0, standing, ("car", 0.5, 100.0), ("car", 0.99, 50.0)),)))
-    cues(Seen(10**8, objects=(_found(10**8, standing),)))
+    cues(
+        FrameDetections(0, objects=(_found(0, standing, ("car", 0.5, 100.0), ("car", 0.99, 50.0)),))
+    )
+    cues(FrameDetections(10**8, objects=(_found(10**8, standing),)))
 
     cars = tally.by_cue["cross_traffic_left"]
     assert (cars.seen, cars.used) == (4, 0)
@@ -78,7 +80,7 @@ def test_tracked_car_is_skipped_for_the_first_rule_it_fails() -> None:
     cues, tally = _pass(TRACKED)
     for _ in range(2):
         found = ("car", 0.99, 100.0), ("car", 0.5, 100.0), ("car", 0.99, 640.0)
-        cues(Seen(0, objects=(_found(0, *found),)), Motion(0.0, 0.0, 0.0, 0.1))
+        cues(FrameDetections(0, objects=(_found(0, *found),)), CarStep(0.0, 0.0, 0.0, 0.1))
 
     cars = tally.by_cue["parked_right"]
     assert (cars.seen, cars.used) == (6, 0)
@@ -87,7 +89,7 @@ def test_tracked_car_is_skipped_for_the_first_rule_it_fails() -> None:
 
 def test_region_with_too_little_road_is_counted_as_skipped() -> None:
     cues, tally = _pass()
-    cues(Seen(0, road=RoadFractions(left=0.13, straight=0.5, right=0.0)))
+    cues(FrameDetections(0, road=RoadFractions(left=0.13, straight=0.5, right=0.0)))
 
     assert tally.by_cue["road_left"].skipped == {TOO_LITTLE_ROAD: 1}
     assert tally.by_cue["road_left"].max_score == 0.13
@@ -103,10 +105,10 @@ def test_used_and_skipped_candidates_add_up_for_every_cue(
     vehicle: Vehicle,
 ) -> None:
     cues, tally = _pass(vehicle)
-    ego = Motion(0.5, 0.0, 0.0, 0.1)
+    ego = CarStep(0.5, 0.0, 0.0, 0.1)
     counted: dict[str, int] = {}
     for t, (some, others) in enumerate(zip(objects, signs, strict=False)):
-        frame = Seen(t * 10**8, objects=(_found(t, *some),), signs=(_found(t, *others),))
+        frame = FrameDetections(t * 10**8, objects=(_found(t, *some),), signs=(_found(t, *others),))
         for cue, number in cues(frame, ego).counts.items():
             counted[cue] = counted.get(cue, 0) + number
 

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import Place, Seen, Sides, Ways
-from crosscue.detectors.cues.tracked.judge import cars_past, crossing, judge, parked
+from crosscue.detectors.cues.observed import FrameDetections, Place, Sides, Ways
+from crosscue.detectors.cues.tracked.judge import cars_past, count_cars, crossing, parked
 from crosscue.detectors.cues.tracked.motion import CAR_HEIGHT_M, CarMotion
 from crosscue.detectors.cues.tracked.tracks import CarTracks, are_hidden
-from crosscue.detectors.ranging.object_tracks import Motion
+from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Cars, Vehicle
 
 SIZE = (1280, 720)
@@ -44,7 +44,7 @@ class Car:
 
 def drive(
     cars: Sequence[Car],
-    steps: Sequence[Motion],
+    steps: Sequence[CarStep],
     *,
     jitter_px: float = 0.0,
     seed: int = 0,
@@ -96,16 +96,16 @@ def mask(box: np.ndarray[tuple[int], np.dtype[np.float64]], nose: int) -> bytes:
         return b""
     tall = np.linspace(1.0, 0.4, x1 - x0)[:: 1 if nose > 0 else -1]
     rows = np.arange(y1 - y0)[:, None]
-    return rle.encode(rows >= (1.0 - tall) * (y1 - y0), (x0, y0), SIZE)
+    return rle.encode_mask(rows >= (1.0 - tall) * (y1 - y0), (x0, y0), SIZE)
 
 
-def steady(frames: int, way_m: float = WAY_M, turned_rad: float = 0.0) -> list[Motion]:
-    return [Motion(way_m, 0.0, turned_rad, PERIOD_S)] * frames
+def steady(frames: int, way_m: float = WAY_M, turned_rad: float = 0.0) -> list[CarStep]:
+    return [CarStep(way_m, 0.0, turned_rad, PERIOD_S)] * frames
 
 
 ego_motions = st.lists(
     st.builds(
-        Motion,
+        CarStep,
         st.floats(-1.0, 3.0),
         st.just(0.0),
         st.floats(-0.06, 0.06),
@@ -121,7 +121,7 @@ standing = st.builds(
 
 @settings(max_examples=200, deadline=None)
 @given(steps=ego_motions, car=standing)
-def test_stationary_car_never_crosses_for_any_ego_motion(steps: list[Motion], car: Car) -> None:
+def test_stationary_car_never_crosses_for_any_ego_motion(steps: list[CarStep], car: Car) -> None:
     for cars in drive([car], steps):
         assert not crossing(cars, RULES)
 
@@ -129,7 +129,7 @@ def test_stationary_car_never_crosses_for_any_ego_motion(steps: list[Motion], ca
 @settings(max_examples=60, deadline=None)
 @given(steps=ego_motions, car=standing, seed=st.integers(0, 99))
 def test_stationary_car_with_jittering_box_never_crosses(
-    steps: list[Motion], car: Car, seed: int
+    steps: list[CarStep], car: Car, seed: int
 ) -> None:
     one = replace(car, height_m=CAR_HEIGHT_M)
 
@@ -149,7 +149,9 @@ def test_moving_car_counts_as_crossing_to_its_side(
 
     (one,) = crossing(last, RULES)
     assert one.right_mps == pytest.approx(right_mps, rel=0.2)
-    assert judge(last, last, 1, CAMERA, RULES, None).crossing == Sides(right_mps < 0, right_mps > 0)
+    assert count_cars(last, last, 1, CAMERA, RULES, None).crossing == Sides(
+        right_mps < 0, right_mps > 0
+    )
     assert not parked(last, RULES)
 
 
@@ -174,7 +176,7 @@ def test_growing_box_of_an_occluded_car_does_not_cross() -> None:
     tracks = CarTracks(CAMERA, RULES)
     for i in range(10):
         box = np.array([[600.0, 350.0, 640.0 + 8.0 * i, 380.0]])
-        cars = tracks([found(box, [0])], Motion(0.0, 0.0, 0.0, PERIOD_S))
+        cars = tracks([found(box, [0])], CarStep(0.0, 0.0, 0.0, PERIOD_S))
         assert not crossing(cars, RULES)
 
 
@@ -193,13 +195,13 @@ def test_parked_car_counts_only_at_the_intersection(nose: int) -> None:
     *_, last = drive([Car(40.0, 2.0, nose=nose)], steps)
     ahead_m = 40.0 - 10 * WAY_M
 
-    here = judge(last, last, 1, CAMERA, RULES, Place(ahead_m - 5.0, ahead_m + 8.0, 1.0))
-    further = judge(last, last, 1, CAMERA, RULES, Place(ahead_m + 30.0, ahead_m + 45.0, 1.0))
+    here = count_cars(last, last, 1, CAMERA, RULES, Place(ahead_m - 5.0, ahead_m + 8.0, 1.0))
+    further = count_cars(last, last, 1, CAMERA, RULES, Place(ahead_m + 30.0, ahead_m + 45.0, 1.0))
 
     side = Sides(nose < 0, nose > 0)
     assert (here.parked, here.parked_elsewhere) == (side, Sides(0, 0))
     assert (further.parked, further.parked_elsewhere) == (Sides(0, 0), side)
-    assert judge(last, last, 1, CAMERA, RULES, None).parked == Sides(0, 0)
+    assert count_cars(last, last, 1, CAMERA, RULES, None).parked == Sides(0, 0)
     assert here.crossing == further.crossing == Sides(0, 0)
 
 
@@ -225,7 +227,7 @@ def test_car_parallel_to_the_street_is_not_parked(bearing: float) -> None:
     assert not parked([car], RULES)
 
 
-def past(car: Car, steps: Sequence[Motion], place: Place | None) -> Ways | None:
+def past(car: Car, steps: Sequence[CarStep], place: Place | None) -> Ways | None:
     """Count the cars past the intersection after the last step."""
     tracks = CarTracks(CAMERA, RULES)
     for _ in drive([car], steps, tracks=tracks):
@@ -269,7 +271,7 @@ def test_box_narrower_than_high_does_not_count_as_oncoming(long: float, oncoming
         height_px = 704.0 * CAR_HEIGHT_M / (80.0 - way_m)
         half_px = 0.5 * long * height_px
         box = (640.0 - half_px, 375.0 - height_px, 640.0 + half_px, 375.0)
-        tracks([found(np.array([box]), [0])], Motion(0.0, 0.0, 0.0, PERIOD_S))
+        tracks([found(np.array([box]), [0])], CarStep(0.0, 0.0, 0.0, PERIOD_S))
 
     assert cars_past(tracks.longer(), CAMERA, RULES, Place(5.0, 15.0, 1.0)) == Ways(oncoming, 0)
 
@@ -280,7 +282,7 @@ def test_low_score_box_continues_but_does_not_start_a_track(scores: tuple[float,
     now: list[CarMotion] = []
     for score in scores:
         one = found(np.array([[600.0, 350.0, 660.0, 380.0]]), [0])
-        now = tracks([replace(one, scores=np.array([score]))], Motion(0.0, 0.0, 0.0, PERIOD_S))
+        now = tracks([replace(one, scores=np.array([score]))], CarStep(0.0, 0.0, 0.0, PERIOD_S))
 
         assert tracks.seen == (score > 0.5)
         assert len(now) <= tracks.seen
@@ -301,14 +303,14 @@ def test_outgoing_car_counts_within_the_resolved_distance(
     for step in range(20):
         height_px = focal_px * CAR_HEIGHT_M / (130.0 + 1.5 * step)
         box = (640.0 - 0.6 * height_px, 375.0 - height_px, 640.0 + 0.6 * height_px, 375.0)
-        tracks([found(np.array([box]), [0])], Motion(0.0, 0.0, 0.0, PERIOD_S))
+        tracks([found(np.array([box]), [0])], CarStep(0.0, 0.0, 0.0, PERIOD_S))
 
     assert cars_past(tracks.longer(), camera, rules, Place(5.0, 15.0, 1.0)) == Ways(0, outgoing)
 
 
 @settings(max_examples=100, deadline=None)
 @given(steps=ego_motions, car=standing)
-def test_stationary_car_is_neither_oncoming_nor_outgoing(steps: list[Motion], car: Car) -> None:
+def test_stationary_car_is_neither_oncoming_nor_outgoing(steps: list[CarStep], car: Car) -> None:
     assert not sum(past(car, steps, Place(1.0, 2.0, 0.1)) or ())
 
 
@@ -327,21 +329,21 @@ def test_overlapped_box_with_a_higher_bottom_is_hidden() -> None:
     assert are_hidden(np.empty((0, 4)), np.empty(0, np.bool_)) == []
 
 
-def cues(steps: Sequence[Motion | None], vehicle: Vehicle = VEHICLE) -> CuePass:
+def cues(steps: Sequence[CarStep | None], vehicle: Vehicle = VEHICLE) -> CuePass:
     one = CuePass(vehicle)
     for step in steps:
         box = np.array([[600.0, 350.0, 680.0, 380.0]])
-        counts = one(Seen(0, (found(box, [0]),)), step).counts
+        counts = one(FrameDetections(0, (found(box, [0]),)), step).counts
         if step is None or step.seconds > 0.5:
             assert "cross_traffic_left" not in counts
     return one
 
 
 def test_car_cues_below_two_frames_per_second_are_noted_as_missing() -> None:
-    slow = [Motion(5.0, 0.0, 0.0, 0.51)] * 4
+    slow = [CarStep(5.0, 0.0, 0.0, 0.51)] * 4
 
     assert cues(slow).notes() == {"crossing and parked cars: frames further than 0.5 s apart": 4}
-    assert not cues([Motion(5.0, 0.0, 0.0, 0.5)] * 4).notes()
+    assert not cues([CarStep(5.0, 0.0, 0.0, 0.5)] * 4).notes()
 
 
 def test_missing_odometry_or_focal_length_is_reported() -> None:

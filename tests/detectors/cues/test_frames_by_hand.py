@@ -26,7 +26,7 @@ from crosscue.detectors.cues.candidates import (
     TOO_FEW_FRAMES,
     TOO_LITTLE_ROAD,
     Candidates,
-    scores_of,
+    label_scores,
     thresholds_met,
     unsure_of,
 )
@@ -34,21 +34,21 @@ from crosscue.detectors.cues.cars import CarShapes, Pairs, no_pairs
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.labelled import count, count_labels
 from crosscue.detectors.cues.observed import (
-    Judged,
+    CarCounts,
+    DetectorRole,
+    FrameDetections,
     Place,
     RoadFractions,
-    Role,
-    Seen,
     Sides,
     Ways,
-    role_of,
+    detector_role,
     seen,
 )
 from crosscue.detectors.cues.rules import counts_of, rule_of
-from crosscue.detectors.cues.same_object import KEPT, meanings, same_objects
+from crosscue.detectors.cues.same_object import KEPT, label_meanings, same_objects
 from crosscue.detectors.cues.tally import CueTally
-from crosscue.detectors.cues.tracked.judge import judge
-from crosscue.detectors.ranging.object_tracks import Motion
+from crosscue.detectors.cues.tracked.judge import count_cars
+from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Camera, Cars, Cues, OwnCue, Regions, Vehicle
 
@@ -71,7 +71,7 @@ CAMERA = Camera(focal_px=500.0, center_px=(320.0, 240.0), x_m=1.0, z_m=1.5, pitc
 TRACKED = VEHICLE.model_copy(
     update={"cars": Cars(kind="tracks", score=0.5, max_gap_s=0.5), "camera": CAMERA}
 )
-EGO = Motion(0.5, 0.0, 0.0, 0.1)
+EGO = CarStep(0.5, 0.0, 0.0, 0.1)
 Thing = tuple[str, float]
 
 
@@ -107,7 +107,7 @@ def test_scores_and_thresholds_are_those_of_the_labels() -> None:
     """
     both, labels = (FEW, MORE), ("car", "van")
 
-    assert scores_of(both, labels) == [0.6, 0.5, 0.2, 0.7]
+    assert label_scores(both, labels) == [0.6, 0.5, 0.2, 0.7]
     assert unsure_of(both, labels, 0.5) == 2
     assert unsure_of(both, labels, None) == 3
     assert count_labels(both, labels, 0.5) == 2
@@ -180,7 +180,7 @@ def road(fraction: float = 1.0) -> RoadMask:
     size = (160, 120)
     is_road = np.zeros((120, 160), np.bool_)
     is_road[:, : round(160 * fraction)] = True
-    return RoadMask(0, SIZE, rle.encode(is_road, (0, 0), size), size)
+    return RoadMask(0, SIZE, rle.encode_mask(is_road, (0, 0), size), size)
 
 
 def test_results_are_sorted_by_role() -> None:
@@ -189,16 +189,16 @@ def test_results_are_sorted_by_role() -> None:
 
     one = seen(7, [cars, signs, first, other, second], [False, True, False, False, True], None)
 
-    assert one == Seen(7, (cars, other), (signs,), first, None)
+    assert one == FrameDetections(7, (cars, other), (signs,), first, None)
     assert one.boxes == (cars, other, signs)
-    assert seen(8, [], [], frozenset({"car"})) == Seen(8, labels=frozenset({"car"}))
-    assert role_of(first, True) == Role.ROAD
-    assert role_of(cars, True) == Role.SIGNS
-    assert role_of(cars, False) == Role.OBJECTS
+    assert seen(8, [], [], frozenset({"car"})) == FrameDetections(8, labels=frozenset({"car"}))
+    assert detector_role(first, True) == DetectorRole.ROAD
+    assert detector_role(cars, True) == DetectorRole.SIGNS
+    assert detector_role(cars, False) == DetectorRole.OBJECTS
 
 
 def test_meaning_of_a_label_is_the_first_label_of_its_cue() -> None:
-    meaning = meanings(VEHICLE)
+    meaning = label_meanings(VEHICLE)
 
     assert meaning["van"] == meaning["car"] == "car"
     assert meaning["stripes"] == "zebra"
@@ -212,7 +212,9 @@ def test_same_object_overlaps_by_more_than_half(left: float, is_same: bool) -> N
     one = found(("car", 0.9))
     two = found(("van", 0.8), boxes=[(left, 5.0, left + 100.0, 45.0)])
 
-    assert [a.tolist() for a in same_objects((one, two), meanings(VEHICLE), (False, False))] == [
+    assert [
+        a.tolist() for a in same_objects((one, two), label_meanings(VEHICLE), (False, False))
+    ] == [
         [KEPT],
         [0 if is_same else KEPT],
     ]
@@ -275,7 +277,7 @@ def test_frame_counts_each_kind_of_cue() -> None:
     objects = found(("traffic light", 0.7), ("traffic light", 0.6), ("zebra", 0.4), ("dog", 0.5))
     signs = found(("one way left", 0.1), ("no entry", 0.2), ("dog", 0.6))
 
-    made = cues(Seen(0, (objects,), (signs,), road(0.65)))
+    made = cues(FrameDetections(0, (objects,), (signs,), road(0.65)))
 
     assert made.counts == {
         "stop_sign": 0,
@@ -290,14 +292,14 @@ def test_frame_counts_each_kind_of_cue() -> None:
         "road_right": 0,
     }
     assert made.road == RoadFractions(1.0, 1.0, 0.0)
-    assert cues(Seen(1)).counts == {}
-    assert cues(Seen(1)).road is None
+    assert cues(FrameDetections(1)).counts == {}
+    assert cues(FrameDetections(1)).road is None
 
 
 def test_only_cues_whose_labels_can_be_reported_are_counted() -> None:
     """Road has no label, so it always counts."""
     cues, _ = _cues()
-    shown = Seen(
+    shown = FrameDetections(
         0, (found(("dog", 0.9)),), labels=frozenset({"dog", "van"}), road=RoadFractions(1, 0, 0)
     )
 
@@ -316,8 +318,8 @@ def test_road_on_the_ground_needs_a_place() -> None:
     )
     cues, tally = _cues(ground)
 
-    unknown = cues(Seen(0, road=road()))
-    known = cues(Seen(1, road=road()), None, Place(10.0, 26.0, 0.0))
+    unknown = cues(FrameDetections(0, road=road()))
+    known = cues(FrameDetections(1, road=road()), None, Place(10.0, 26.0, 0.0))
 
     assert unknown.road is not None
     assert math.isnan(unknown.road.left)
@@ -332,13 +334,13 @@ def test_cars_are_paired_with_the_previous_frame_until_restarted() -> None:
     cues, _ = _cues()
     here = found(("car", 0.9), t_ns=0)
 
-    def moved(t_ms: int) -> Seen:
+    def moved(t_ms: int) -> FrameDetections:
         x = 5.0 + t_ms / 25.0
-        return Seen(
+        return FrameDetections(
             t_ms * MS, (found(("car", 0.9), boxes=[(x, 5.0, x + 100.0, 45.0)], t_ns=t_ms * MS),)
         )
 
-    assert "cross_traffic_right" not in cues(Seen(0, (here,))).counts
+    assert "cross_traffic_right" not in cues(FrameDetections(0, (here,))).counts
     assert cues(moved(100)).counts["cross_traffic_right"] == 1
     assert cues(moved(100)).counts["cross_traffic_right"] == 0  # not later
     assert cues(moved(200)).counts["cross_traffic_right"] == 1
@@ -354,9 +356,12 @@ def test_own_tracker_pairs_the_cars() -> None:
         return Pairs(np.array([[-9.0, 0.0]]), np.zeros((1, 2)), np.zeros(1, np.int64), 640)
 
     cues = CuePass(VEHICLE, tracker)
-    cues(Seen(0, (found(("car", 0.9)),)))
+    cues(FrameDetections(0, (found(("car", 0.9)),)))
 
-    assert cues(Seen(0, (found(("car", 0.9), ("van", 0.9)),))).counts["cross_traffic_left"] == 1
+    assert (
+        cues(FrameDetections(0, (found(("car", 0.9), ("van", 0.9)),))).counts["cross_traffic_left"]
+        == 1
+    )
     assert given == [(1, 2, VEHICLE.cars)]
 
 
@@ -366,10 +371,10 @@ def test_own_tracker_pairs_the_cars() -> None:
         (TRACKED, None, "no odometry, so the camera's own motion is unknown"),
         (
             TRACKED,
-            Motion(None, 0.0, 0.0, 0.1),
+            CarStep(None, 0.0, 0.0, 0.1),
             "no odometry, so the camera's own motion is unknown",
         ),
-        (TRACKED, Motion(0.5, 0.0, 0.0, 0.51), "frames further than 0.5 s apart"),
+        (TRACKED, CarStep(0.5, 0.0, 0.0, 0.51), "frames further than 0.5 s apart"),
         (
             TRACKED.model_copy(update={"camera": Camera()}),
             EGO,
@@ -378,10 +383,10 @@ def test_own_tracker_pairs_the_cars() -> None:
     ],
 )
 def test_frames_without_tracked_cars_are_counted_by_reason(
-    vehicle: Vehicle, ego: Motion | None, why: str
+    vehicle: Vehicle, ego: CarStep | None, why: str
 ) -> None:
     cues, tally = _cues(vehicle)
-    frame = Seen(0, (found(("car", 0.9)),))
+    frame = FrameDetections(0, (found(("car", 0.9)),))
     cues(frame, EGO)
     for _ in range(2):
         assert "parked_left" not in cues(frame, ego).counts
@@ -397,7 +402,7 @@ def test_tracked_cars_are_those_of_the_newest_frame() -> None:
     """Half a second between frames is not too long; a gap forgets the cars."""
     cues, tally = _cues(TRACKED)
     assert cues.followed() == []
-    frame = Seen(0, (found(("car", 0.9)),))
+    frame = FrameDetections(0, (found(("car", 0.9)),))
     for _ in range(2):
         counts = cues(frame, EGO._replace(way_m=0.0, seconds=0.5)).counts
 
@@ -423,22 +428,22 @@ def test_rules_get_the_tracked_cars_and_their_judgement(monkeypatch: pytest.Monk
         given.extend([observed] if isinstance(observed, Pairs) else [])
         return {}
 
-    def judged_as(*arguments: object) -> Judged:
+    def judged_as(*arguments: object) -> CarCounts:
         judged_with.append(arguments)
-        return judge(*arguments)  # type: ignore[arg-type]
+        return count_cars(*arguments)  # type: ignore[arg-type]
 
     def past_as(*arguments: object) -> Ways:
         judged_with.append(arguments)
         return Ways(3, 4)
 
     monkeypatch.setattr(frame, "counts_of", rules)
-    monkeypatch.setattr(frame, "judge", judged_as)
+    monkeypatch.setattr(frame, "count_cars", judged_as)
     monkeypatch.setattr(frame, "cars_past", past_as)
     cues, place = CuePass(TRACKED), Place(10.0, 26.0, 1.0)
     still = EGO._replace(way_m=0.0)
     boxes = [(5.0, 5.0, 105.0, 45.0), (161.0, 7.0, 261.0, 47.0)]
-    cues(Seen(0, (found(("car", 0.9), ("car", 0.9)),)), still, place)
-    cues(Seen(1, (found(("car", 0.9), ("car", 0.9), boxes=boxes),)), still, place)
+    cues(FrameDetections(0, (found(("car", 0.9), ("car", 0.9)),)), still, place)
+    cues(FrameDetections(1, (found(("car", 0.9), ("car", 0.9), boxes=boxes),)), still, place)
 
     none, both = given
     assert none.step_px.shape == none.center_px.shape == (0, 2)
@@ -552,7 +557,7 @@ def test_score_of_cars_that_is_set_replaces_the_detectors() -> None:
 
 def test_threshold_of_followed_cars_is_the_detectors_where_none_is_set() -> None:
     tally = CueTally(VEHICLE.model_copy(update={"cars": Cars(kind="tracks")}))
-    nothing = Judged(Sides(0, 0), Sides(0, 0), Sides(0, 0), Sides(0, 0), 1, 1)
+    nothing = CarCounts(Sides(0, 0), Sides(0, 0), Sides(0, 0), Sides(0, 0), 1, 1)
 
     tally.followed([found(("car", 0.9), min_scores=[0.7])], nothing, {"outgoing_cars": 0})
 
@@ -567,7 +572,7 @@ def test_followed_cars_are_skipped_by_the_first_rule_that_fails() -> None:
     and 3; right: 4 and 0. Past: 2 of 9 outgoing; oncoming has no count.
     """
     tally = CueTally(VEHICLE)
-    judged = Judged(Sides(1, 2), Sides(0, 4), Sides(2, 1), Sides(3, 0), 8, 6)
+    judged = CarCounts(Sides(1, 2), Sides(0, 4), Sides(2, 1), Sides(3, 0), 8, 6)
 
     tally.followed([CARS], judged, {"outgoing_cars": 2})
 
@@ -628,7 +633,7 @@ def test_frames_are_explained_by_the_detectors_that_ran() -> None:
     car = found(("car", 0.9), ("dog", 0.9))
     signs = found(("one way left", 0.9), ("dog", 0.1))
     for t_ms in (0, 100):
-        cues(Seen(t_ms * MS, (replace(car, t_ns=t_ms * MS),), (signs,), doubles=(car,)))
+        cues(FrameDetections(t_ms * MS, (replace(car, t_ns=t_ms * MS),), (signs,), doubles=(car,)))
 
     assert skipped(tally, "parked_left") == (
         3,
@@ -650,9 +655,9 @@ def test_cars_are_explained_if_a_detector_can_report_them(
     cues, tally = _cues(vehicle)
     reported = None if labels is None else frozenset(labels)
 
-    cues(Seen(0, (found(("car", 0.9)),), labels=reported), EGO)
+    cues(FrameDetections(0, (found(("car", 0.9)),), labels=reported), EGO)
 
     assert ("parked_left" in tally.by_cue) == is_explained
-    cues(Seen(0, (), (found(("car", 0.9)),), labels=reported), EGO)
+    cues(FrameDetections(0, (), (found(("car", 0.9)),), labels=reported), EGO)
     if is_explained:
         assert tally.by_cue["parked_left"].seen == 1

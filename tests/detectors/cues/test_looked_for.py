@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.detectors.base import Choice, Detections, reportable
+from crosscue.detectors.base import Detections, DetectorChoice, reportable
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import Seen, all_labels
+from crosscue.detectors.cues.observed import FrameDetections, all_labels
 from crosscue.detectors.registry import make
 from crosscue.eval.pipeline.scene.looked_for import (
     NEVER,
@@ -37,7 +37,7 @@ def _found(*labels: str) -> Detections:
 
 
 def _counts(labels: tuple[str, ...] | None, *found: str) -> dict[str, int]:
-    seen = Seen(0, objects=(_found(*found),), labels=all_labels([labels]))
+    seen = FrameDetections(0, objects=(_found(*found),), labels=all_labels([labels]))
     return dict(CuePass(VEHICLE)(seen).counts)
 
 
@@ -73,14 +73,14 @@ def test_labels_are_unknown_if_one_detector_lists_none() -> None:
 
 
 def test_built_in_detectors_list_their_labels(tmp_path: Path) -> None:
-    signs = make(Choice("signs", "signs"))
-    card = make(Choice("yolox", "model", {"card": str(yolox_card(tmp_path))}))
+    signs = make(DetectorChoice("signs", "signs"))
+    card = make(DetectorChoice("yolox", "model", {"card": str(yolox_card(tmp_path))}))
 
     assert reportable(signs) == ("do not enter", "one way left", "one way right")
-    assert reportable(make(Choice("road", "road"))) == ()
+    assert reportable(make(DetectorChoice("road", "road"))) == ()
     assert {"car"} < {*(reportable(card) or ())}
     assert {"car", "stop sign", "traffic light"} <= {
-        *(reportable(make(Choice("cars", "mask-rcnn"))) or ())
+        *(reportable(make(DetectorChoice("cars", "mask-rcnn"))) or ())
     }
 
 

@@ -22,7 +22,7 @@ from crosscue.detectors.cues.cars import (
     pair_cars,
     parked_cars,
 )
-from crosscue.detectors.cues.observed import Judged, Sides, Ways, nose_of, of_side
+from crosscue.detectors.cues.observed import CarCounts, Sides, Ways, nose_of, of_side
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Cars, Vehicle
 
@@ -91,7 +91,7 @@ def test_shapes_of_cars_are_centre_area_and_nose() -> None:
     drawn = np.zeros((40, 100), np.bool_)
     drawn[30:, :25] = True
     drawn[20:, 25:] = True
-    masks = (rle.encode(drawn, (10, 20), SIZE), b"")
+    masks = (rle.encode_mask(drawn, (10, 20), SIZE), b"")
     two = Detections(7, SIZE, box, np.array([0.95, 0.95]), ("car", "van"), masks)
 
     found = car_shapes([two], RULES)
@@ -278,7 +278,7 @@ def test_cues_of_a_pair_count_their_side() -> None:
 
 
 def test_cues_of_tracked_cars_are_those_judged_over_frames() -> None:
-    judged = Judged(Sides(1, 2), Sides(3, 4), Sides(5, 6), Sides(7, 8), 9, 9, Ways(10, 11))
+    judged = CarCounts(Sides(1, 2), Sides(3, 4), Sides(5, 6), Sides(7, 8), 9, 9, Ways(10, 11))
     found = Pairs(np.array([[-4.0, 0.0]]), np.zeros((1, 2)), np.zeros(1, np.int64), 400, judged)
 
     assert count_crossing(found, VEHICLE, CUES["cross_traffic_left"]) == 1

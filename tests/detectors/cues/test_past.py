@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.datasets.scenes.drive import write_scene
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
-from crosscue.datasets.truth.truth import load as load_truth
+from crosscue.datasets.truth.truth import read_truth as load_truth
 from crosscue.detectors.cues.far_side import (
     MobileyeState,
     end_of,
@@ -27,10 +27,10 @@ from crosscue.replay.columns import Block, Floats, Topic
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.extractor import SampleExtractor
 from crosscue.replay.signals.kinds import MOBILEYE_SIGNALS, Samples, Signal
 from crosscue.replay.signals.plan import plan
-from crosscue.replay.signals.windows import Window, windows
+from crosscue.replay.signals.windows import SampleWindow, windows
 from crosscue.replay.vehicle.mobileye_cues import Past
 from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
 from support.memory_log import MemoryLog
@@ -169,7 +169,7 @@ def vehicle_of(text: str) -> Vehicle:
 def samples_from(log: MemoryLog, vehicle: Vehicle) -> tuple[dict[Signal, Samples], Ledger]:
     planned = plan([(0, topic) for topic in log.topics], vehicle)
     ledger = Ledger("log")
-    extractor = Extractor(planned, vehicle, 0, ledger)
+    extractor = SampleExtractor(planned, vehicle, 0, ledger)
     asked = Selection(topics=planned.topics_of(0))
     parts: dict[Signal, list[Samples]] = {signal: [] for signal in MOBILEYE_SIGNALS}
     for window in windows([log], [extractor], [asked], planned):
@@ -249,17 +249,17 @@ def test_two_devices_are_distinguished_by_their_topic_prefix() -> None:
     assert [source.topic.name for source in chosen.sources] == ["/rear/obstacle_data"]
 
 
-def windows_of(folder: Path, vehicle: Vehicle) -> list[Window]:
+def windows_of(folder: Path, vehicle: Vehicle) -> list[SampleWindow]:
     with open_log(folder / "drive.mcap") as log:
         planned = plan([(0, topic) for topic in log.topics], vehicle)
-        extractor = Extractor(planned, vehicle, 0, Ledger("drive"))
+        extractor = SampleExtractor(planned, vehicle, 0, Ledger("drive"))
         return list(windows([log], [extractor], [Selection(planned.topics_of(0))], planned))
 
 
 @pytest.mark.slow
 def test_lines_and_vehicles_past_are_counted_on_a_simulated_drive(tmp_path: Path) -> None:
     """L303 has a road ahead with cars on it; both cues are positive before the intersection."""
-    tiny = SceneSettings(layout="L303", camera=replace(Camera(), width_px=192, height_px=108))
+    tiny = SceneSettings(layout="L303", camera=replace(SceneCamera(), width_px=192, height_px=108))
     files = write_scene(tmp_path, tiny)
     ranges = np.loadtxt(tmp_path / "ranges.csv", delimiter=",", skiprows=1)
     truth = load_truth(files.truth)

@@ -16,7 +16,7 @@ from crosscue.replay.vehicle.vehicle import Regions, parse
 
 def _mask(road: NDArray[np.bool_]) -> RoadMask:
     size = (road.shape[1], road.shape[0])
-    return RoadMask(0, size, rle.encode(road, (0, 0), size), size)
+    return RoadMask(0, size, rle.encode_mask(road, (0, 0), size), size)
 
 
 def test_full_road_mask_has_fraction_one_and_empty_mask_zero() -> None:

@@ -30,7 +30,7 @@ PLACE = Place(start_m=10.0, end_m=26.0, sd_m=0.0)
 
 def mask(road: NDArray[np.bool_], size_px: tuple[int, int] | None = None) -> RoadMask:
     size = (road.shape[1], road.shape[0])
-    return RoadMask(0, size_px or size, rle.encode(road, (0, 0), size), size)
+    return RoadMask(0, size_px or size, rle.encode_mask(road, (0, 0), size), size)
 
 
 def changed(camera: Camera = CAMERA, **changes: Any) -> Camera:

@@ -14,7 +14,7 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.candidates import REGION_NOT_SEEN
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import Place, RoadFractions, Seen
+from crosscue.detectors.cues.observed import FrameDetections, Place, RoadFractions
 from crosscue.detectors.cues.road_ground import ground_fractions, outlines
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.ground_plane import GroundPlane
@@ -56,7 +56,7 @@ def pictured(
         is_road &= ahead | (from_axle <= place.end_m)
         is_road |= is_there & (left > 0.0) & ("left" in legs)
         is_road |= is_there & (left < 0.0) & ("right" in legs)
-    mask = rle.encode(is_road & is_ground, (0, 0), MASK)
+    mask = rle.encode_mask(is_road & is_ground, (0, 0), MASK)
     return RoadMask(0, SIZE, mask, MASK)
 
 
@@ -155,7 +155,9 @@ def test_unresolved_side_regions_are_nan(place: Place | None) -> None:
 def test_coarse_mask_does_not_resolve_a_distant_region() -> None:
     fine = pictured(30.0, 30.0)
     coarse = replace(
-        fine, mask=rle.encode(np.ones((9, 16), np.bool_), (0, 0), (16, 9)), mask_size_px=(16, 9)
+        fine,
+        mask=rle.encode_mask(np.ones((9, 16), np.bool_), (0, 0), (16, 9)),
+        mask_size_px=(16, 9),
     )
 
     assert ground_fractions(fine, CAMERA, GROUND, at(16.0)).left > 0.9
@@ -167,8 +169,8 @@ def test_unseen_region_yields_no_count_and_is_tallied() -> None:
     tally = CueTally(vehicle)
     cues = CuePass(vehicle, tally=tally)
 
-    unseen = cues(Seen(0, road=pictured(3.0, 6.0)))
-    seen = cues(Seen(1, road=pictured(3.0, 6.0)), None, at(16.0))
+    unseen = cues(FrameDetections(0, road=pictured(3.0, 6.0)))
+    seen = cues(FrameDetections(1, road=pictured(3.0, 6.0)), None, at(16.0))
 
     assert not any(cue.startswith("road") for cue in unseen.counts)
     assert {cue: n for cue, n in seen.counts.items() if cue.startswith("road")} == {

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.candidates import SAME_OBJECT
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import Seen
-from crosscue.detectors.cues.same_object import KEPT, MIN_IOU, meanings, same_objects
+from crosscue.detectors.cues.observed import FrameDetections
+from crosscue.detectors.cues.same_object import KEPT, MIN_IOU, label_meanings, same_objects
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import iou
 from crosscue.replay.vehicle.vehicle import Cars, Vehicle
 
 VEHICLE = Vehicle(version=1, cars=Cars(labels=("car", "truck")))
-MEANING = meanings(VEHICLE)
+MEANING = label_meanings(VEHICLE)
 Object = tuple[str, float, float]
 OBJECTS = st.lists(
     st.tuples(
@@ -62,7 +62,7 @@ def test_labels_of_one_cue_mean_the_same_object() -> None:
         [KEPT],
     ]
     assert duplicates(found(("dog", 0.6, 10.0)), found(("car", 0.8, 10.0))) == [[KEPT], [KEPT]]
-    assert meanings(Vehicle(version=1)).get("truck") is None
+    assert label_meanings(Vehicle(version=1)).get("truck") is None
 
 
 def test_one_detection_replaces_at_most_one_per_detector() -> None:
@@ -110,7 +110,7 @@ def test_duplicate_detection_is_tallied_with_its_reason() -> None:
     cues = CuePass(VEHICLE, tally=tally)
     light, weaker = found(("traffic light", 0.95, 10.0)), found(("traffic light", 0.7, 10.0))
 
-    counts = cues(Seen(0, objects=(light, found()), doubles=(weaker,))).counts
+    counts = cues(FrameDetections(0, objects=(light, found()), doubles=(weaker,))).counts
 
     lights = tally.by_cue["traffic_light"]
     assert counts["traffic_light"] == lights.used == 1

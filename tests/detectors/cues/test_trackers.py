@@ -34,7 +34,7 @@ def _car(
     profile[-quarter:] = 18 if nose > 0 else height
     mask = np.arange(height)[:, None] >= height - profile[None, :]
     box = np.array([[x, y, x + length, y + height]], np.float64)
-    text = rle.encode(mask, (x, y), SIZE)
+    text = rle.encode_mask(mask, (x, y), SIZE)
     return Detections(t_ns, SIZE, box, np.array([score]), ("car",), (text,))
 
 
@@ -45,9 +45,9 @@ def _shapes(*cars: Detections) -> CarShapes:
 def _mirrored(found: Detections) -> Detections:
     width = SIZE[0]
     x0, y0, x1, y1 = found.boxes_px[0]
-    mask = rle.decode(found.masks[0], SIZE)[:, ::-1]
+    mask = rle.decode_mask(found.masks[0], SIZE)[:, ::-1]
     box = np.array([[width - x1, y0, width - x0, y1]])
-    return replace(found, boxes_px=box, masks=(rle.encode(mask, (0, 0), SIZE),))
+    return replace(found, boxes_px=box, masks=(rle.encode_mask(mask, (0, 0), SIZE),))
 
 
 def _sides(before: CarShapes, now: CarShapes) -> tuple[Sides, Sides]:
@@ -140,9 +140,9 @@ def test_run_length_encoding_survives_a_round_trip(
     whole = np.zeros((size[1], size[0]), np.bool_)
     whole[y : y + h, x : x + w] = mask
 
-    text = rle.encode(mask, (x, y), size)
+    text = rle.encode_mask(mask, (x, y), size)
 
-    assert (rle.decode(text, size) == whole).all()
+    assert (rle.decode_mask(text, size) == whole).all()
     assert rle.area_px(text) == whole.sum()
     np.testing.assert_allclose(rle.column_heights_px(text, size), whole.sum(axis=0))
 
@@ -150,21 +150,21 @@ def test_run_length_encoding_survives_a_round_trip(
 def test_run_length_encoding_matches_coco() -> None:
     corner = np.array([[True]])
 
-    assert rle.encode(corner, (0, 0), (2, 2)) == b"013"  # none, one, three
+    assert rle.encode_mask(corner, (0, 0), (2, 2)) == b"013"  # none, one, three
     # 40 = 8 + 32: five bits "8" with the continuation bit (8 + 32 + 48 = 'X'), then 1 ('1').
-    assert rle.encode(corner, (0, 40), (1, 41)) == b"X11"
+    assert rle.encode_mask(corner, (0, 40), (1, 41)) == b"X11"
 
 
 def test_mask_outside_its_picture_is_refused() -> None:
     with pytest.raises(ValueError, match="not inside 4 x 4"):
-        rle.encode(np.ones((2, 2), np.bool_), (3, 0), (4, 4))
+        rle.encode_mask(np.ones((2, 2), np.bool_), (3, 0), (4, 4))
 
 
 @pytest.mark.parametrize("size", [(8, 9), (8, 7), (9, 8)])
 def test_mask_of_another_picture_size_is_refused(size: tuple[int, int]) -> None:
-    full = rle.encode(np.ones((8, 8), np.bool_), (0, 0), (8, 8))
+    full = rle.encode_mask(np.ones((8, 8), np.bool_), (0, 0), (8, 8))
 
-    for read in (rle.decode, rle.column_heights_px):
+    for read in (rle.decode_mask, rle.column_heights_px):
         with pytest.raises(ValueError, match="mask of 64 pixels"):
             read(full, size)
 
@@ -172,4 +172,4 @@ def test_mask_of_another_picture_size_is_refused(size: tuple[int, int]) -> None:
 @pytest.mark.parametrize("text", [b"", b"\x00", b"o", b"zzzz", b"0" * 3 + b"\xff"])
 def test_invalid_mask_bytes_are_refused(text: bytes) -> None:
     with pytest.raises(ValueError, match="mask"):
-        rle.decode(text, (8, 8))
+        rle.decode_mask(text, (8, 8))

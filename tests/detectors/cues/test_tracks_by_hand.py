@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from crosscue.detectors.cues.observed import Judged, Place, Sides, Ways
+from crosscue.detectors.cues.observed import CarCounts, Place, Sides, Ways
 from crosscue.detectors.cues.tracked.judge import (
     along,
     cars_past,
+    count_cars,
     crossing,
     crossing_gates,
     is_at,
     is_past,
-    judge,
     parked,
 )
 from crosscue.detectors.cues.tracked.motion import (
@@ -187,15 +187,15 @@ def test_cars_are_counted_by_side_here_and_elsewhere() -> None:
     others = [car(frames=2), car(distance_m=100.1)]
     standing = [car(nose=-1.0), car(**far), car(**far)]
 
-    found = judge([*moving, *others], standing, 9, CAMERA, RULES, PLACE)
+    found = count_cars([*moving, *others], standing, 9, CAMERA, RULES, PLACE)
 
-    assert found == Judged(Sides(2, 1), Sides(1, 0), Sides(1, 2), Sides(0, 2), 9, 6)
-    anywhere = judge([*moving, *others], standing, 9, CAMERA, RULES, None)
-    assert anywhere == Judged(Sides(3, 3), Sides(0, 0), Sides(0, 0), Sides(1, 2), 9, 6)
+    assert found == CarCounts(Sides(2, 1), Sides(1, 0), Sides(1, 2), Sides(0, 2), 9, 6)
+    anywhere = count_cars([*moving, *others], standing, 9, CAMERA, RULES, None)
+    assert anywhere == CarCounts(Sides(3, 3), Sides(0, 0), Sides(0, 0), Sides(1, 2), 9, 6)
     slow = RULES.model_copy(update={"crossing_mps": 0.5})
     slowly = car(right_mps=0.9, right_sd_mps=0.1)
-    assert judge([slowly], [], 1, CAMERA, slow, None).crossing == Sides(0, 1)
-    edge = judge([car(distance_m=100.0)], [], 1, CAMERA, RULES, None)
+    assert count_cars([slowly], [], 1, CAMERA, slow, None).crossing == Sides(0, 1)
+    edge = count_cars([car(distance_m=100.0)], [], 1, CAMERA, RULES, None)
     assert edge.followed == 1
 
 

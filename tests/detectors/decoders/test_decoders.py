@@ -9,19 +9,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from crosscue.detectors.decoders.base import BoxOutput, Interface, Tensor, kind_of
+from crosscue.detectors.decoders.base import BoxOutput, Interface, Tensor, decoder_name
 from crosscue.detectors.decoders.table import DECODERS
 from support.decoder_samples import BOX, CLASS, CLASSES, SAMPLES, SCORE, SIZE, Sample
 
 
-@pytest.fixture(params=DECODERS, ids=kind_of)
+@pytest.fixture(params=DECODERS, ids=decoder_name)
 def decoder(request: pytest.FixtureRequest) -> type[BoxOutput]:
     found: type[BoxOutput] = request.param
     return found
 
 
 def _built(decoder: type[BoxOutput]) -> tuple[BoxOutput, Sample]:
-    sample = SAMPLES[kind_of(decoder)]()
+    sample = SAMPLES[decoder_name(decoder)]()
     return decoder.model_validate({"classes": CLASSES, **sample.settings}), sample
 
 

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from crosscue.detectors.ranging.object_tracks import Facing, Motion, ObjectTracks, Track
+from crosscue.detectors.ranging.object_tracks import CarStep, Facing, ObjectTrack, ObjectTracks
 from crosscue.detectors.ranging.standard_sizes import light_size
 from crosscue.replay.columns import Floats
 
 FOCAL_PX = 1500.0
 CENTER_PX = (960.0, 540.0)
-AHEAD = Motion(1.0, 0.0, 0.0, 0.1)
+AHEAD = CarStep(1.0, 0.0, 0.0, 0.1)
 # Range at the start, metres to the right and up, height.
 Light = tuple[float, float, float, float]
 NEAR: Light = (57.0, -5.0, 5.0, 1.3)
@@ -33,8 +33,8 @@ def box_of(light: Light, gone_m: float, turned_rad: float = 0.0) -> Floats:
 
 
 def take(
-    followed: ObjectTracks, lights: Sequence[Light], gone_m: float, motion: Motion = AHEAD
-) -> Sequence[Track]:
+    followed: ObjectTracks, lights: Sequence[Light], gone_m: float, motion: CarStep = AHEAD
+) -> Sequence[ObjectTrack]:
     boxes = np.array([box_of(one, gone_m) for one in lights]).reshape(-1, 4)
     return followed(motion, boxes, boxes[:, 3] - boxes[:, 1])
 
@@ -93,7 +93,7 @@ def test_turn_of_the_car_starts_no_new_track() -> None:
     followed = tracks()
     for i in range(12):
         box = box_of(FAR, 0.0, turned_rad=0.04 * i)
-        motion = Motion(0.0, 0.0, 0.04 if i else 0.0, 0.1)
+        motion = CarStep(0.0, 0.0, 0.04 if i else 0.0, 0.1)
         now = followed(motion, box[None, :], np.array([box[3] - box[1]]))
 
     assert [one.seen for one in now] == [12]
@@ -136,7 +136,7 @@ def test_facing_requires_enough_consistent_frames(lenses: list[str], facing: Fac
 def test_range_without_odometry_relies_on_the_size_prior() -> None:
     followed = tracks()
     for gone_m in range(20):
-        (track,) = take(followed, [FAR], float(gone_m), Motion(None, 0.0, 0.0, 0.1))
+        (track,) = take(followed, [FAR], float(gone_m), CarStep(None, 0.0, 0.0, 0.1))
 
     height_px = FOCAL_PX * FAR[3] / (84.0 - 19.0)
     size = light_size(2.5)
@@ -150,7 +150,7 @@ def test_odometry_error_raises_the_range_variance() -> None:
     exact, loose = tracks(), tracks()
     for gone_m in range(30):
         (one,) = take(exact, [FAR], float(gone_m))
-        (other,) = take(loose, [FAR], float(gone_m), Motion(1.0, 0.1, 0.0, 0.1))
+        (other,) = take(loose, [FAR], float(gone_m), CarStep(1.0, 0.1, 0.0, 0.1))
 
     assert other.range_m == one.range_m
     assert other.var_m2 > 1.2 * one.var_m2

@@ -9,7 +9,7 @@ from crosscue.detectors.ranging.standard_sizes import (
     STOP_SIGN,
     SizePrior,
     light_size,
-    size_of,
+    size_prior,
 )
 
 
@@ -39,8 +39,8 @@ def test_implausible_aspect_does_not_change_the_prior() -> None:
 
 
 def test_stop_sign_size_does_not_depend_on_the_aspect() -> None:
-    assert size_of("stop_sign", 2.0) == size_of("stop_sign") == STOP_SIGN
-    assert size_of("traffic_light", 2.0) == light_size(2.0)
+    assert size_prior("stop_sign", 2.0) == size_prior("stop_sign") == STOP_SIGN
+    assert size_prior("traffic_light", 2.0) == light_size(2.0)
 
 
 def test_lights_of_the_same_make_narrow_a_size_by_their_variance() -> None:

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from crosscue.eval.batch.jobs import (
-    Done,
     Engine,
     Job,
-    State,
+    JobOutcome,
+    JobState,
     exit_status_of,
     fingerprint_of,
     in_turn,
@@ -102,7 +102,7 @@ def test_run_of_changed_log_or_settings_needs_overwrite(tmp_path: Path) -> None:
     assert all("give another folder or --overwrite" in str(done.error) for done in refused)
     assert exit_status_of(refused) == 1
     assert [done.attempts for done in replaced] == [1, 1]
-    assert [state_of(job) for job in changed] == [State.DONE, State.DONE]
+    assert [state_of(job) for job in changed] == [JobState.DONE, JobState.DONE]
 
 
 def test_incomplete_run_folder_is_processed_again(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_incomplete_run_folder_is_processed_again(tmp_path: Path) -> None:
     run_many(jobs, letters, in_turn)
     complete = tree(jobs[0].run)
     (jobs[0].run / "manifest.json").unlink()
-    assert state_of(jobs[0]) is State.CUT_SHORT
+    assert state_of(jobs[0]) is JobState.CUT_SHORT
 
     results = run_many(jobs, letters, in_turn)
 
@@ -124,7 +124,7 @@ def test_run_with_edited_manifest_is_not_done(tmp_path: Path) -> None:
     manifest = jobs[0].run / "manifest.json"
     manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "notices": ["by hand"]}))
 
-    assert state_of(jobs[0]) is State.OTHER
+    assert state_of(jobs[0]) is JobState.OTHER
 
 
 @pytest.mark.parametrize("torn", ["", "{", "[]", '{"format_version": 1}', '{"format_version": 9}'])
@@ -133,7 +133,7 @@ def test_run_with_invalid_journal_entry_is_not_done(tmp_path: Path, torn: str) -
     run_many(jobs, letters, in_turn)
     (tmp_path / "runs" / ".drives" / "drive0.json").write_text(torn)
 
-    assert state_of(jobs[0]) is State.OTHER
+    assert state_of(jobs[0]) is JobState.OTHER
 
 
 def test_missing_log_fails_only_its_drive(tmp_path: Path) -> None:
@@ -182,8 +182,8 @@ def test_progress_counts_earlier_done_and_failed_drives(tmp_path: Path) -> None:
 
 
 def test_exit_status_combines_those_of_all_drives() -> None:
-    def done(status: int, error: str | None = None) -> Done[Letters]:
-        return Done(Job("a", (), Path(), ""), status, error)
+    def done(status: int, error: str | None = None) -> JobOutcome[Letters]:
+        return JobOutcome(Job("a", (), Path(), ""), status, error)
 
     assert exit_status_of([done(0), done(0)]) == 0
     assert exit_status_of([done(0), done(3)]) == 3

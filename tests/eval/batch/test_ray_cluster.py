@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 
 from crosscue.eval.batch.jobs import exit_status_of, in_turn, run_many
-from crosscue.eval.batch.ray_cluster import LOCAL, joined
+from crosscue.eval.batch.ray_cluster import LOCAL, connect_ray
 from crosscue.eval.batch.ray_jobs import OnRay
 from crosscue.eval.studies.town import work
 from crosscue.eval.studies.town.settings import LandmarkStudy
 from crosscue.eval.studies.town.work import assemble, chunks_of, run
-from crosscue.localization.town.settings import City, Drive
+from crosscue.localization.town.settings import City, TownDrive
 from crosscue.replay.errors import CrosscueError, UsageError, WorkerError
 from support.drive_work import letters, write_jobs
 from support.trees import tree
@@ -33,7 +33,7 @@ needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="ray is not inst
 WORDS = ("plain", "dies once", "damaged", "loss", "dies", "last")
 STUDY = LandmarkStudy(
     drives=2,
-    drive=Drive(city=City(largest_km2=2.0)),
+    drive=TownDrive(city=City(largest_km2=2.0)),
     densities_per_km2=(0.5,),
     detection_rates=(0.6,),
     points=(),
@@ -47,7 +47,7 @@ def cluster() -> Iterator[Any]:
         patch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
         patch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         before = signal.getsignal(signal.SIGTERM)
-        with joined(LOCAL, 2) as ray:
+        with connect_ray(LOCAL, 2) as ray:
             assert signal.getsignal(signal.SIGTERM) is before
             yield ray
         assert not ray.is_initialized()
@@ -56,7 +56,7 @@ def cluster() -> Iterator[Any]:
 @needs_ray
 def test_missing_cluster_is_reported_in_one_line() -> None:
     with pytest.raises(CrosscueError, match="--ray no_such: no cluster") as caught:
-        joined("no_such").__enter__()
+        connect_ray("no_such").__enter__()
 
     assert "\n" not in str(caught.value)
 
@@ -67,13 +67,13 @@ def test_unreachable_cluster_address_is_reported() -> None:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     with pytest.raises(CrosscueError, match=f"--ray {address}: no connection"):
-        joined(address).__enter__()
+        connect_ray(address).__enter__()
 
 
 def test_missing_ray_package_names_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
 
-    with pytest.raises(UsageError, match=r"pip install 'crosscue\[ray\]'"), joined(LOCAL):
+    with pytest.raises(UsageError, match=r"pip install 'crosscue\[ray\]'"), connect_ray(LOCAL):
         pass
 
 
@@ -84,7 +84,7 @@ def test_cluster_is_joined_once_without_usage_statistics(cluster: Any) -> None:
 
     assert not usage_lib.usage_stats_enabled()
     assert cluster.cluster_resources()["CPU"] == 2.0
-    with joined("auto") as again:
+    with connect_ray("auto") as again:
         assert again is cluster
     assert cluster.is_initialized()
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from crosscue.eval.batch.jobs import Done, in_turn, run_many
+from crosscue.eval.batch.jobs import JobOutcome, in_turn, run_many
 from crosscue.eval.batch.ray_jobs import OnRay
 from crosscue.replay.errors import CrosscueError
 from support.drive_work import Letters, letters, write_jobs
@@ -61,7 +61,7 @@ def test_lost_node_repeats_only_its_running_drives(cluster: Any, tmp_path: Path)
     begun = [tmp_path / f"drive{i}.begun" for i in (1, 3)]
     lost = ""
 
-    found: dict[str, Done[Letters]] = {}
+    found: dict[str, JobOutcome[Letters]] = {}
     end = time.monotonic() + 150.0
     for done in engine(jobs, letters):
         assert time.monotonic() < end, found

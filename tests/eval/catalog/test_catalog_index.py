@@ -31,13 +31,13 @@ def runs(tmp_path: Path) -> Path:
 def manifests_read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Record the names of the runs whose manifests are read."""
     names: list[str] = []
-    rows_of = records.rows_of
+    rows_of = records.run_rows
 
     def counted(found: object, *rest: object) -> object:
         names.append(getattr(found, "run", ""))
         return rows_of(found, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(index, "rows_of", counted)
+    monkeypatch.setattr(index, "run_rows", counted)
     return names
 
 

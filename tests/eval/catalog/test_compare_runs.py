@@ -12,7 +12,7 @@ from crosscue.eval import cli
 from crosscue.eval.catalog.compare import compare_runs, open_scored, read_tolerance
 from crosscue.eval.runs.account import Account, line
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.scoring.by_drive import table_of
+from crosscue.eval.scoring.by_drive import by_drive_table
 from crosscue.replay.errors import UsageError
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -131,7 +131,7 @@ def test_metrics_of_unpaired_drives_are_not_compared(tmp_path: Path) -> None:
         folder.mkdir()
         drives = {name: {"distance_m": 8.0}, "both": {"distance_m": float(name == "a")}}
         (folder / "metrics.json").write_text(json.dumps({"pose": {"by_drive": drives}}))
-        pq.write_table(table_of(iter([])), folder / "by_drive.parquet")
+        pq.write_table(by_drive_table(iter([])), folder / "by_drive.parquet")
 
     found = compare_runs(open_scored(tmp_path / "a"), open_scored(tmp_path / "b"))
 

@@ -9,12 +9,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from crosscue.eval import cli
-from crosscue.eval.catalog.decoded_logs import decode_tables, file_name
+from crosscue.eval.catalog.decoded_logs import decode_tables, table_file
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Messages, Table, Topic
 from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
-from crosscue.replay.mobileye.geometry import Mounting
+from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.vehicle.vehicle import Mobileye, Vehicle
 from support.data import shared
@@ -36,7 +36,7 @@ def _mobileye_drive() -> list[Block]:
             "obstacle_id": np.full(30, 7, np.int16),
         }
     )
-    settings = MobileyeSettings(mounting=Mounting(2.0, 0.0, 0.0))
+    settings = MobileyeSettings(mounting=DevicePosition(2.0, 0.0, 0.0))
     return [encode_tables(bursts_of(image_ns, objects, settings, bus="eye"), settings, "eye")]
 
 
@@ -116,7 +116,7 @@ def test_file_names_of_topics_are_unique_and_stay_in_the_folder() -> None:
         "../../etc/passwd",
         "x" * 999,
     ):
-        name = file_name(topic, taken)
+        name = table_file(topic, taken)
         assert name.lower() not in taken
         assert "/" not in name
         assert not name.startswith(".")

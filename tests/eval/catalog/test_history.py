@@ -15,7 +15,7 @@ import crosscue
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import create, write_manifest
 from crosscue.eval.runs.tags import write_tags
-from crosscue.eval.scoring.by_drive import DriveMetric, table_of
+from crosscue.eval.scoring.by_drive import DriveMetric, by_drive_table
 from support.manifests import estimated
 from support.scoring import log_row
 
@@ -45,7 +45,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 DriveMetric(f"drive {drive}", "cues.stop_sign.positives", "sum", 9.0, 1),
             ]
             (run.path / "score").mkdir()
-            pq.write_table(table_of(iter(parts)), run.path / "score" / "by_drive.parquet")
+            pq.write_table(by_drive_table(iter(parts)), run.path / "score" / "by_drive.parquet")
     return folder
 
 
@@ -137,7 +137,7 @@ def test_names_are_escaped_in_the_page(fleet: Path, tmp_path: Path) -> None:
     write_tags(run.path, {"model": "<script>alert(1)</script>"})
     (run.path / "score").mkdir()
     part = DriveMetric("d", "cues.<b>.recall", "mean", 1.0, 2)
-    pq.write_table(table_of(iter([part])), run.path / "score" / "by_drive.parquet")
+    pq.write_table(by_drive_table(iter([part])), run.path / "score" / "by_drive.parquet")
 
     found = crosscue.history(folder, tmp_path / "page.html", "model")
 

@@ -13,7 +13,7 @@ import crosscue
 from crosscue.eval import cli
 from crosscue.eval.catalog.many_runs import compare_many
 from crosscue.eval.runs.folder import create, write_manifest
-from crosscue.eval.scoring.by_drive import DriveMetric, table_of
+from crosscue.eval.scoring.by_drive import DriveMetric, by_drive_table
 from support.manifests import estimated
 
 RECALL = "cues.stop_sign.recall"
@@ -31,7 +31,7 @@ def scored_runs(folder: Path, right: Sequence[int], first: int = 0) -> list[Path
             DriveMetric(f"drive {number}", RECALL, "mean", float(count), 20),
             DriveMetric(f"drive {number}", DUSK, "mean", float(count // 2), 10),
         ]
-        pq.write_table(table_of(iter(parts)), run.path / "score" / "by_drive.parquet")
+        pq.write_table(by_drive_table(iter(parts)), run.path / "score" / "by_drive.parquet")
         found.append(run.path)
     return found
 

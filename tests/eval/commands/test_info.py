@@ -21,8 +21,8 @@ from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import DATA, Block, CanFrames, Messages, Topic
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.logs.log_summary import quick_summary, summarise, together
-from crosscue.replay.safe_text import cells, table, visible, wrapped
+from crosscue.replay.logs.log_summary import common_span, quick_summary, summarise_log
+from crosscue.replay.safe_text import table, terminal_cells, visible, wrapped
 from crosscue.results import plain
 from support.clock_streams import SECOND_NS, START_NS, Stream, table_of
 from support.data import shared
@@ -106,7 +106,7 @@ def example_log(**changes: Any) -> BlockLog:
 
 
 def text_of(log: BlockLog, width: int = 80) -> str:
-    return "\n".join(lines_of(summarise(log), width))
+    return "\n".join(lines_of(summarise_log(log), width))
 
 
 def test_summary_of_complete_log_lists_topics_and_no_findings() -> None:
@@ -121,7 +121,7 @@ def test_summary_of_complete_log_lists_topics_and_no_findings() -> None:
 
 
 def test_can_identifiers_are_counted_by_frame_format_and_frequency() -> None:
-    summary = summarise(example_log())
+    summary = summarise_log(example_log())
     bus = next(t for t in summary.topics if t.name == "can0")
 
     assert bus.can_id_count == 3
@@ -134,7 +134,7 @@ def test_can_identifiers_are_counted_by_frame_format_and_frequency() -> None:
 
 
 def test_losses_are_reported_by_topic_reason_and_place() -> None:
-    summary = summarise(example_log(dropped=31, unknown=True))
+    summary = summarise_log(example_log(dropped=31, unknown=True))
     text = "\n".join(lines_of(summary, 100))
 
     assert not summary.is_whole
@@ -147,7 +147,7 @@ def test_losses_are_reported_by_topic_reason_and_place() -> None:
 
 @pytest.mark.parametrize("dropped", [0, 1, 40])
 def test_rows_of_the_account_add_up(dropped: int) -> None:
-    summary = summarise(example_log(dropped=dropped))
+    summary = summarise_log(example_log(dropped=dropped))
 
     for topic in summary.topics:
         assert topic.found == topic.used + sum(topic.skipped.values())
@@ -162,7 +162,7 @@ def test_undecodable_topic_is_skipped_with_reason_and_rate() -> None:
     block = Block("/odd", START_NS + 100 * MS * np.arange(n, dtype=np.int64), rows)
     log = BlockLog((block,), (Topic("/odd", "odd_msgs/msg/Odd", "bson"),))
 
-    summary = summarise(log)
+    summary = summarise_log(log)
 
     (topic,) = summary.topics
     assert topic.skipped == {"no decoder for encoding 'bson'": n}
@@ -178,7 +178,7 @@ def test_two_can_buses_are_reported_as_ambiguous() -> None:
     two = replace(log, topics=(*log.topics, column_topic("can1", "crosscue/CanFrames")))
 
     assert "2 topics could be the CAN bus (can0, can1): select one of them in the vehicle file" in (
-        summarise(two).findings
+        summarise_log(two).findings
     )
 
 
@@ -189,20 +189,20 @@ def test_topics_without_common_clock_are_reported() -> None:
         (column_topic("/a"), column_topic("/b")),
     )
 
-    assert any(f.startswith("no two share a clock") for f in summarise(log).findings)
+    assert any(f.startswith("no two share a clock") for f in summarise_log(log).findings)
 
 
 def test_combined_logs_report_their_common_time() -> None:
-    early = summarise(example_log(path=Path("a.mcap")))
+    early = summarise_log(example_log(path=Path("a.mcap")))
     late_stream = Stream(300, 50 * MS)
-    late = summarise(
+    late = summarise_log(
         BlockLog(
             (table_of("/x", late_stream.log_ns() + 10 * SECOND_NS),),
             (column_topic("/x"),),
             path=Path("b.mcap"),
         )
     )
-    boot = summarise(
+    boot = summarise_log(
         BlockLog(
             (table_of("/x", late_stream.log_ns() - START_NS),),
             (column_topic("/x"),),
@@ -210,13 +210,13 @@ def test_combined_logs_report_their_common_time() -> None:
         )
     )
 
-    common = together([early, late])
+    common = common_span([early, late])
     assert common.start_ns == START_NS + 10 * SECOND_NS
     assert common.end_ns == early.end_ns
     assert common.findings == ()
-    assert together([early, boot]).start_ns is None
-    assert together([early, boot]).findings[0].startswith("no two share a clock")
-    assert together([]).start_ns is None
+    assert common_span([early, boot]).start_ns is None
+    assert common_span([early, boot]).findings[0].startswith("no two share a clock")
+    assert common_span([]).start_ns is None
 
 
 def test_empty_log_is_reported_as_empty() -> None:
@@ -247,7 +247,7 @@ def test_hostile_names_are_escaped_in_text_and_json() -> None:
         path=Path(HOSTILE),
     )
 
-    summary = summarise(log)
+    summary = summarise_log(log)
 
     for part in lines_of(summary, 80):
         for line in part.split("\n"):
@@ -258,7 +258,7 @@ def test_hostile_names_are_escaped_in_text_and_json() -> None:
 
 
 def test_json_summary_is_strict_and_sorted() -> None:
-    text = strict_json(plain(summarise(example_log())))
+    text = strict_json(plain(summarise_log(example_log())))
 
     tree = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert list(tree) == sorted(tree)
@@ -281,7 +281,7 @@ def test_tables_and_sentences_fit_the_terminal_width(
 
     assert len(cut) == len(rows) + 1
     for line in [*cut, *(part for r in rows for part in wrapped(r[0], width).split("\n"))]:
-        assert cells(line) <= width
+        assert terminal_cells(line) <= width
         assert "\x1b" not in line
 
 
@@ -294,7 +294,7 @@ def test_summary_of_typical_log_fits_eighty_columns() -> None:
         dropped=12,
     )
 
-    assert max(cells(line) for line in text_of(log, 80).split("\n")) <= 80
+    assert max(terminal_cells(line) for line in text_of(log, 80).split("\n")) <= 80
 
 
 @pytest.mark.parametrize(
@@ -324,7 +324,7 @@ def test_info_of_recorded_minute_reports_its_losses(
     assert status == 3
     assert re.search(r"^can/0 +crosscue/CanFrames +CAN bus +53800 ", out, re.M)
     assert "64 of 592 rows dropped: array file is cut" in out
-    assert max(cells(line) for line in out.split("\n")) <= 80
+    assert max(terminal_cells(line) for line in out.split("\n")) <= 80
 
 
 def test_info_of_two_logs_as_json_combines_them(capsys: pytest.CaptureFixture[str]) -> None:

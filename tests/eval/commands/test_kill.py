@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from crosscue.datasets.scenes.drive import write_scene
-from crosscue.datasets.scenes.rendering.camera import Camera
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import RunFolder, create, locked, open_run
@@ -39,7 +39,7 @@ class Drive:
     """A small simulated drive and its run."""
 
     def __init__(self, folder: Path) -> None:
-        camera = Camera(width_px=192, height_px=108)
+        camera = SceneCamera(width_px=192, height_px=108)
         with pytest.MonkeyPatch.context() as patch:
             scenes.shorten(patch, pictures=75)
             write_scene(folder, SceneSettings("C", camera=camera))

@@ -12,7 +12,7 @@ import pytest
 
 import crosscue
 from crosscue.datasets.truth.coco import read_coco
-from crosscue.detectors.training.annotations import read_coco as read_to_train
+from crosscue.detectors.training.annotations import read_training_coco as read_to_train
 from crosscue.eval.failures.record import Failure
 from crosscue.eval.runs.folder import write_manifest
 from crosscue.eval.runs.manifest import EstimateManifest

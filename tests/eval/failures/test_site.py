@@ -11,7 +11,7 @@ import pytest
 
 import crosscue
 from crosscue.eval.failures.record import Failure, read_failures, write_failures
-from crosscue.eval.failures.site import FACETS, PER_PAGE, entries_of, write_lists
+from crosscue.eval.failures.site import FACETS, PER_PAGE, site_entries, write_lists
 from crosscue.replay.errors import EmptyResultError, OutputError, UsageError
 from support.scene_run import scene_run
 from support.scoring import truth_folder
@@ -98,7 +98,7 @@ def failure(number: int, **changes: object) -> Failure:
 
 
 def test_pages_without_script_list_all_failures_by_each_facet(tmp_path: Path) -> None:
-    entries = entries_of([failure(number) for number in range(2 * PER_PAGE + 1)])
+    entries = site_entries([failure(number) for number in range(2 * PER_PAGE + 1)])
     write_lists(tmp_path, entries, frozenset())
 
     def listed(pages: list[Path]) -> list[str]:
@@ -117,7 +117,7 @@ def test_pages_without_script_list_all_failures_by_each_facet(tmp_path: Path) ->
 
 
 def test_embedded_json_cannot_close_its_script_element(tmp_path: Path) -> None:
-    write_lists(tmp_path, entries_of([failure(1)]), frozenset())
+    write_lists(tmp_path, site_entries([failure(1)]), frozenset())
     page = (tmp_path / "index.html").read_text()
 
     rows = json.loads(page.partition('id="rows">')[2].partition("</script>")[0])

@@ -16,12 +16,12 @@ from crosscue.detectors.networks.mask_rcnn.detector import SOURCE_SCORES
 from crosscue.detectors.training.platt import fit_isotonic, fit_platt
 from crosscue.eval.fit.detector.threshold import (
     TRIED,
+    bounded_threshold,
     fewest_detections,
     lower_bound,
     round_between,
-    threshold_for,
 )
-from crosscue.eval.scoring.boxes.reliability import reliability
+from crosscue.eval.scoring.boxes.reliability import class_calibration
 from crosscue.replay.errors import SchemaError, UsageError
 from support.onnx_models import bright_box_model, constant_model
 
@@ -50,7 +50,7 @@ def test_chosen_threshold_reaches_precision_with_stated_confidence() -> None:
     for _ in range(400):
         scores = rng.uniform(0.2, 1.0, 600)
         is_right = rng.random(600) < probability(scores)
-        chosen = threshold_for(scores, is_right, 0.95, 0.95)
+        chosen = bounded_threshold(scores, is_right, 0.95, 0.95)
         if chosen is not None:
             found += 1
             too_low += bool(np.interp(chosen.score, grid, above) < 0.95)
@@ -63,12 +63,12 @@ def test_threshold_keeps_equal_scores_together_and_needs_enough_detections() -> 
     scores = np.repeat([0.9, 0.5], 200)
     is_right = np.arange(400) < 200
 
-    chosen = threshold_for(scores, is_right, 0.95, 0.95)
+    chosen = bounded_threshold(scores, is_right, 0.95, 0.95)
 
     assert chosen is not None
     assert (chosen.of, chosen.right, chosen.score, chosen.next_score) == (200, 200, 0.5, 0.9)
     few = fewest_detections(0.95, 0.95) - 1
-    assert threshold_for(scores[:few], is_right[:few], 0.95, 0.95) is None
+    assert bounded_threshold(scores[:few], is_right[:few], 0.95, 0.95) is None
 
 
 def test_threshold_is_rounded_between_neighbouring_scores() -> None:
@@ -88,8 +88,8 @@ def test_calibrated_scores_are_probabilities_in_the_same_order(fit) -> None:  # 
     right = rng.random(4000) < probability(fresh)
     after = by.probabilities(fresh)
 
-    assert reliability("", fresh, right).error > 0.1
-    assert reliability("", after, right).error < 0.05
+    assert class_calibration("", fresh, right).error > 0.1
+    assert class_calibration("", after, right).error < 0.05
     order = np.argsort(fresh)
     assert (np.diff(after[order]) > 0.0).all()
 

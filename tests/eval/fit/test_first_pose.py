@@ -14,7 +14,7 @@ from crosscue.datasets.geodesy import (
     geodetic_to_ecef,
     geodetic_to_enu,
 )
-from crosscue.datasets.truth.truth import load
+from crosscue.datasets.truth.truth import read_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.eval.fit.first_pose import with_start, with_start_of
 from crosscue.eval.fit.gnss_truth import _between_positions, write_gnss_truth
@@ -119,7 +119,7 @@ def test_run_started_by_gnss_is_scored_in_its_own_map(tmp_path: Path) -> None:
 def test_gnss_truth_records_accuracy_antenna_and_origin(tmp_path: Path) -> None:
     vehicle = Vehicle(version=1, gnss=Gnss(x_m=1.2, y_m=-0.3))
     path = write_gnss_truth([straight_drive()], vehicle, EVERYTHING, tmp_path)
-    truth = load(path)
+    truth = read_truth(path)
     track = read_tum(tmp_path / str(truth.pose))
 
     assert truth.position_sd_m == pytest.approx(0.5)

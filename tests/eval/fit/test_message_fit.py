@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.datasets.truth.truth import load
+from crosscue.datasets.truth.truth import read_truth
 from crosscue.eval.cli import run as crosscue
-from crosscue.eval.fit.annotated_runs import AnnotatedRuns, annotate, graph_of_runs
+from crosscue.eval.fit.annotated_runs import AnnotatedRuns, add_approaches, graph_of_runs
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
@@ -41,7 +41,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], list[P
 
 def annotated_run(run: RunFolder, truth: Path) -> AnnotatedRuns:
     found = AnnotatedRuns([], Counter())
-    annotate(run, load(truth), Vehicle(version=1), found)
+    add_approaches(run, read_truth(truth), Vehicle(version=1), found)
     return found
 
 

@@ -13,7 +13,7 @@ import pytest
 from crosscue.eval.cli import run as crosscue
 from crosscue.eval.fit.annotated_runs import annotated_drives
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.scoring.truth import load
+from crosscue.eval.scoring.truth import read_scored_truth
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from support.fusion_runs import made_up_drive, write_empty_truth, write_run, write_truth
 
@@ -40,7 +40,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Drives:
 
 def test_drive_is_divided_at_the_intersection(drives: Drives) -> None:
     before, *after = annotated_drives(
-        open_run(drives[0][0]), load(drives[1][0], "a"), Vehicle(version=1)
+        open_run(drives[0][0]), read_scored_truth(drives[1][0], "a"), Vehicle(version=1)
     )
 
     assert before.features == {"intersection": True, "left": True, "right": True, "straight": True}
@@ -50,7 +50,9 @@ def test_drive_is_divided_at_the_intersection(drives: Drives) -> None:
 
 
 def test_drive_without_intersection_has_no_features(drives: Drives) -> None:
-    (one,) = annotated_drives(open_run(drives[0][2]), load(drives[1][2], "c"), Vehicle(version=1))
+    (one,) = annotated_drives(
+        open_run(drives[0][2]), read_scored_truth(drives[1][2], "c"), Vehicle(version=1)
+    )
 
     assert one.features == {"intersection": False, "left": False, "right": False}
     assert np.isnan(one.start_m).all()

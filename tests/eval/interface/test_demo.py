@@ -11,7 +11,7 @@ import pytest
 
 import crosscue
 from crosscue.datasets.real import annotate_pandaset, recordings
-from crosscue.datasets.truth.truth import load as load_truth
+from crosscue.datasets.truth.truth import read_truth as load_truth
 from crosscue.detectors.catalog import fetch as weights
 from crosscue.detectors.catalog import places
 from crosscue.eval.cli import run
@@ -49,7 +49,7 @@ def test_real_demo_is_fetched_once_replayed_and_scored(
     assert run(["demo", "--real", "--overwrite", "--json"]) == 0
     tree = json.loads(capsys.readouterr().out)
     assert len(stand_in_drive.server.gets) == requests
-    assert Path(tree["log"]) == recordings.place_of(stand_in_drive.known)
+    assert Path(tree["log"]) == recordings.recording_folder(stand_in_drive.known)
     assert tree["metrics"]["coverage"]
 
 
@@ -66,8 +66,8 @@ def test_local_data_folder_needs_no_download(
     stand_in_drive: StandIn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run(["demo", "--real", "--data", str(stand_in_drive.folder), "-q"]) == 0
-    shutil.rmtree(recordings.place_of(stand_in_drive.known).parent)
-    shutil.rmtree(places.cache_folder())
+    shutil.rmtree(recordings.recording_folder(stand_in_drive.known).parent)
+    shutil.rmtree(places.model_folder())
     monkeypatch.setenv(weights.DATA, str(stand_in_drive.folder))
 
     drive = crosscue.fetch_drive()
@@ -90,7 +90,7 @@ def test_interrupted_download_is_resumed(
     crosscue.fetch_drive()
 
     assert stand_in_drive.server.gets[1].startswith("bytes=")
-    assert not list(recordings.place_of(stand_in_drive.known).rglob("*.part"))
+    assert not list(recordings.recording_folder(stand_in_drive.known).rglob("*.part"))
 
 
 @pytest.mark.parametrize("name", [PICTURE, "net.onnx"])
@@ -100,7 +100,7 @@ def test_file_of_wrong_checksum_is_not_kept(stand_in_drive: StandIn, name: str) 
     with pytest.raises(crosscue.CrosscueError, match="expected SHA-256"):
         crosscue.fetch_drive()
 
-    below = (recordings.place_of(stand_in_drive.known), places.cache_folder())
+    below = (recordings.recording_folder(stand_in_drive.known), places.model_folder())
     names = [path.name for folder in below for path in folder.rglob("*")]
     assert Path(name).name not in names
 
@@ -192,7 +192,7 @@ def test_files_of_the_real_demo_are_consistent() -> None:
 def test_stored_truth_equals_output_of_annotation_script(tmp_path: Path) -> None:
     sequence = shared("sequences", "pandaset_002")
 
-    annotate_pandaset.annotate(sequence, tmp_path)
+    annotate_pandaset.annotate_sequence(sequence, tmp_path)
 
     for name in ("truth.json", "ranges.csv"):
         assert (tmp_path / name).read_bytes() == (annotate_pandaset.FOLDER / name).read_bytes()

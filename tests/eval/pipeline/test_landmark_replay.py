@@ -25,7 +25,7 @@ from crosscue.eval.scoring.pose.measured import read_measured
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.localization.landmarks.images import grey_of
-from crosscue.localization.landmarks.update import best_of
+from crosscue.localization.landmarks.update import best_candidate
 from crosscue.replay.columns import Block, Bytes, Floats, Images, Messages
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.vehicle import Vehicle, load
@@ -385,7 +385,7 @@ def test_real_frames_match_nearest_landmarks_of_kitti_turn(tmp_path: Path) -> No
         picture = (folder / "image_l" / f"{i:06d}.png").read_bytes()
         seen = stage.search.matcher.describe(grey_of(Encoded("png", memoryview(picture))))
         everything = tuple(stage.search.database)
-        best = best_of(seen, everything, stage.search.database, stage.search.matcher)
+        best = best_candidate(seen, everything, stage.search.database, stage.search.matcher)
         assert best is not None
         assert best.match.score > 50
         offsets_m.append(float(np.hypot(*(best.place.xy_m - east_north[i]))))

@@ -16,7 +16,11 @@ from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.smoother import score_smoother
-from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
+from crosscue.localization.landmarks.database import (
+    LandmarkDatabase,
+    LandmarkPosition,
+    LandmarkWriter,
+)
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Floats
 from crosscue.replay.logs.opening import open_log
@@ -198,7 +202,7 @@ def _with_landmarks(folder: Path, clock: Clock) -> Outcome:
     with LandmarkWriter(path, PlaceByNumber.kind) as writer:
         for x_m in np.arange(2.0, 90.0, 4.0):
             xy = np.array([x_m, 0.0])
-            writer.add(Place(f"{x_m:g}", xy, 0.25 * np.eye(2), 0.0), features_at(xy))
+            writer.add(LandmarkPosition(f"{x_m:g}", xy, 0.25 * np.eye(2), 0.0), features_at(xy))
     vehicle = load(folder / "car.toml")
     with open_log(log) as opened, LandmarkDatabase(path) as database:
         into = create(folder / "run", overwrite=True)

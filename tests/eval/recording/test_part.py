@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 import crosscue
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.moments import part_of
+from crosscue.eval.runs.moments import run_between
 from crosscue.replay.errors import UsageError
 from support.scene_run import scene_run
 from support.scoring import at
@@ -28,7 +28,7 @@ def entities(path: Path) -> set[str]:
 
 
 def test_tables_of_a_part_have_only_its_rows_and_selected_columns(run: RunFolder) -> None:
-    part = part_of(run, at(10), at(19))
+    part = run_between(run, at(10), at(19))
 
     assert part.table("frames")["t_ns"].to_pylist() == [at(frame) for frame in range(10, 20)]
     assert part.table("frames", ["frame"]).column_names == ["frame"]

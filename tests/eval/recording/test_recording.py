@@ -16,10 +16,10 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.images import Encoded
 from crosscue.eval import cli
-from crosscue.eval.recording import save
+from crosscue.eval.recording import save_rrd
 from crosscue.eval.recording.camera import shown
 from crosscue.eval.recording.columns import time_of
-from crosscue.eval.recording.layout import Shown, blueprint
+from crosscue.eval.recording.layout import ViewData, blueprint
 from crosscue.eval.recording.marks import road_lines
 from crosscue.eval.recording.notes import inert
 from crosscue.eval.recording.plan import log_landmarks
@@ -54,7 +54,7 @@ def _saved_recording(tmp_path: Path, **more: Any) -> Path:
     run = scene_run(tmp_path / "drive", **more)
     track = TruthTrack(np.array([at(0), at(9)]), np.array([0.0, 9.0]), np.zeros(2))
     path = tmp_path / "drive.rrd"
-    save(run, path, track, good_truth().ranges)
+    save_rrd(run, path, track, good_truth().ranges)
     return path
 
 
@@ -184,9 +184,9 @@ def test_view_accepts_truth_without_a_track(
 
 def test_layout_has_views_for_available_data() -> None:
     pose = {name: np.array([0.0, 1.0]) for name in ("x_m", "y_m")}
-    complete = blueprint(Shown(TOPIC, pose, has_truth=True, has_scene=True))
-    bare = blueprint(Shown(None, None, has_truth=False, has_scene=True))
-    alone = blueprint(Shown(None, pose, has_truth=False, has_scene=False))
+    complete = blueprint(ViewData(TOPIC, pose, has_truth=True, has_scene=True))
+    bare = blueprint(ViewData(None, None, has_truth=False, has_scene=True))
+    alone = blueprint(ViewData(None, pose, has_truth=False, has_scene=False))
 
     counted = [len(list(_views(one.root_container))) for one in (complete, bare, alone)]
     assert counted == [11, 5, 6]
@@ -203,7 +203,7 @@ def _views(part: Any) -> Any:
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 30), st.integers(0, 20), st.integers(3, 30), st.integers(3, 20))
 def test_outline_follows_the_border_of_the_mask(x: int, y: int, width: int, height: int) -> None:
-    mask = rle.encode(np.ones((height, width), np.bool_), (x, y), (64, 48))
+    mask = rle.encode_mask(np.ones((height, width), np.bool_), (x, y), (64, 48))
     box = np.array([x, y, x + width, y + height], np.float64)
 
     (line,) = rle.outline(mask, (64, 48), box)
@@ -214,7 +214,7 @@ def test_outline_follows_the_border_of_the_mask(x: int, y: int, width: int, heig
 
 
 def test_road_lines_are_in_picture_pixels() -> None:
-    mask = rle.encode(np.ones((4, 8), np.bool_), (0, 5), (8, 9))
+    mask = rle.encode_mask(np.ones((4, 8), np.bool_), (0, 5), (8, 9))
 
     lines = road_lines(RoadMask(0, (80, 90), mask, (8, 9)))
 

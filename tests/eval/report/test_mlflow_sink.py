@@ -9,7 +9,7 @@ import pytest
 
 import crosscue
 from crosscue.eval import cli
-from crosscue.eval.report.mlflow_sink import fit
+from crosscue.eval.report.mlflow_sink import mlflow_name
 from crosscue.eval.runs.tags import write_tags
 from support.scoring import run_folder, truth_folder
 
@@ -90,7 +90,7 @@ def test_missing_mlflow_names_the_extra_to_install(monkeypatch: pytest.MonkeyPat
 
 
 def test_metric_names_are_sanitised_for_mlflow() -> None:
-    assert fit("cues.stop_sign.by_condition.low sun.recall") == (
+    assert mlflow_name("cues.stop_sign.by_condition.low sun.recall") == (
         "cues.stop_sign.by_condition.low sun.recall"
     )
-    assert fit("a|b<c>") == "a_b_c_"
+    assert mlflow_name("a|b<c>") == "a_b_c_"

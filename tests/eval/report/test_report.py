@@ -23,13 +23,13 @@ from crosscue.eval.report.scene_figures import (
     draw_range,
     draw_reliability,
 )
-from crosscue.eval.report.svg_plot import Drawing, Panel, ticks
+from crosscue.eval.report.svg_plot import Panel, SvgChart, ticks
 from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.candidates import CandidateRow
 from crosscue.eval.runs.folder import RunFolder, write_manifest
 from crosscue.eval.runs.manifest import SceneSummary
 from crosscue.eval.scoring.files import FOLDER
-from crosscue.eval.scoring.runs import RunScored, judge_run, metrics_of, scores_of
+from crosscue.eval.scoring.runs import RunScored, judge_run, metrics_of, pooled_scores
 from support.manifests import estimate_manifest
 from support.scene_run import SIZE, scene_run
 from support.scoring import approach, at, good_truth, span, truth, truth_folder
@@ -64,7 +64,7 @@ def _scored(folder: Path, name: str = "A", **more: Any) -> RunScored:
 
 
 def _report_text(folder: Path, *scored: RunScored, **more: Any) -> str:
-    scores = scores_of(scored)
+    scores = pooled_scores(scored)
     path = write_report(
         folder, scored, scores, {**metrics_of(scored, scores), **more}, worst_frames(scored)
     )
@@ -100,7 +100,7 @@ def test_coverage_is_first_and_losses_are_reported(tmp_path: Path) -> None:
 
 def test_tables_report_metrics_and_published_values(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
-    metrics = metrics_of([one], scores_of([one]))
+    metrics = metrics_of([one], pooled_scores([one]))
     page = _report_text(tmp_path, one)
 
     precision = metrics["cues"]["cross_traffic_right"]["precision"]
@@ -241,7 +241,7 @@ def test_attribution_of_a_cue_is_reported(tmp_path: Path) -> None:
 def test_several_drives_share_one_page(tmp_path: Path) -> None:
     drives = [_scored(tmp_path / name, name) for name in ("one", "two", "three")]
     failed = {"runs/<four>": "runs/<four>: no manifest.json"}
-    scores = scores_of(drives)
+    scores = pooled_scores(drives)
     metrics = metrics_of(drives, scores)
     metrics["coverage"]["failed"] = failed
 
@@ -276,7 +276,7 @@ def test_score_writes_the_page_and_prints_its_path(
 
 def test_charts_have_text_descriptions(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
-    scores = scores_of([one])
+    scores = pooled_scores([one])
     assert scores.approaches is not None
     assert one.judged.approaches is not None
     (curve,) = one.judged.approaches.curves
@@ -310,7 +310,7 @@ def test_belief_without_true_distances_is_drawn_over_time(tmp_path: Path) -> Non
 
 def test_range_chart_includes_the_claimed_interval(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
-    scores = scores_of([one])
+    scores = pooled_scores([one])
     unsure = [replace(part, var_m2=np.full_like(part.var_m2, 100.0)) for part in one.judged.ranges]
 
     chart = draw_range(unsure, scores.range)
@@ -321,7 +321,7 @@ def test_range_chart_includes_the_claimed_interval(tmp_path: Path) -> None:
 
 def test_range_chart_shows_its_worst_bins(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
-    scores = dict(scores_of([one]).range)
+    scores = dict(pooled_scores([one]).range)
     bins = dict(scores["start"].by_distance)
     worst = max(bins)
     bins |= {worst: replace(bins[worst], nees=73.5), "over 120": replace(bins[worst], nees=41.0)}
@@ -350,7 +350,7 @@ def test_ticks_are_few_round_and_inside_the_range(low: float, width: float, max_
 
 
 def test_curve_breaks_at_missing_values() -> None:
-    drawing = Drawing(100, 100, "title", "description")
+    drawing = SvgChart(100, 100, "title", "description")
     panel = Panel(0, 0, 100, 100, (0.0, 4.0), (0.0, 1.0))
 
     drawing.curve(panel, np.arange(5.0), np.array([0.0, 1.0, np.nan, 1.0, 0.0]), "line")

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from rerun.chunk import RrdReader
 
 from crosscue.eval.drives.score import ScoreWork
-from crosscue.eval.recording import save
+from crosscue.eval.recording import save_rrd
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.tables.log_time import Gap, broken_at, gaps_of
+from crosscue.eval.runs.tables.log_time import ClockGap, broken_at, gaps_of
 from crosscue.eval.scoring.drives import ScoreSettings
 from crosscue.eval.scoring.pose.score import ScoredPoses
 from support.gap_drive import BEGIN, ROW, SECOND, Clock, replayed, write_drive
@@ -40,7 +40,7 @@ def _rows(path: Path, entity: str, component: str) -> list[tuple[int, Any]]:
     return sorted(found, key=lambda row: row[0])
 
 
-def _crosses(rows: Sequence[tuple[int, Any]], gap: Gap) -> bool:
+def _crosses(rows: Sequence[tuple[int, Any]], gap: ClockGap) -> bool:
     """Return True if a line crosses the gap."""
     before = [value for t_ns, value in rows if t_ns < gap.middle_ns]
     return bool(np.isfinite(before[-1][0]))
@@ -56,7 +56,7 @@ def test_gap_spans_the_pause_of_odometry(paused: RunFolder) -> None:
 
 def test_lines_of_a_recording_break_at_gaps(paused: RunFolder, tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
-    save(paused, path)
+    save_rrd(paused, path)
 
     (gap,) = gaps_of(paused.drive_manifest().timeline)
     lines = [
@@ -110,7 +110,7 @@ def test_report_shades_each_gap_with_its_duration(
 def test_long_gap_is_shortened_on_the_time_axis() -> None:
     t_ns = np.concatenate([np.arange(60), np.arange(60, 140) + 12_000]) * ROW
     n = len(t_ns)
-    gap = Gap(59 * ROW, 12_060 * ROW, "gap of 1200.1 s")
+    gap = ClockGap(59 * ROW, 12_060 * ROW, "gap of 1200.1 s")
     zero, two = np.zeros(n), np.zeros((n, 2))
     poses = ScoredPoses(
         t_ns, two, two, zero, np.zeros((n, 3, 3)), zero, zero, zero, 1.0, "", (gap,)

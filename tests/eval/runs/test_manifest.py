@@ -23,17 +23,17 @@ from crosscue.eval.runs.manifest import (
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import RunError
-from crosscue.replay.time.segments import Cause, Epoch, LogClock, Marks, Segment
+from crosscue.replay.time.segments import Cause, Epoch, EpochMarks, LogClock, TimeSegment
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.manifests import detected, estimated, log_account
 from support.memory_log import MemoryLog, wheel_block
 
 SET_BACK = TimeSegments(
     segments=(
-        Segment(0, 0, 1, 2, 1, 2, Cause.START),
-        Segment(1, 5, 5, 9, 3, 7, Cause.SET_BACK, None, -2, breaks_odometry=True),
+        TimeSegment(0, 0, 1, 2, 1, 2, Cause.START),
+        TimeSegment(1, 5, 5, 9, 3, 7, Cause.SET_BACK, None, -2, breaks_odometry=True),
     ),
-    clocks=(LogClock((Epoch(0, 0), Epoch(5, 2)), {"/a": Marks((3, None), (7,), ((1, 2),))}),),
+    clocks=(LogClock((Epoch(0, 0), Epoch(5, 2)), {"/a": EpochMarks((3, None), (7,), ((1, 2),))}),),
     notices=("set back",),
 )
 RICH = detected("/cam", {"finder": "objects"}, time=SET_BACK)

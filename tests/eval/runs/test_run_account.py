@@ -20,13 +20,13 @@ from crosscue.eval.runs.account import (
     account,
     account_lines,
     account_of,
-    check,
+    check_account,
     details_of,
     detecting_of,
     joined_accounts,
     line,
     reading_of,
-    summed,
+    sum_accounts,
 )
 from crosscue.eval.runs.folder import create, open_run
 from crosscue.eval.runs.tables.skipped import write_skipped
@@ -59,7 +59,7 @@ def _checked_account(run: Path, printed: dict[str, Any]) -> Account:
     """Return the run's account after comparing it with the output and the skipped table."""
     folder = open_run(run)
     found = folder.drive_manifest().account
-    check(found)
+    check_account(found)
     assert printed["account"] == found.as_json()
     reported: Counter[tuple[str, str, bool]] = Counter()
     unknown = set()
@@ -173,7 +173,7 @@ def test_unbalanced_account_raises_an_error(stage: str, by: int, what: str) -> N
         getattr(one, what)["another"] = by
 
     with pytest.raises(AccountError, match=f"{stage} .*please report"):
-        check(wrong)
+        check_account(wrong)
 
 
 def test_account_is_complete_only_without_losses_in_every_stage() -> None:
@@ -186,7 +186,7 @@ def test_account_is_complete_only_without_losses_in_every_stage() -> None:
 
 
 def test_sum_of_accounts_adds_rows_and_keeps_losses() -> None:
-    both = summed([_account(), _account()])
+    both = sum_accounts([_account(), _account()])
 
     assert both.reading["/t"].entered == 20
     assert both.reading["/t"].dropped == {"cut": 2}
@@ -297,7 +297,7 @@ def test_lines_of_an_account_are_in_the_order_of_stages_and_names() -> None:
     ]
 
     assert [(stage, name, one.used) for stage, name, one in made.lines()] == expected
-    total = summed([made, made])
+    total = sum_accounts([made, made])
     assert [(stage, name, one.used) for stage, name, one in total.lines()] == [
         (stage, name, 2 * used) for stage, name, used in expected
     ]
@@ -362,15 +362,15 @@ def test_error_names_stage_and_counts() -> None:
     made = _scored(account([]), **{"": line(3, 1, {"dull": 1}, {"cut": 2})})
 
     with pytest.raises(AccountError) as error:
-        check(made)
+        check_account(made)
 
     assert str(error.value) == (
         "scoring rows of unknown topics: 3 in, 1 used, 1 skipped, 2 dropped: this does not add up; "
         "it is a bug in crosscue, please report it"
     )
     with pytest.raises(AccountError, match="scoring x: 0 in, -1 used"):
-        check(_scored(account([]), x=line(0, -1, {"dull": 1})))
-    check(_scored(account([]), x=line(0, 0, {})))
+        check_account(_scored(account([]), x=line(0, -1, {"dull": 1})))
+    check_account(_scored(account([]), x=line(0, 0, {})))
 
 
 def _topic(used: int) -> TopicLine:
@@ -429,21 +429,21 @@ def test_sum_counts_runs_and_those_with_unknown_losses() -> None:
     unknown = account([], {"/cam": line(5, 4, {}, {"cut": 1}, ["cut", "torn"])})
     whole = account([], {"/cam": line(2, 2, {})})
 
-    total = summed([unknown, whole, unknown]).detecting["/cam"]
+    total = sum_accounts([unknown, whole, unknown]).detecting["/cam"]
 
     assert (total.entered, total.used, total.dropped) == (12, 10, {"cut": 2})
     assert (total.runs, total.runs_with_unknown_drops) == (3, 2)
     assert total.unknown == ()
-    assert summed([whole, whole]).is_whole
-    assert not summed([unknown, whole]).is_whole
-    assert not summed([whole, unknown]).is_whole
+    assert sum_accounts([whole, whole]).is_whole
+    assert not sum_accounts([unknown, whole]).is_whole
+    assert not sum_accounts([whole, unknown]).is_whole
 
 
 def test_sum_that_does_not_balance_raises() -> None:
     with pytest.raises(AccountError, match="scoring x: 2 in, 1 used"):
-        summed([_scored(account([]), x=line(2, 1, {}))])
-    assert isinstance(summed([]), SummedAccount)
-    assert summed([]).is_whole
+        sum_accounts([_scored(account([]), x=line(2, 1, {}))])
+    assert isinstance(sum_accounts([]), SummedAccount)
+    assert sum_accounts([]).is_whole
 
 
 def test_printed_account_lists_losses_first_and_rows_that_were_not_selected_never() -> None:

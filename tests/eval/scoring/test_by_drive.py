@@ -8,7 +8,7 @@ import pytest
 
 from crosscue.eval import cli
 from crosscue.eval.catalog.paired import compare_drives
-from crosscue.eval.scoring.by_drive import DriveMetric, no_longer_scored, parts_of
+from crosscue.eval.scoring.by_drive import DriveMetric, drive_contributions, no_longer_scored
 from support.scoring import (
     belief_table,
     cue_table,
@@ -40,7 +40,11 @@ def scores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 def fleet(tree: Mapping[str, Any]) -> list[DriveMetric]:
     """Return metrics of several drives that all have the same scores."""
-    return [one for i in range(DRIVES) for one in parts_of(f"drive {i}", tree, None, is_lost=False)]
+    return [
+        one
+        for i in range(DRIVES)
+        for one in drive_contributions(f"drive {i}", tree, None, is_lost=False)
+    ]
 
 
 def with_doubled_counts(tree: Any, name: str = "") -> Any:

@@ -22,10 +22,10 @@ from crosscue.eval.scoring.pose.errors import (
     RpeDelta,
     align,
     ape,
-    nees,
-    pair,
+    pair_poses,
     rpe,
     rpe_pairs,
+    squared_errors,
     statistics,
     summarise_nees,
 )
@@ -192,7 +192,7 @@ def test_nearest_pairs_equal_evo(seed: int, shift: int) -> None:
     long = random_walk(seed + 1, 400)
     t_ns = np.cumsum(rng.integers(1, 40_000_000, 400)) + shift * 1_000_000
     estimate = Trajectory(t_ns, long.xyz_m, long.quat_wxyz)
-    ours = pair(truth, estimate, 10_000_000, how="nearest")
+    ours = pair_poses(truth, estimate, 10_000_000, how="nearest")
     theirs, found = sync.associate_trajectories(to_evo(truth), to_evo(estimate), max_diff=0.01)
 
     np.testing.assert_allclose(ours.truth.xyz_m, theirs.positions_xyz)
@@ -256,8 +256,8 @@ def test_coverage_accounts_for_every_true_pose() -> None:
     keep = np.ones(100, np.bool_)
     keep[:10] = keep[40:50] = keep[95:] = False
     estimate = Trajectory(truth.t_ns[keep], truth.xyz_m[keep], truth.quat_wxyz[keep])
-    interpolated = pair(truth, estimate, 250_000_000)
-    nearest = pair(truth, estimate, 250_000_000, how="nearest")
+    interpolated = pair_poses(truth, estimate, 250_000_000)
+    nearest = pair_poses(truth, estimate, 250_000_000, how="nearest")
 
     assert interpolated.coverage == Coverage(100, 79, 10, 5, 6)
     assert nearest.coverage == Coverage(100, 83, 8, 3, 6)
@@ -273,7 +273,7 @@ def test_interpolation_is_linear_in_time(seed: int, fraction: float) -> None:
     middle = np.array([round(fraction * 100_000_000)], np.int64)
     truth = Trajectory(middle, np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
     cov = np.array([[0.0] * 6, [1.0] * 6])
-    found = pair(truth, two, 10**9, cov)
+    found = pair_poses(truth, two, 10**9, cov)
     part = middle[0] / 1e8
 
     np.testing.assert_allclose(
@@ -308,7 +308,7 @@ def test_nees_of_consistent_errors_is_in_band() -> None:
     error = rng.normal(size=(2000, 3)) @ root.T
     upper = np.tile(cov[np.triu_indices(3)], (2000, 1))
     for dimensions in (2, 3):
-        values = nees(paired_with(error, upper), 2 if dimensions == 2 else 3)
+        values = squared_errors(paired_with(error, upper), 2 if dimensions == 2 else 3)
         summary = summarise_nees(values, dimensions, independent=2000)
         assert summary.band_low < summary.mean < summary.band_high
         assert summary.fraction_inside_95 == pytest.approx(0.95, abs=0.02)
@@ -320,8 +320,8 @@ def test_nees_computed_by_hand_with_heading_wrap() -> None:
     upper = np.array([[4.0, 0.0, 0.0, 1.0, 0.0, 0.25]])
     paired = paired_with(np.array([[2.0, 3.0, 1.0]]), upper)
 
-    assert nees(paired, 2)[0] == pytest.approx(1.0 + 9.0)
-    assert nees(paired, 3)[0] == pytest.approx(1.0 + 9.0 + 4.0)
+    assert squared_errors(paired, 2)[0] == pytest.approx(1.0 + 9.0)
+    assert squared_errors(paired, 3)[0] == pytest.approx(1.0 + 9.0 + 4.0)
 
 
 def test_rows_with_singular_covariance_are_counted_not_scored() -> None:
@@ -334,7 +334,7 @@ def test_rows_with_singular_covariance_are_counted_not_scored() -> None:
             [1.0, 0.0, 0.0, -1.0, 0.0, 1.0],
         ]
     )
-    summary = summarise_nees(nees(paired_with(np.ones((5, 3)), upper), 3), 3)
+    summary = summarise_nees(squared_errors(paired_with(np.ones((5, 3)), upper), 3), 3)
 
     assert (summary.rows, summary.rows_singular) == (1, 4)
     assert summary.mean == pytest.approx(3.0)
@@ -403,22 +403,24 @@ def straight_track() -> Trajectory:
         (lambda: rpe_pairs(np.zeros((5, 3)), RpeDelta(0, "frames")), ValueError, "expected > 0"),
         (lambda: rpe_pairs(np.zeros((5, 3)), RpeDelta(1.5, "frames")), ValueError, "whole number"),
         (
-            lambda: pair(later_track(), stationary_track(), 1),
+            lambda: pair_poses(later_track(), stationary_track(), 1),
             UsageError,
             "no true pose has an estimate",
         ),
         (
-            lambda: pair(random_walk(1, 0), stationary_track(), 1),
+            lambda: pair_poses(random_walk(1, 0), stationary_track(), 1),
             UsageError,
             "0 true and 5 estimated",
         ),
         (
-            lambda: pair(random_walk(1), random_walk(2), 1, np.zeros((3, 6))),
+            lambda: pair_poses(random_walk(1), random_walk(2), 1, np.zeros((3, 6))),
             ValueError,
             r"expected \(60, 6\)",
         ),
         (
-            lambda: nees(Paired(random_walk(1), random_walk(1), None, Coverage(0, 0, 0, 0, 0)), 2),
+            lambda: squared_errors(
+                Paired(random_walk(1), random_walk(1), None, Coverage(0, 0, 0, 0, 0)), 2
+            ),
             ValueError,
             "cov_xyh: needed for NEES",
         ),

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.eval.scoring.drives import judge
+from crosscue.eval.scoring.drives import score_drive
 from crosscue.eval.scoring.run_tables import run_tables
 from crosscue.eval.scoring.scene.approaches import associate, judge_approaches, score_approaches
 from crosscue.eval.scoring.scene.belief import (
@@ -18,7 +18,7 @@ from crosscue.eval.scoring.scene.belief import (
     compare_belief,
     judge_belief,
     log_score,
-    reliability,
+    reliability_bins,
     score_belief,
 )
 from crosscue.eval.scoring.scene.detection import Definition
@@ -75,7 +75,7 @@ def test_feature_without_evaluated_cue_is_reported_as_not_looked_for(
     cues: dict[str, dict[int, int]] | None, detected: str, full: str
 ) -> None:
     steps = {**BELIEF, "intersection": {}, "right": {}}
-    judged = judge(tables(cues, belief_table(steps)), truth()).approaches
+    judged = score_drive(tables(cues, belief_table(steps)), truth()).approaches
 
     assert judged is not None
     assert judged.results[0].why_not_detected == detected
@@ -301,7 +301,7 @@ def test_brier_and_log_score_computed_by_hand() -> None:
 def test_reliability_of_calibrated_belief_is_on_diagonal() -> None:
     rng = np.random.default_rng(5)
     p = rng.uniform(0.0, 1.0, 20000)
-    bins = reliability(p, rng.uniform(0.0, 1.0, 20000) < p, np.arange(20000) % 20)
+    bins = reliability_bins(p, rng.uniform(0.0, 1.0, 20000) < p, np.arange(20000) % 20)
 
     assert len(bins) == 10
     assert sum(one.steps for one in bins) == 20000

@@ -14,14 +14,14 @@ from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, write_tum
 from crosscue.eval import cli
 from crosscue.eval.pipeline.replay import replay_drive
-from crosscue.eval.recording import save as save_recording
+from crosscue.eval.recording import save_rrd as save_recording
 from crosscue.eval.report.page import write_report
 from crosscue.eval.report.summary import pose_summary
 from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.files import FOLDER
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
-from crosscue.eval.scoring.runs import judge_run, metrics_of, scores_of
+from crosscue.eval.scoring.runs import judge_run, metrics_of, pooled_scores
 from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Images, Messages, Topic
@@ -195,7 +195,7 @@ class _Elements(HTMLParser):
 
 def _reported(run: RunFolder, path: Path) -> Path:
     one = judge_run(run, path)
-    scores = scores_of([one])
+    scores = pooled_scores([one])
     return write_report(
         run.file(FOLDER), [one], scores, metrics_of([one], scores), worst_frames([one])
     )

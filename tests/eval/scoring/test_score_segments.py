@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from crosscue.eval.drives.score import ScoreWork
-from crosscue.eval.report.summary import pose_summary, summary
+from crosscue.eval.report.summary import pose_summary, scores_text
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import ambiguous
 from crosscue.eval.scoring.columns import AMBIGUOUS
 from crosscue.eval.scoring.drives import ScoreSettings
-from crosscue.eval.scoring.runs import scores_of
+from crosscue.eval.scoring.runs import pooled_scores
 from support.gap_drive import Clock, replayed, write_drive
 
 
@@ -54,7 +54,7 @@ def test_rows_with_repeated_log_time_are_counted_in_all_scores(tmp_path: Path) -
     assert metrics["account"]["scoring"]["poses"]["skipped"][AMBIGUOUS] == pose["ambiguous"]
     parts = ("scored", "before_estimate", "after_estimate", "in_gap", "ambiguous")
     assert pose["truth_poses"] == sum(pose[part] for part in parts)
-    printed = summary(scores_of([scored.one]))
+    printed = scores_text(pooled_scores([scored.one]))
     assert f"ambiguous  {frames} frames not scored" in printed
     assert scored.one.pose is not None
     assert f"{pose['ambiguous']} whose log time comes twice" in pose_summary(scored.one.pose)

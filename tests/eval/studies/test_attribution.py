@@ -6,8 +6,13 @@ from collections.abc import Mapping
 import pytest
 
 from crosscue.eval.scoring.columns import RunTables
-from crosscue.eval.scoring.drives import as_metrics, judge, score
-from crosscue.eval.studies.attribution import Drive, attribute, attribution_lines, attribution_tree
+from crosscue.eval.scoring.drives import as_metrics, score, score_drive
+from crosscue.eval.studies.attribution import (
+    AttributedDrive,
+    attribute,
+    attribution_lines,
+    attribution_tree,
+)
 from crosscue.replay.files.tree_text import strict_json
 from support.scoring import BELIEF, CUES, belief_table, good_truth, range_table, tables
 
@@ -20,7 +25,7 @@ def _tables(belief: Beliefs) -> RunTables:
     return tables(CUES, belief_table(belief), range_table(8, 45, 0.5), frames=50)
 
 
-def _drive(name: str, by_cue: Mapping[str, Beliefs]) -> Drive:
+def _drive(name: str, by_cue: Mapping[str, Beliefs]) -> AttributedDrive:
     """A drive whose belief changes if one of the given cues is left out."""
     truth = good_truth(name)
 
@@ -28,7 +33,7 @@ def _drive(name: str, by_cue: Mapping[str, Beliefs]) -> Drive:
         changed = [belief for cue, belief in by_cue.items() if cue in cues]
         return _tables(changed[0] if changed else BELIEF)
 
-    return Drive(judge(_tables(BELIEF), truth), truth, estimate)
+    return AttributedDrive(score_drive(_tables(BELIEF), truth), truth, estimate)
 
 
 GROUPS = {

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from crosscue.detectors.base import Choice
+from crosscue.detectors.base import DetectorChoice
 from crosscue.eval.batch.jobs import in_turn
 from crosscue.eval.cli import run
 from crosscue.eval.studies import simulated_drives
@@ -42,7 +42,7 @@ def _run_in_this_process(patch: pytest.MonkeyPatch) -> None:
     """Run drives in this process, because a worker process would not have the patched detectors."""
     patch.setattr(simulated_drives, "load", _with_oracle)
     patch.setattr(study_intersections, "engine_of", lambda *_args: in_turn)
-    oracle = Choice("oracle", "support.oracle:build")
+    oracle = DetectorChoice("oracle", "support.oracle:build")
     patch.setattr(study_intersections, "choices_of", lambda _: {"oracle": oracle})
 
 

@@ -9,11 +9,11 @@ import pytest
 
 from crosscue.eval.scoring.intervals import Mean
 from crosscue.eval.scoring.truth import FEATURES
-from crosscue.eval.studies.layouts.report import tables_of, verdict, write_layout_study
+from crosscue.eval.studies.layouts.report import study_tables, verdict, write_layout_study
 from crosscue.eval.studies.layouts.score import (
     DriveBelief,
     LayoutScores,
-    difference,
+    score_difference,
     score_layouts,
 )
 from crosscue.eval.studies.layouts.settings import LayoutStudy
@@ -37,7 +37,7 @@ def beliefs(p: float) -> list[DriveBelief]:
 
 def scores() -> LayoutScores:
     first, second = beliefs(0.5), beliefs(0.95)
-    less = difference(first, second)
+    less = score_difference(first, second)
     return LayoutScores(
         {"source": score_layouts(first), "temporal": score_layouts(second)},
         {"temporal less source": less},
@@ -51,7 +51,7 @@ def scores() -> LayoutScores:
 
 
 def test_every_table_row_has_one_entry_per_column() -> None:
-    for table in tables_of(scores()):
+    for table in study_tables(scores()):
         assert {len(row) for row in table.rows} == {len(table.head)}
         assert table.as_text().startswith(table.heading)
 

@@ -14,7 +14,7 @@ from crosscue.datasets.scenes.layout import layout_named
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width, world_of
 from crosscue.eval.scoring.truth import FEATURES
 from crosscue.eval.studies import simulated_drives
-from crosscue.eval.studies.layouts.score import DriveBelief, difference, score_layouts
+from crosscue.eval.studies.layouts.score import DriveBelief, score_difference, score_layouts
 from crosscue.eval.studies.layouts.settings import LayoutStudy
 from crosscue.eval.studies.simulated_drives import MADE_BY, Work
 from crosscue.replay.errors import UsageError
@@ -103,8 +103,8 @@ def test_drives_become_outdated_by_code_changes_but_not_by_comments() -> None:
         '"""Heights."""\n\n\ndef height(x):\n    """Twice as high."""\n    return 2 * x  # m\n'
     )
 
-    assert simulated_drives.meaning_of(documented) == simulated_drives.meaning_of(plain)
-    assert simulated_drives.meaning_of(plain.replace("2", "3")) != simulated_drives.meaning_of(
+    assert simulated_drives.code_meaning(documented) == simulated_drives.code_meaning(plain)
+    assert simulated_drives.code_meaning(plain.replace("2", "3")) != simulated_drives.code_meaning(
         plain
     )
 
@@ -180,10 +180,10 @@ def test_difference_is_zero_for_equal_beliefs_and_antisymmetric() -> None:
     some = [belief({}, layout=f"M{i}") for i in range(6)]
     confident = [belief(CONFIDENT, layout=f"M{i}") for i in range(6)]
 
-    assert difference(some, some).brier.value == 0.0
-    assert difference(some, confident).brier.value == pytest.approx(
-        -difference(confident, some).brier.value
+    assert score_difference(some, some).brier.value == 0.0
+    assert score_difference(some, confident).brier.value == pytest.approx(
+        -score_difference(confident, some).brier.value
     )
-    assert difference(some, confident).brier.value < 0.0
+    assert score_difference(some, confident).brier.value < 0.0
     with pytest.raises(ValueError, match="the same drives"):
-        difference(some, confident[1:])
+        score_difference(some, confident[1:])

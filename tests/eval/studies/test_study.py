@@ -24,7 +24,7 @@ from crosscue.eval.studies.intervals import (
     ratio_of,
     ratio_of_means,
 )
-from crosscue.eval.studies.page import Table, write_page
+from crosscue.eval.studies.page import PageTable, write_study_page
 from crosscue.eval.studies.town import work
 from crosscue.eval.studies.town.field_study import drive_field, finish_field
 from crosscue.eval.studies.town.landmark_study import comparisons_of
@@ -33,7 +33,7 @@ from crosscue.eval.studies.town.range_study import (
     calibrate,
     drive_choices,
     implied_m,
-    summarise,
+    summarise_ranges,
 )
 from crosscue.eval.studies.town.replayed import through_log
 from crosscue.eval.studies.town.run import drive_study, finish_landmarks, finish_range
@@ -44,12 +44,12 @@ from crosscue.eval.studies.town.settings import (
     load_study,
 )
 from crosscue.eval.studies.town.work import assemble, chunks_of, run
-from crosscue.localization.town.drive import Keys, Result, drive_many
-from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
+from crosscue.localization.town.drive import DriveResult, Keys, drive_many
+from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import RunError, StudyFileError, UsageError, WorkerError
 
-TOWN = Drive(city=City(largest_km2=2.0))
+TOWN = TownDrive(city=City(largest_km2=2.0))
 SMALL = LandmarkStudy(
     drives=3, drive=TOWN, densities_per_km2=(0.5, 5.0), detection_rates=(0.6,), points=()
 )
@@ -76,8 +76,8 @@ def run_drives(study: LandmarkStudy, folder: Path, workers: int = 1) -> Path:
     return folder
 
 
-def counting(calls: list[int], fail_at: int | None = None) -> Callable[[Drive, Keys], Floats]:
-    def drive(settings: Drive, seeds: Keys) -> Floats:
+def counting(calls: list[int], fail_at: int | None = None) -> Callable[[TownDrive, Keys], Floats]:
+    def drive(settings: TownDrive, seeds: Keys) -> Floats:
         calls.append(len(seeds))
         if fail_at is not None and len(calls) >= fail_at:
             raise MemoryError("the worker died here")
@@ -170,7 +170,11 @@ def test_extra_distance_is_averaged_over_pairs_reached_goals_and_all_drives() ->
         ratio_of_means(distances_m[0], outcomes[1], distances_m[1], outcomes[1]).value
     )
     rows = [
-        {**dict.fromkeys(Result._fields, np.ones(3)), "travelled_m": distance_m, "outcome": outcome}
+        {
+            **dict.fromkeys(DriveResult._fields, np.ones(3)),
+            "travelled_m": distance_m,
+            "outcome": outcome,
+        }
         for distance_m, outcome in zip(distances_m, outcomes, strict=True)
     ]
     (found,) = comparisons_of(study, rows)
@@ -303,8 +307,8 @@ def test_invalid_drive_option_is_named(
 
 
 def test_page_is_self_contained_and_adapts_to_screen_and_colour_scheme(tmp_path: Path) -> None:
-    table = Table("<heading>", ("what", "km"), (("<b>", "1.0"),))
-    write_page(tmp_path / "p.html", "Title", ["a & b"], [table, table], [])
+    table = PageTable("<heading>", ("what", "km"), (("<b>", "1.0"),))
+    write_study_page(tmp_path / "p.html", "Title", ["a & b"], [table, table], [])
     page = (tmp_path / "p.html").read_text()
 
     assert "prefers-color-scheme:dark" in page
@@ -330,7 +334,7 @@ def test_city_without_intersections_is_refused(tmp_path: Path) -> None:
     blocks = City(
         smallest_km2=0.25, largest_km2=0.25, shortest_block_m=900.0, longest_block_m=950.0
     )
-    study = SMALL.model_copy(update={"drive": Drive(city=blocks)})
+    study = SMALL.model_copy(update={"drive": TownDrive(city=blocks)})
 
     with pytest.raises(UsageError, match=r"no intersection.*drive\.city"):
         list(drive_study(study, tmp_path, 1))
@@ -368,7 +372,7 @@ def test_default_seeds_differ_from_calibration_seed() -> None:
 
 @pytest.mark.slow
 def test_default_compass_interval_equals_calibrated_one() -> None:
-    default = Drive()
+    default = TownDrive()
 
     assert calibrate(default, 2, tolerance=0.01) == default.sensors.compass_interval_m
 
@@ -381,7 +385,7 @@ def test_distance_until_loss_scales_with_squared_compass_error(tmp_path: Path) -
         patch.setattr(work, "CHUNK_DRIVES", 60)
         list(drive_study(study, tmp_path, 2))
     finish_range(study, tmp_path)
-    twenty, thirty, none = summarise(study, RunFolder(tmp_path).table("drives"))
+    twenty, thirty, none = summarise_ranges(study, RunFolder(tmp_path).table("drives"))
 
     ratio = twenty.lost_after_m.value / thirty.lost_after_m.value
     assert ratio == pytest.approx(2.25, rel=0.12)
@@ -391,7 +395,7 @@ def test_distance_until_loss_scales_with_squared_compass_error(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_simulated_drive_replayed_from_log_matches_simulation(tmp_path: Path) -> None:
-    settings = Drive(
+    settings = TownDrive(
         city=City(largest_km2=1.5),
         landmarks_per_km2=20.0,
         navigation=Navigation(strategy="landmark to landmark"),

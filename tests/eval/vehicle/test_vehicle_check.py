@@ -12,7 +12,7 @@ import pytest
 import crosscue
 from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.eval.cli import run
-from crosscue.eval.vehicle.check import Checked, _normalized, check
+from crosscue.eval.vehicle.check import Checked, _normalized, check_drive_signals
 from crosscue.eval.vehicle.ground_picture import draw_ground
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Table, Topic
@@ -43,7 +43,7 @@ def checked_signals(yaw_sign: float = 1.0, wheel_scale: float = 1.0) -> Checked:
         fix = {"course_rad": course[some], "speed_mps": np.full(20, 10.0)}
         blocks.append(Block("fix", times[some], Table(fix)))
     log = MemoryLog((WHEELS, GYRO, FIX), blocks, path=Path(__file__))
-    return check([log], Vehicle(version=1), EVERYTHING)
+    return check_drive_signals([log], Vehicle(version=1), EVERYTHING)
 
 
 def test_consistent_signals_have_no_contradictions() -> None:

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 
 from crosscue.localization.landmarks.database import (
     LandmarkDatabase,
+    LandmarkPosition,
     LandmarkWriter,
-    Place,
     is_positive,
 )
-from crosscue.localization.landmarks.features import Features
+from crosscue.localization.landmarks.features import Keypoints
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogError, LogFormatError, OutputError, UsageError
 from support.landmark_files import database_of, place_at, some_features
@@ -31,11 +31,11 @@ GRID = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0)), axis=-1).reshape(
 
 def test_places_and_features_survive_a_round_trip(tmp_path: Path) -> None:
     cov = np.array([[4.0, 1.0], [1.0, 9.0]])
-    place = Place("north\nwest ☃", np.array([4.1e5, 5.3e6]), cov, -1.25, "survey")
+    place = LandmarkPosition("north\nwest ☃", np.array([4.1e5, 5.3e6]), cov, -1.25, "survey")
     given_features = some_features(3)
     with LandmarkWriter(tmp_path / "lm.sqlite", "orb") as writer:
         writer.add(place, given_features)
-        writer.add(Place("no heading", np.zeros(2), cov), some_features(4, 0))
+        writer.add(LandmarkPosition("no heading", np.zeros(2), cov), some_features(4, 0))
 
     with LandmarkDatabase(tmp_path / "lm.sqlite") as database:
         first, second = list(database)
@@ -116,7 +116,7 @@ def test_empty_database_has_no_candidates(tmp_path: Path) -> None:
 )
 def test_invalid_covariance_is_refused(cov: list[list[float]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Place("bad", np.zeros(2), np.array(cov))
+        LandmarkPosition("bad", np.zeros(2), np.array(cov))
 
 
 @given(st.floats(0.01, 1e3), st.floats(0.01, 1e3), st.floats(-0.99, 0.99))
@@ -128,18 +128,18 @@ def test_valid_covariance_is_positive(sd_x: float, sd_y: float, correlation: flo
 
 def test_coordinates_that_are_not_finite_are_refused() -> None:
     with pytest.raises(ValueError, match="landmark x: expected finite numbers"):
-        Place("x", np.array([np.nan, 0.0]), np.eye(2))
+        LandmarkPosition("x", np.array([np.nan, 0.0]), np.eye(2))
     with pytest.raises(ValueError, match="heading inf"):
-        Place("x", np.zeros(2), np.eye(2), np.inf)
+        LandmarkPosition("x", np.zeros(2), np.eye(2), np.inf)
 
 
 def test_invalid_names_and_feature_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match="name"):
-        Place("", np.zeros(2), np.eye(2))
+        LandmarkPosition("", np.zeros(2), np.eye(2))
     with pytest.raises(ValueError, match="expected Unicode"):
-        Place("\udcff", np.zeros(2), np.eye(2))
+        LandmarkPosition("\udcff", np.zeros(2), np.eye(2))
     with pytest.raises(ValueError, match=r"points_px: expected \(3, 2\)"):
-        Features(1, 1, np.zeros((2, 2), np.float32), np.zeros((3, 32), np.uint8))
+        Keypoints(1, 1, np.zeros((2, 2), np.float32), np.zeros((3, 32), np.uint8))
 
 
 def test_query_wider_than_the_index_boxes_is_refused(grid: Path) -> None:

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.localization.landmarks.features import CameraGeometry, Features, make_matcher
-from crosscue.localization.landmarks.images import grey_of, picture_of, read_picture
+from crosscue.localization.landmarks.features import CameraGeometry, Keypoints, make_matcher
+from crosscue.localization.landmarks.images import copy_picture, grey_of, read_encoded
 from crosscue.localization.landmarks.matcher import OrbMatcher, OrbSettings
 from crosscue.replay.columns import Bytes, Images, Messages
 from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError, UsageError
@@ -61,7 +61,7 @@ def test_picture_without_texture_matches_nothing(name: str, shade: int) -> None:
 def test_coincident_points_have_score_zero(name: str) -> None:
     matcher = make_matcher(name, CAMERA)
     made = some_features(1, 40)
-    spot = Features(640, 480, np.full((40, 2), 5.0, np.float32), made.descriptors)
+    spot = Keypoints(640, 480, np.full((40, 2), 5.0, np.float32), made.descriptors)
 
     assert matcher.match(spot, spot).score == 0.0
 
@@ -86,7 +86,7 @@ def test_features_of_any_picture_size_are_in_its_pixels(size: tuple[int, int]) -
 
 
 def test_descriptors_of_different_lengths_do_not_match() -> None:
-    other = Features(9, 9, np.zeros((5, 2), np.float32), np.zeros((5, 16), np.uint8))
+    other = Keypoints(9, 9, np.zeros((5, 2), np.float32), np.zeros((5, 16), np.uint8))
 
     assert ORB.match(some_features(1), other).score == 0.0
 
@@ -122,23 +122,23 @@ def test_picture_file_is_decoded_and_truncated_one_refused(tmp_path: Path, suffi
     content = encoded(wall(1, 120, 90), suffix)
     path.write_bytes(content)
 
-    grey = grey_of(read_picture(path))
+    grey = grey_of(read_encoded(path))
     assert grey.shape == (90, 120)
     assert np.abs(grey.astype(int) - wall(1, 120, 90)).mean() < 12
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(LogFormatError, match=r"cut short|does not decode"):
-        grey_of(read_picture(path))
+        grey_of(read_encoded(path))
 
 
 def test_files_that_are_not_pictures_are_reported(tmp_path: Path) -> None:
     (tmp_path / "text.png").write_text("hello")
     with pytest.raises(LogFormatError, match=r"text\.png: not a JPEG, PNG or WebP picture"):
-        read_picture(tmp_path / "text.png")
+        read_encoded(tmp_path / "text.png")
     with pytest.raises(LogError, match=r"missing\.png: No such file"):
-        read_picture(tmp_path / "missing.png")
+        read_encoded(tmp_path / "missing.png")
     (tmp_path / "wall.png").write_bytes(encoded(wall(1)))
     with pytest.raises(LogTooLargeError, match=r"wall\.png: picture of \d+ bytes: more than 1000"):
-        read_picture(tmp_path / "wall.png", Limits(message_bytes=1000))
+        read_encoded(tmp_path / "wall.png", Limits(message_bytes=1000))
 
 
 def _raw(picture: Bytes, pixel_format: str, step: int | None = None) -> Images:
@@ -160,10 +160,10 @@ def test_raw_pictures_of_each_format_convert_to_grey() -> None:
     colour = np.repeat(grey[:, :, None], 3, axis=2)
 
     for picture, name in ((grey, "mono8"), (colour, "rgb8"), (colour, "bgr8")):
-        np.testing.assert_array_equal(grey_of(picture_of(_raw(picture, name), 0)), grey)
+        np.testing.assert_array_equal(grey_of(copy_picture(_raw(picture, name), 0)), grey)
     red = np.zeros((2, 2, 3), np.uint8)
     red[:, :, 0] = 200
-    assert (grey_of(picture_of(_raw(red, "rgb8"), 0)) == 60).all()
+    assert (grey_of(copy_picture(_raw(red, "rgb8"), 0)) == 60).all()
     padded = np.zeros((30, 48), np.uint8)
     padded[:, :40] = grey
     images = _raw(padded, "mono8", 48)
@@ -175,13 +175,13 @@ def test_raw_pictures_of_each_format_convert_to_grey() -> None:
         images.step_bytes,
         images.pixel_format,
     )
-    np.testing.assert_array_equal(grey_of(picture_of(narrow, 0)), grey)
+    np.testing.assert_array_equal(grey_of(copy_picture(narrow, 0)), grey)
 
 
 def test_real_street_pictures_match_only_their_neighbours() -> None:
     """KITTI, frames at intervals of about 1 m, in a turn of 98 degrees."""
     folder = shared("sequences", "kitti_seq2_right_turn_98deg", "image_l")
-    seen = [ORB.describe(grey_of(read_picture(folder / f"{i:06d}.png"))) for i in (0, 3, 47, 50)]
+    seen = [ORB.describe(grey_of(read_encoded(folder / f"{i:06d}.png"))) for i in (0, 3, 47, 50)]
 
     assert ORB.match(seen[0], seen[1]).score > 100
     assert ORB.match(seen[2], seen[3]).score > 100
@@ -192,7 +192,7 @@ def test_real_pictures_of_other_days_rarely_match() -> None:
     """Few of eight known pairs match: ORB is not robust to seasons and changed facades."""
     folder = shared("place_recognition")
     orb = OrbMatcher(OrbSettings(features=1000))
-    seen = {p.stem: orb.describe(grey_of(read_picture(p))) for p in folder.rglob("*.jpg")}
+    seen = {p.stem: orb.describe(grey_of(read_encoded(p))) for p in folder.rglob("*.jpg")}
     same = {
         ("gmb_q1", "gmb_db2"),
         ("gmb_q2", "gmb_db5"),

@@ -13,7 +13,11 @@ from hypothesis import strategies as st
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.ekf import PoseBelief, is_lost, major_axis_m, update_position
-from crosscue.localization.landmarks.database import LandmarkDatabase, LandmarkWriter, Place
+from crosscue.localization.landmarks.database import (
+    LandmarkDatabase,
+    LandmarkPosition,
+    LandmarkWriter,
+)
 from crosscue.localization.landmarks.update import (
     LandmarkSettings,
     camera_position,
@@ -24,7 +28,7 @@ from crosscue.localization.pose_track import (
     Advance,
     TrackSettings,
     TrackState,
-    advance,
+    advance_pose,
     start_belief,
 )
 from crosscue.replay.columns import Floats
@@ -153,7 +157,7 @@ def run(
             lever_m=lever_m,
         )
         measurements = PlaceMeasurements(search_in(database, options), truth, lever_m=lever_m)
-        done = advance(
+        done = advance_pose(
             TrackState(first), made.increments, EVERY_READING, headings, measurements=measurements
         )
     return done, truth, measurements
@@ -220,7 +224,7 @@ def follow(
     if not path.exists():
         with LandmarkWriter(path, "nearness") as writer:
             for name, xy in marks.items():
-                writer.add(Place(name, xy, np.eye(2)), features_at(xy))
+                writer.add(LandmarkPosition(name, xy, np.eye(2)), features_at(xy))
     exact = OdometrySettings(track_width_m=TRACK_M)
     made = integrate(wheels(truth, exact), exact, gyro(truth, exact)).increments
     first = start_belief(
@@ -235,7 +239,7 @@ def follow(
     )
     with LandmarkDatabase(path) as database:
         measurements = PlaceMeasurements(search_in(database, options), truth)
-        return advance(
+        return advance_pose(
             TrackState(first), made, TrackSettings(), measurements=measurements
         ), measurements
 
@@ -298,9 +302,9 @@ def test_only_landmarks_inside_the_ellipse_are_matched(tmp_path: Path) -> None:
     place = np.array([100.0, 0.0])
     path = tmp_path / "twins.sqlite"
     with LandmarkWriter(path, "nearness") as writer:
-        writer.add(Place("right", place, np.eye(2)), features_at(place))
+        writer.add(LandmarkPosition("right", place, np.eye(2)), features_at(place))
         writer.add(
-            Place("twin", place + np.array([0.0, 100.0]), np.eye(2)),
+            LandmarkPosition("twin", place + np.array([0.0, 100.0]), np.eye(2)),
             features_at(place + np.array([0.0, 0.01])),
         )
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import streets_of
 from crosscue.localization.town.parameters import parameters_of
-from crosscue.localization.town.random_stream import Stream, normal, stream_of, uniform
-from crosscue.localization.town.settings import City, Drive
+from crosscue.localization.town.random_stream import RandomStream, normal, stream_of, uniform
+from crosscue.localization.town.settings import City, TownDrive
 from crosscue.localization.town.streets import (
     Streets,
     draw_goal,
@@ -23,15 +23,15 @@ from crosscue.localization.town.streets import (
     has_intersection,
     has_way,
     make_streets,
-    place_of,
+    node_position,
     step_of,
 )
-from crosscue.replay.compiled import compiled
+from crosscue.replay.compiled import compile_function
 
-SMALL = Drive(city=City(largest_km2=3.0, one_way_fraction=0.5, dead_end_fraction=0.1))
+SMALL = TownDrive(city=City(largest_km2=3.0, one_way_fraction=0.5, dead_end_fraction=0.1))
 
 
-def stream(seed: int, purpose: int = 7) -> Stream:
+def stream(seed: int, purpose: int = 7) -> RandomStream:
     with np.errstate(over="ignore"):
         return stream_of(np.uint64(seed), np.uint64(purpose))
 
@@ -69,11 +69,11 @@ def test_goal_is_reachable_from_every_reachable_intersection(seed: int) -> None:
 def test_every_street_leads_to_an_intersection_with_an_exit(seed: int) -> None:
     streets = streets_of(SMALL, seed)
     for node in range(len(streets.ways)):
-        x, y = place_of(streets, node)
+        x, y = node_position(streets, node)
         for way, (dx, dy) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
             if has_way(streets.ways, node, way):
                 there = node + step_of(way, len(streets.xs_m))
-                there_x, there_y = place_of(streets, there)
+                there_x, there_y = node_position(streets, there)
                 assert (np.sign(there_x - x), np.sign(there_y - y)) == (dx, dy)
                 assert streets.ways[there] != 0
 
@@ -89,7 +89,7 @@ def test_compiled_city_matches_python_and_is_reproducible() -> None:
 
 def test_block_lengths_and_area_are_in_their_ranges() -> None:
     for seed in range(20):
-        city = streets_of(Drive(), seed)
+        city = streets_of(TownDrive(), seed)
         for coordinates in (city.xs_m, city.ys_m):
             blocks = np.diff(coordinates)
             assert blocks.min() >= 50.0
@@ -98,8 +98,8 @@ def test_block_lengths_and_area_are_in_their_ranges() -> None:
 
 
 def test_landmarks_are_distinct_and_of_the_requested_density() -> None:
-    streets = streets_of(Drive(city=drive_settings.City(smallest_km2=50.0)), 2)
-    draw = compiled(draw_landmarks)
+    streets = streets_of(TownDrive(city=drive_settings.City(smallest_km2=50.0)), 2)
+    draw = compile_function(draw_landmarks)
     drawn = [draw(stream(i), streets, 2.0)[0] for i in range(40)]
 
     assert np.mean([len(one) for one in drawn]) == pytest.approx(2.0 * streets.area_km2, rel=0.1)

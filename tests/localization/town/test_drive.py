@@ -20,37 +20,37 @@ from crosscue.localization.town.drive import (
     LANDMARK_SET,
     LANDMARK_TAKEN,
     STEP_FIELDS,
-    Log,
-    Outcome,
-    Result,
+    DriveOutcome,
+    DriveRecord,
+    DriveResult,
     as_result,
-    drive,
     drive_many,
     drive_traced,
+    simulate_town_drive,
 )
-from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
+from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
 from crosscue.replay.columns import Floats
 from crosscue.replay.compiled import fingerprint
 
-FIELD = {name: i for i, name in enumerate(Result._fields)}
+FIELD = {name: i for i, name in enumerate(DriveResult._fields)}
 TOWN = City(largest_km2=3.0)
 TANGLED = City(largest_km2=4.0, dead_end_fraction=0.15, one_way_fraction=0.6)
 KINDS = {
-    "town": Drive(city=TOWN),
-    "no compass": Drive(sensors=Sensors(compass_2sigma_deg=None)),
-    "tangled, hybrid": Drive(
+    "town": TownDrive(city=TOWN),
+    "no compass": TownDrive(sensors=Sensors(compass_2sigma_deg=None)),
+    "tangled, hybrid": TownDrive(
         city=TANGLED,
         landmarks_per_km2=4.0,
         navigation=Navigation(strategy="hybrid", hybrid_above_m=15.0),
         longest_m=2000.0,
     ),
-    "landmark to landmark": Drive(
+    "landmark to landmark": TownDrive(
         city=TOWN,
         landmarks_per_km2=8.0,
         sensors=Sensors(detection_rate=0.6, landmark_gate_nis=4.0),
         navigation=Navigation(strategy="landmark to landmark"),
     ),
-    "field": Drive(
+    "field": TownDrive(
         city=City(smallest_km2=1.0, largest_km2=1.0),
         landmarks_per_km2=0.55,
         landmark_per_goal=True,
@@ -58,12 +58,12 @@ KINDS = {
         longest_s=200.0,
         navigation=Navigation(strategy="landmark to landmark"),
     ),
-    "maze": Drive(
+    "maze": TownDrive(
         city=City(dead_end_fraction=0.2, one_way_fraction=0.8, smallest_km2=2.0, largest_km2=3.0),
         landmarks_per_km2=5.0,
         longest_m=600.0,
     ),
-    "coarse": Drive(
+    "coarse": TownDrive(
         city=TOWN, car=drive_settings.Car(step_s=0.05, cruise_mps=7.0), longest_m=800.0
     ),
 }
@@ -73,7 +73,7 @@ def seeds(count: int, first: int = 0) -> np.ndarray[tuple[int], np.dtype[np.uint
     return np.arange(first, first + count, dtype=np.uint64)
 
 
-def many(settings: Drive, count: int, first: int = 0) -> Floats:
+def many(settings: TownDrive, count: int, first: int = 0) -> Floats:
     parts = np.array_split(seeds(count, first), 8)
     with ThreadPoolExecutor(2) as pool:
         return np.concatenate(list(pool.map(lambda part: drive_many(settings, part), parts)))
@@ -82,7 +82,7 @@ def many(settings: Drive, count: int, first: int = 0) -> Floats:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_compiled_drive_matches_python(kind: str) -> None:
-    plain = np.array([drive(KINDS[kind], seed) for seed in range(3)], np.float64)
+    plain = np.array([simulate_town_drive(KINDS[kind], seed) for seed in range(3)], np.float64)
 
     np.testing.assert_allclose(drive_many(KINDS[kind], seeds(3)), plain, rtol=1e-9, atol=1e-9)
 
@@ -91,10 +91,10 @@ def test_traced_drive_matches_python_step_by_step() -> None:
     settings = KINDS["landmark to landmark"]
     traced = drive_traced(settings, 3)
     n_steps, n_events = len(traced.steps), len(traced.events)
-    log = Log(
+    log = DriveRecord(
         np.empty((n_steps, STEP_FIELDS)), np.empty((n_events, EVENT_FIELDS)), np.zeros(1, np.int64)
     )
-    result = drive(settings, 3, log)
+    result = simulate_town_drive(settings, 3, log)
 
     assert traced.result == pytest.approx(result, rel=1e-9)
     np.testing.assert_allclose(traced.steps, log.steps, rtol=1e-9, atol=1e-9)
@@ -154,10 +154,10 @@ def test_drives_in_parts_are_bit_identical_to_all_at_once() -> None:
 @pytest.mark.parametrize(
     "settings",
     [
-        Drive(),
-        Drive(sensors=Sensors(compass_2sigma_deg=20.0)),
-        Drive(sensors=Sensors(compass_2sigma_deg=10.0)),
-        Drive(
+        TownDrive(),
+        TownDrive(sensors=Sensors(compass_2sigma_deg=20.0)),
+        TownDrive(sensors=Sensors(compass_2sigma_deg=10.0)),
+        TownDrive(
             landmarks_per_km2=1.0,
             navigation=Navigation(strategy="hybrid"),
             sensors=Sensors(detection_rate=0.6),
@@ -165,7 +165,7 @@ def test_drives_in_parts_are_bit_identical_to_all_at_once() -> None:
     ],
     ids=["30 degrees", "20 degrees", "10 degrees", "landmarks"],
 )
-def test_nees_of_drives_is_in_its_band(settings: Drive) -> None:
+def test_nees_of_drives_is_in_its_band(settings: TownDrive) -> None:
     """400 drives cannot resolve the 4 % excess that 20,000 drives show at 20 to 30 degrees."""
     rows = many(settings, 400)
     low, high = mean_band(3, 400)
@@ -175,7 +175,7 @@ def test_nees_of_drives_is_in_its_band(settings: Drive) -> None:
 
 def test_nees_without_a_compass_exceeds_its_band() -> None:
     """Without a compass, true positions spread along an arc, but the filter assumes an ellipse."""
-    rows = many(Drive(sensors=Sensors(compass_2sigma_deg=None)), 400)
+    rows = many(TownDrive(sensors=Sensors(compass_2sigma_deg=None)), 400)
     _, high = mean_band(3, 400)
 
     assert rows[:, FIELD["nees"]].mean() > high
@@ -208,8 +208,8 @@ def test_cars_on_long_streets_are_lost_at_the_predicted_distance() -> None:
     )
     # The slip is large enough that the start heading soon loses its effect.
     sensors = Sensors(compass_2sigma_deg=60.0, compass_interval_m=4.0, slip_per_sqrt_m=0.03)
-    rows = many(Drive(city=city, sensors=sensors), 200)
-    lost = rows[(rows[:, FIELD["outcome"]] == Outcome.LOST) & (rows[:, FIELD["turns"]] == 0)]
+    rows = many(TownDrive(city=city, sensors=sensors), 200)
+    lost = rows[(rows[:, FIELD["outcome"]] == DriveOutcome.LOST) & (rows[:, FIELD["turns"]] == 0)]
     law_m = 25.0**2 / (math.radians(30.0) ** 2 * 4.0)
 
     assert len(lost) > 20
@@ -217,8 +217,8 @@ def test_cars_on_long_streets_are_lost_at_the_predicted_distance() -> None:
 
 
 def test_landmarks_are_passed_but_not_detected_at_zero_rate() -> None:
-    none = drive_many(Drive(city=TOWN), seeds(6))
-    blind = Drive(city=TOWN, landmarks_per_km2=5.0, sensors=Sensors(detection_rate=0.0))
+    none = drive_many(TownDrive(city=TOWN), seeds(6))
+    blind = TownDrive(city=TOWN, landmarks_per_km2=5.0, sensors=Sensors(detection_rate=0.0))
     unseen = drive_many(blind, seeds(6))
 
     assert (none[:, FIELD["passed"]] == 0).all()
@@ -232,14 +232,14 @@ def test_city_without_intersections_is_refused() -> None:
     )
 
     with pytest.raises(ValueError, match="no intersection"):
-        drive_many(Drive(city=blocks), seeds(3))
+        drive_many(TownDrive(city=blocks), seeds(3))
 
 
 @pytest.mark.parametrize(
     ("section", "field", "value"),
     [
-        (Drive, "landmarks_per_km2", -1.0),
-        (Drive, "landmarks_per_km2", 1e6),
+        (TownDrive, "landmarks_per_km2", -1.0),
+        (TownDrive, "landmarks_per_km2", 1e6),
         (Sensors, "detection_rate", 1.1),
         (Sensors, "landmark_sd_m", 0.0),
         (Sensors, "compass_2sigma_deg", float("nan")),
@@ -248,7 +248,7 @@ def test_city_without_intersections_is_refused() -> None:
     ],
 )
 def test_settings_out_of_range_are_refused(
-    section: type[Drive] | type[Sensors] | type[City], field: str, value: float
+    section: type[TownDrive] | type[Sensors] | type[City], field: str, value: float
 ) -> None:
     with pytest.raises(ValidationError, match=field):
         section.model_validate({field: value})

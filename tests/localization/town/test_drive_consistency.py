@@ -15,25 +15,25 @@ from crosscue.localization.angles import wrap_all
 from crosscue.localization.town.drive import (
     LANDMARK_REFUSED,
     LANDMARK_TAKEN,
-    Result,
+    DriveResult,
     Traced,
     drive_many,
     drive_traced,
 )
-from crosscue.localization.town.settings import City, Drive, Navigation, Sensors
+from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
 from crosscue.replay.columns import Floats
 
-NEES = Result._fields.index("nees")
+NEES = DriveResult._fields.index("nees")
 FINE_M = 1e-4
 NO_GATE = 1e9
 
 
-def fine_encoders(compass_2sigma_deg: float | None, *, goals: int = 1) -> Drive:
+def fine_encoders(compass_2sigma_deg: float | None, *, goals: int = 1) -> TownDrive:
     sensors = Sensors(compass_2sigma_deg=compass_2sigma_deg, encoder_step_m=FINE_M)
-    return Drive(sensors=sensors, goals=goals)
+    return TownDrive(sensors=sensors, goals=goals)
 
 
-def compass_innovations(settings: Drive, traced: Traced) -> tuple[Floats, Floats]:
+def compass_innovations(settings: TownDrive, traced: Traced) -> tuple[Floats, Floats]:
     """Innovations of the compass, and their variances according to the filter."""
     sensors, track_m = settings.sensors, settings.car.track_width_m
     assert sensors.compass_2sigma_deg is not None
@@ -83,7 +83,7 @@ def test_compass_innovations_are_white_and_consistent(compass_deg: float) -> Non
 
 
 def test_landmark_nis_is_in_its_band() -> None:
-    settings = Drive(
+    settings = TownDrive(
         city=City(largest_km2=9.0),
         landmarks_per_km2=5.0,
         navigation=Navigation(strategy="landmark to landmark"),

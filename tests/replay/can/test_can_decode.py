@@ -21,7 +21,7 @@ from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
 from crosscue.replay.can.encode import encode
 from crosscue.replay.can.extract import PRESENT_SUFFIX
-from crosscue.replay.can.layout import Arithmetic, CanMessage, CanSignal, is_whole
+from crosscue.replay.can.layout import Arithmetic, CanMessage, CanSignal, is_integer
 from crosscue.replay.columns import Block, Table
 from crosscue.replay.ledger import Ledger
 from support.can_layouts import block_of, dbc_text, frames_of, messages
@@ -126,7 +126,7 @@ def test_decoded_values_equal_cantools(
 
 
 def _is_integral(signal: CanSignal) -> bool:
-    return not signal.is_float and is_whole(signal.scale) and is_whole(signal.offset)
+    return not signal.is_float and is_integer(signal.scale) and is_integer(signal.offset)
 
 
 def invertible(message: CanMessage) -> CanMessage:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from crosscue.replay.can import decode as decoding
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
-from crosscue.replay.can.grouping import Engine, Rules
+from crosscue.replay.can.grouping import CanDecoder, MessageRules
 from crosscue.replay.can.layout import CanMessage, CanSignal
 from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Table
 from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
@@ -293,7 +293,7 @@ def test_auto_engine_compiles_loops_after_enough_frames(monkeypatch: pytest.Monk
     compiled = []
     compile_engine = decoding.compiled_engine
 
-    def counted(rules: Sequence[Rules]) -> Engine:
+    def counted(rules: Sequence[MessageRules]) -> CanDecoder:
         compiled.append(len(rules))
         return compile_engine(rules)
 

@@ -11,7 +11,7 @@ from cantools.database.can.formats import dbc
 
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import TOO_SHORT, UNKNOWN_ID, BusDecoder, DecodeSettings, EngineName
-from crosscue.replay.can.layout import overlaps
+from crosscue.replay.can.layout import overlapping_signals
 from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
@@ -95,7 +95,7 @@ def test_decodable_frames_of_real_bus_equal_cantools(bus: str, engine: EngineNam
         ours = blocks[message.topic_name]
         assert len(ours) == len(rows)
         compared += len(rows)
-        for one in split_messages(theirs[message.key], any(overlaps(message))):
+        for one in split_messages(theirs[message.key], any(overlapping_signals(message))):
             assert_same_columns(ours, one, rows)
     assert compared == sum(map(len, blocks.values())) == ledger.topic(block.topic).used
     assert set(ledger.topic(block.topic).skipped) <= {UNKNOWN_ID, TOO_SHORT}

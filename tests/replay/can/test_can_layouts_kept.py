@@ -19,7 +19,7 @@ from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.dbc_text import read_dbc
 from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.can.layout import CanMessage
-from crosscue.replay.can.layout_cache import VARIABLE, cache_folder
+from crosscue.replay.can.layout_cache import VARIABLE, layout_cache_folder
 from crosscue.replay.can.sources import DatabaseText, read_text
 from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.errors import SchemaError
@@ -286,12 +286,12 @@ def test_files_are_parsed_without_cache_folder(
 
 
 def test_cache_folder_follows_environment() -> None:
-    assert cache_folder({VARIABLE: "/a"}) == Path("/a")
-    assert cache_folder({VARIABLE: "off"}) is None
-    assert cache_folder({"XDG_CACHE_HOME": "/b"}) == Path("/b/crosscue/can_layouts")
+    assert layout_cache_folder({VARIABLE: "/a"}) == Path("/a")
+    assert layout_cache_folder({VARIABLE: "off"}) is None
+    assert layout_cache_folder({"XDG_CACHE_HOME": "/b"}) == Path("/b/crosscue/can_layouts")
     home = Path.home() / ".cache/crosscue/can_layouts"
-    assert cache_folder({}) == home
-    assert cache_folder({"XDG_CACHE_HOME": "relative"}) == home
+    assert layout_cache_folder({}) == home
+    assert layout_cache_folder({"XDG_CACHE_HOME": "relative"}) == home
 
 
 _LOAD_OFTEN = """

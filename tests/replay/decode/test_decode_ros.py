@@ -18,7 +18,7 @@ from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.refuse import MISFIT, WRONG_CODING
 from crosscue.replay.decode.ros.decoder import RosDecoder
 from crosscue.replay.decode.ros.fields import WalkedFields
-from crosscue.replay.decode.ros.standard import Kind, generic
+from crosscue.replay.decode.ros.standard import RosConversion, generic
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from support.ros_messages import (
@@ -42,7 +42,7 @@ def generic_decoder(topic: Topic) -> RosDecoder:
     """Return the generic decoder, even for a type with standard columns."""
     decoder = decoder_of(topic)
     assert isinstance(decoder, RosDecoder)
-    return replace(decoder, kind=Kind((), generic))
+    return replace(decoder, kind=RosConversion((), generic))
 
 
 def serialized(store: Typestore, message: object, name: str, *, little: bool = True) -> bytes:

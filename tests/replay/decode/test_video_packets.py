@@ -15,8 +15,8 @@ from crosscue.replay.columns import Block, Images, Topic
 from crosscue.replay.decode.packets import NO_PICTURE, NOT_DECODED
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.signals.extractor import Extractor
-from crosscue.replay.signals.kinds import Plan, Source
+from crosscue.replay.signals.extractor import SampleExtractor
+from crosscue.replay.signals.kinds import SignalPlan, SignalSource
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.videos import SIZE_PX, number_of, video
 
@@ -40,8 +40,8 @@ def numbers_shown(topic: Topic, blocks: list[Block]) -> tuple[dict[int, int], Le
             found[t_ns] = number_of(pixels.reshape(SIZE_PX[1], SIZE_PX[0], 3))
 
     ledger = Ledger("video")
-    planned = Plan((Source(0, topic, ()),), {})
-    extractor = Extractor(planned, Vehicle(version=1), 0, ledger, on_pictures=read_numbers)
+    planned = SignalPlan((SignalSource(0, topic, ()),), {})
+    extractor = SampleExtractor(planned, Vehicle(version=1), 0, ledger, on_pictures=read_numbers)
     for block in blocks:
         for _ in extractor(block):
             pass

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
-from crosscue.replay.mobileye.geometry import Mounting
+from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.layout import VARIANTS
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from support.mobileye_frames import MS, frames, join, random_drive, status, triple, values
 
-ORIGIN_MOUNTING = Mounting()
+ORIGIN_MOUNTING = DevicePosition()
 DEVICE_FRAME = MobileyeSettings(mounting=ORIGIN_MOUNTING)
 
 
@@ -242,7 +242,7 @@ def test_missing_mounting_calibration_is_a_notice() -> None:
 def test_obstacle_positions_are_relative_to_rear_axle() -> None:
     """The device is 3 m ahead, rotated left by 90 degrees; the obstacle is 24 m ahead of it."""
     sent = [status(1, 0), (0x739, "0180014002003003"), *triple(0, 1)[1:]]
-    turned = MobileyeSettings(mounting=Mounting(3.0, 0.5, radians(90)))
+    turned = MobileyeSettings(mounting=DevicePosition(3.0, 0.5, radians(90)))
     tables, _ = decode(frames(sent), turned)
 
     assert values(tables["obstacles"], "x_m") == pytest.approx([3.0 + 28.0])
@@ -268,7 +268,7 @@ def test_lanes_are_left_positive_after_decoding() -> None:
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.03])
 def test_lane_is_transformed_to_vehicle_frame(yaw_rad: float) -> None:
-    mounting = Mounting(1.7, -0.2, yaw_rad)
+    mounting = DevicePosition(1.7, -0.2, yaw_rad)
     in_device_frame, _ = decode(frames([status(0, 0), *LEFT_LANE]))
     in_vehicle_frame, _ = decode(
         frames([status(0, 0), *LEFT_LANE]), MobileyeSettings(mounting=mounting)

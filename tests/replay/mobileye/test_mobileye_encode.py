@@ -13,14 +13,14 @@ from crosscue.replay.columns import Block, CanFrames, Floats, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.can.encode import FRAME_NS, LATENCY_NS, bursts_of, encode_tables
-from crosscue.replay.mobileye.geometry import Mounting
+from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.layout import Columns, Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.mobileye.tables import LEFT, RIGHT, table_block
 from support.mobileye_frames import MS, block_of, random_drive, random_words, values
 
-ROTATED = MobileyeSettings(mounting=Mounting(1.85, -0.1, 0.02))
-UNROTATED = MobileyeSettings(mounting=Mounting(1.85, -0.1))
+ROTATED = MobileyeSettings(mounting=DevicePosition(1.85, -0.1, 0.02))
+UNROTATED = MobileyeSettings(mounting=DevicePosition(1.85, -0.1))
 
 
 def encode_burst(
@@ -101,7 +101,7 @@ def test_standalone_messages_round_trip_byte_for_byte(message: Message, variant:
 
 
 def settings_for(variant: str) -> MobileyeSettings:
-    unrotated_mounting = Mounting(1.85, -0.1)
+    unrotated_mounting = DevicePosition(1.85, -0.1)
     return {
         "classic": MobileyeSettings(revision="classic", mounting=unrotated_mounting),
         "2.32": MobileyeSettings(revision="2.32", mounting=unrotated_mounting),

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.errors import SchemaError
-from crosscue.replay.mobileye.bits import extract, payloads_of, place, words_of
-from crosscue.replay.mobileye.layout import VARIANTS, Message, describe, layout, parse
-from crosscue.replay.mobileye.wire import columns_of, from_given, from_raw, values_of
+from crosscue.replay.mobileye.bits import extract, leading_words, payloads_of, place_bits
+from crosscue.replay.mobileye.layout import VARIANTS, Message, describe, layout, parse_layout
+from crosscue.replay.mobileye.wire import from_given, from_raw, si_columns, values_of
 from support.mobileye_frames import random_words
 
 
@@ -23,7 +23,7 @@ def decoded_value(name: str, field: str, text: str, variant: str = "") -> float:
     raw = bytes.fromhex(text)
     payload[0, : len(raw)] = list(raw)
     number = VARIANTS.index(variant) if variant else -1
-    values = values_of(message, words_of(payload), np.array([number], dtype=np.int8))
+    values = values_of(message, leading_words(payload), np.array([number], dtype=np.int8))
     return float(values[field][0])
 
 
@@ -135,17 +135,17 @@ def test_fields_that_depend_on_unknown_variant_are_missing() -> None:
 def test_angle_on_the_bus_is_negated_bearing(angle_raw: int, bearing_deg: float) -> None:
     """The sent angle and the bearing of the sent position are from three real recordings."""
     f = next(f for f in layout()["obstacle_c"].fields if f.name == "angle_rad")
-    words = place(np.array([angle_raw]), f.start, f.bits, False)
+    words = place_bits(np.array([angle_raw]), f.start, f.bits, False)
     values = values_of(layout()["obstacle_c"], words, np.array([-1], dtype=np.int8))
-    angle_rad = columns_of(layout()["obstacle_c"], values)["angle_rad"].astype(np.float64)
+    angle_rad = si_columns(layout()["obstacle_c"], values)["angle_rad"].astype(np.float64)
     assert degrees(angle_rad[0]) == pytest.approx(bearing_deg, abs=0.1)
 
 
 def test_lane_heading_sign_is_unified_across_messages() -> None:
     """Real messages: 0x737 is left-positive, the LKA lane right-positive; columns agree."""
     c1_lka = np.array([0.01367])
-    lka = columns_of(layout()["lane_b"], {"c1": c1_lka, **_other_fields("lane_b", "c1")})
-    details = columns_of(
+    lka = si_columns(layout()["lane_b"], {"c1": c1_lka, **_other_fields("lane_b", "c1")})
+    details = si_columns(
         layout()["lane_details"], {"c1": -c1_lka, **_other_fields("lane_details", "c1")}
     )
     assert lka["c1"].tolist() == details["c1"].tolist() == [-0.01367]
@@ -184,13 +184,13 @@ def test_describe_lists_every_field_once() -> None:
 def test_invalid_layout_is_refused(text: str, message: str) -> None:
     head = '[[message]]\nname = "m"\nabout = ""\ntable = "t"\nid = 1\nlengths = [4]\n'
     with pytest.raises(SchemaError, match=re.escape(message)):
-        parse(head + text)
+        parse_layout(head + text)
 
 
 def test_messages_with_same_identifier_are_refused() -> None:
     one = '[[message]]\nname = "{}"\nabout = ""\ntable = "t"\nid = 1\nlengths = [4]\nfields = []\n'
     with pytest.raises(SchemaError, match="two messages have the same identifier"):
-        parse(one.format("a") + one.format("b"))
+        parse_layout(one.format("a") + one.format("b"))
 
 
 @given(
@@ -201,15 +201,15 @@ def test_extract_inverts_place(start: int, bits: int, signed: bool, seed: int) -
     bits = min(bits, 64 - start)
     low = -(1 << (bits - 1)) if signed else 0
     raw = np.random.default_rng(seed).integers(low, low + (1 << bits), 20)
-    words = place(raw, start, bits, False)
+    words = place_bits(raw, start, bits, False)
     np.testing.assert_array_equal(extract(words, start, bits, signed, False), raw)
-    np.testing.assert_array_equal(words_of(payloads_of(words)), words)
+    np.testing.assert_array_equal(leading_words(payloads_of(words)), words)
 
 
 def test_big_endian_numbers_are_extracted_and_placed() -> None:
-    word = words_of(np.array([[0, 0x12, 0x34, 0, 0, 0, 0, 0]], dtype=np.uint8))
+    word = leading_words(np.array([[0, 0x12, 0x34, 0, 0, 0, 0, 0]], dtype=np.uint8))
     assert extract(word, 8, 16, False, True)[0] == 0x1234
-    np.testing.assert_array_equal(place(np.array([0x1234]), 8, 16, True), word)
+    np.testing.assert_array_equal(place_bits(np.array([0x1234]), 8, 16, True), word)
 
 
 @pytest.mark.parametrize("message", layout().messages, ids=lambda m: m.name)

@@ -15,7 +15,7 @@ from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
-from crosscue.replay.mobileye.geometry import Mounting
+from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.layout import layout
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.mobileye.ros.sign import VOTES_WANTED
@@ -33,7 +33,7 @@ from support.mobileye_frames import (
 from support.mobileye_ros import TOPIC_TYPES, as_cdr, messages_of
 
 BUS_SETTINGS = MobileyeSettings(
-    mounting=Mounting(1.9, 0.1), family="extended", ros_lane_sign="right"
+    mounting=DevicePosition(1.9, 0.1), family="extended", ros_lane_sign="right"
 )
 
 

@@ -16,7 +16,7 @@ from crosscue.replay.errors import LogFormatError
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.can_text import dialect as can_text
 from crosscue.replay.readers.can_text import digits
-from crosscue.replay.readers.can_text.lines import Lines, Overlong, Tail, lines_of
+from crosscue.replay.readers.can_text.lines import Lines, Overlong, Tail, read_lines
 from support.can_files import (
     Sent,
     assert_equal_to_python_can,
@@ -55,7 +55,7 @@ def test_chunk_boundaries_do_not_change_frames(
 ) -> None:
     frames = random_frames(400)
     path = _log(tmp_path, candump(frames))
-    monkeypatch.setattr(can_text, "lines_of", lambda p, _=0: lines_of(p, 400))
+    monkeypatch.setattr(can_text, "read_lines", lambda p, _=0: read_lines(p, 400))
 
     found, ledger = read_back(path)
 
@@ -227,7 +227,7 @@ def test_lines_are_complete_for_any_chunk_size(tmp_path: Path, size: int) -> Non
     lines = [b"x" * (k % 29) for k in range(300)]
     path = _log(tmp_path, b"\n".join(lines) + b"\r\nlast")
     got: list[bytes] = []
-    for piece in lines_of(path, size):
+    for piece in read_lines(path, size):
         if isinstance(piece, Lines):
             assert piece.first_number == len(got) + 1
             got += [piece.text(i) for i in range(piece.done)]
@@ -243,7 +243,7 @@ def test_line_longer_than_chunk_is_reported_and_next_lines_are_read(tmp_path: Pa
     read: list[bytes] = []
 
     # Each piece is valid only until the next one, because they share a buffer.
-    for piece in lines_of(path, 64):
+    for piece in read_lines(path, 64):
         if isinstance(piece, Lines):
             read += [piece.text(i) for i in range(piece.done)]
         else:
@@ -263,7 +263,7 @@ def test_digit_parsers_accept_only_digits(byte: int) -> None:
         (digits.decimal, 10, b"0123456789"),
         (digits.hexadecimal, 16, b"0123456789abcdefABCDEF"),
     ):
-        value, ok = read(digits.words_of(buffer), stop, count)
+        value, ok = read(digits.byte_words(buffer), stop, count)
         assert bool(ok[0]) == (byte in alphabet)
         if ok[0]:
             assert value[0] == int(f"1{chr(byte)}1", base)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from crosscue.replay.base import Selection
 from crosscue.replay.readers.mcap import recording_pass as mcap_pass
-from crosscue.replay.readers.mcap.chunks.chunk_table import run_of, table_of
+from crosscue.replay.readers.mcap.chunks.chunk_table import parse_chunk_indexes, run_of
 from crosscue.replay.readers.mcap.records import PREFIX
 from support.mcap_files import (
     ChunkOf,
@@ -187,4 +187,4 @@ def test_run_length_never_exceeds_equal_records(sizes: list[int]) -> None:
 
 
 def test_empty_index_yields_empty_table() -> None:
-    assert len(table_of(b"", (), (), 0)) == 0
+    assert len(parse_chunk_indexes(b"", (), (), 0)) == 0

@@ -19,7 +19,7 @@ from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.rosbag2.db3 import open_db3
-from crosscue.replay.readers.rosbag2.tables import Tables
+from crosscue.replay.readers.rosbag2.tables import StorageTables
 from crosscue.replay.readers.rosbag2.wal import check_wal
 from support.data import shared
 from support.rosbag_files import (
@@ -459,7 +459,7 @@ def test_undamaged_file_is_read_in_one_pass(
     def counted(*_: object) -> None:
         raise AssertionError("the table was gone through again")
 
-    monkeypatch.setattr(Tables, "counts", counted)
+    monkeypatch.setattr(StorageTables, "counts", counted)
     reading = read_rows(path)
 
     assert reading.ledger.is_whole

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.replay.columns import Block, Table, Topic
-from crosscue.replay.vehicle.drafting.camera import Mounting, camera_lines
-from crosscue.replay.vehicle.drafting.text import _quoted, draft, examine
+from crosscue.replay.vehicle.drafting.camera import CameraMounting, camera_lines
+from crosscue.replay.vehicle.drafting.text import _quoted, draft_text, examine
 from support.memory_log import MemoryLog
 
 
@@ -34,7 +34,7 @@ def test_image_size_is_drafted_only_if_the_log_records_it(
         Topic("/info", "sensor_msgs/msg/CameraInfo", "columns"),
     )
 
-    lines = camera_lines([MemoryLog(topics, [block])], Mounting())
+    lines = camera_lines([MemoryLog(topics, [block])], CameraMounting())
 
     camera = tomllib.loads("\n".join(lines))["camera"]
     assert (camera["focal_px"], camera["center_px"]) == (900.0, [640.0, 360.0])
@@ -59,7 +59,7 @@ def speed_log(**columns_of: str) -> MemoryLog:
 
 
 def drafted(log: MemoryLog) -> tuple[str, dict[str, str]]:
-    text = draft(examine([log], ()), Path(), Mounting())
+    text = draft_text(examine([log], ()), Path(), CameraMounting())
     return text, tomllib.loads(text).get("topics", {})
 
 

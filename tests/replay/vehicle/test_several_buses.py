@@ -11,12 +11,12 @@ import pytest
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import DATA, Block, CanFrames, Table, Topic
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.signals.extractor import Extractor
+from crosscue.replay.signals.extractor import SampleExtractor
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.signals.plan import plan
-from crosscue.replay.vehicle.drafting.camera import Mounting
+from crosscue.replay.vehicle.drafting.camera import CameraMounting
 from crosscue.replay.vehicle.drafting.observed import observe
-from crosscue.replay.vehicle.drafting.text import draft, examine
+from crosscue.replay.vehicle.drafting.text import draft_text, examine
 from crosscue.replay.vehicle.vehicle import load, parse
 from support.memory_log import MemoryLog
 
@@ -89,7 +89,7 @@ def test_each_section_is_read_from_its_bus(log: MemoryLog, dbc: Path) -> None:
     )
     vehicle = load(file)
     planned = plan([(0, topic) for topic in log.topics], vehicle)
-    extract = Extractor(planned, vehicle, 0, ledger := Ledger(""))
+    extract = SampleExtractor(planned, vehicle, 0, ledger := Ledger(""))
 
     found = [samples for block in log.read(ledger, EVERYTHING) for samples in extract(block)]
 
@@ -104,7 +104,7 @@ def test_each_section_is_read_from_its_bus(log: MemoryLog, dbc: Path) -> None:
 def test_very_short_log_is_drafted_without_yaw_rate(log: MemoryLog, dbc: Path, rows: int) -> None:
     short = MemoryLog(log.topics, [block.take(slice(0, rows)) for block in log.blocks])
 
-    can = parse(draft(examine([short], [dbc]), dbc.parent, Mounting()), "the draft").can
+    can = parse(draft_text(examine([short], [dbc]), dbc.parent, CameraMounting()), "the draft").can
 
     assert can.bus is not None
     assert can.yaw_rate is None
@@ -124,7 +124,7 @@ def test_observed_time_range_is_bounded_despite_outlier_times(log: MemoryLog, db
 
 
 def test_draft_names_every_bus_and_the_bus_of_each_signal(log: MemoryLog, dbc: Path) -> None:
-    text = draft(examine([log], [dbc]), dbc.parent, Mounting())
+    text = draft_text(examine([log], [dbc]), dbc.parent, CameraMounting())
 
     can = parse(text, "the draft").can
     assert can.bus == "body"
@@ -149,7 +149,7 @@ def test_database_of_another_bus_is_omitted_with_reason(
     examined = examine([log], [radar, dbc])
 
     assert examined.databases == [dbc]
-    text = draft(examined, tmp_path, Mounting())
+    text = draft_text(examined, tmp_path, CameraMounting())
     assert 'dbc = ["car.dbc"]' in text
     assert "# omitted, a file of another bus: radar.dbc: " in text
     assert "0x064" in text

@@ -12,10 +12,10 @@ import pytest
 
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.columns import Floats
-from crosscue.replay.vehicle.drafting.candidates import WHEELS, Candidate, Kind, candidates
-from crosscue.replay.vehicle.drafting.choice import Choices, choose
+from crosscue.replay.vehicle.drafting.candidates import WHEELS, Candidate, SignalKind, candidates
+from crosscue.replay.vehicle.drafting.choice import Choices, rank_candidates
 from crosscue.replay.vehicle.drafting.observed import Bus, Observed
-from crosscue.replay.vehicle.drafting.series import Series, Track
+from crosscue.replay.vehicle.drafting.series import GroundTrack, Series
 
 SECONDS: Final = 60
 T_NS: Final = np.arange(SECONDS * 20, dtype=np.int64) * 50_000_000
@@ -27,7 +27,7 @@ STRAIGHT: Final = np.zeros_like(T_S)
 
 
 def candidate_signal(
-    kind: Kind, name: str, values: Floats, wheel: str = "", unit: str = ""
+    kind: SignalKind, name: str, values: Floats, wheel: str = "", unit: str = ""
 ) -> tuple[Candidate, Series]:
     message, _, signal = name.partition(".")
     one = Candidate(message, signal, kind, unit, 1.0, wheel, message)
@@ -40,7 +40,7 @@ def wheels(
     sides = {"left": -1.0, "right": 1.0}
     return [
         candidate_signal(
-            Kind.WHEEL,
+            SignalKind.WHEEL,
             f"{message}.{wheel}",
             scale * (speed + sides[wheel.rpartition("_")[2]] * 0.775 * yaw_rate),
             wheel,
@@ -55,10 +55,10 @@ def choices_among(
     """Return the choice from these signals on one bus."""
     course = np.cumsum(YAW_RATE if yaw_rate is None else yaw_rate) * 0.05
     each_second = slice(None, None, 20)
-    track = Track.of_course("fix", T_NS[each_second], SPEED[each_second], course[each_second])
+    track = GroundTrack.of_course("fix", T_NS[each_second], SPEED[each_second], course[each_second])
     bus = Bus("can0", signals=list(signals))
     last_ns = int(T_NS[-1])
-    return choose(Observed((bus,), (track,) if with_gnss else (), (), (), 0, last_ns))
+    return rank_candidates(Observed((bus,), (track,) if with_gnss else (), (), (), 0, last_ns))
 
 
 @pytest.mark.parametrize("with_gnss", [True, False])
@@ -66,8 +66,8 @@ def test_yaw_rate_consistent_with_wheels_is_chosen(with_gnss: bool) -> None:
     rng = np.random.default_rng(1)
     found = choices_among(
         *wheels("ABS", SPEED, YAW_RATE),
-        candidate_signal(Kind.YAW_RATE, "A.YAW", 0.15 * rng.standard_normal(len(T_S))),
-        candidate_signal(Kind.YAW_RATE, "B.YAW", YAW_RATE + 0.002),
+        candidate_signal(SignalKind.YAW_RATE, "A.YAW", 0.15 * rng.standard_normal(len(T_S))),
+        candidate_signal(SignalKind.YAW_RATE, "B.YAW", YAW_RATE + 0.002),
         with_gnss=with_gnss,
     )
 
@@ -81,7 +81,7 @@ def test_yaw_rate_consistent_with_wheels_is_chosen(with_gnss: bool) -> None:
 def test_yaw_rate_that_turns_on_straight_road_is_rejected() -> None:
     found = choices_among(
         *wheels("ABS", SPEED, STRAIGHT),
-        candidate_signal(Kind.YAW_RATE, "A.YAW", STRAIGHT + 0.05 + 1e-6 * T_S),
+        candidate_signal(SignalKind.YAW_RATE, "A.YAW", STRAIGHT + 0.05 + 1e-6 * T_S),
         yaw_rate=STRAIGHT,
     )
 
@@ -97,7 +97,7 @@ def test_yaw_rate_that_turns_while_stationary_is_rejected() -> None:
     turn = np.where(T_S > 50.0, 0.0, YAW_RATE)
     found = choices_among(
         *wheels("ABS", stop, turn),
-        candidate_signal(Kind.YAW_RATE, "A.YAW", turn + np.where(T_S > 50.0, 0.1, 0.0)),
+        candidate_signal(SignalKind.YAW_RATE, "A.YAW", turn + np.where(T_S > 50.0, 0.1, 0.0)),
         with_gnss=False,
     )
 
@@ -109,8 +109,8 @@ def test_sign_of_signal_is_the_consistent_one(sign: int) -> None:
     steering = np.arctan(2.7 * YAW_RATE / SPEED) * 15.0
     found = choices_among(
         *wheels("ABS", SPEED, YAW_RATE),
-        candidate_signal(Kind.YAW_RATE, "A.YAW", sign * YAW_RATE),
-        candidate_signal(Kind.STEERING, "A.ANGLE", sign * steering + 0.05),
+        candidate_signal(SignalKind.YAW_RATE, "A.YAW", sign * YAW_RATE),
+        candidate_signal(SignalKind.STEERING, "A.ANGLE", sign * steering + 0.05),
     )
 
     assert found.yaw_rates[0].verdict.sign == sign
@@ -121,7 +121,7 @@ def test_sign_of_signal_is_the_consistent_one(sign: int) -> None:
 def test_unsigned_steering_angle_is_rejected() -> None:
     steering = np.abs(np.arctan(2.7 * YAW_RATE / SPEED) * 15.0)
     found = choices_among(
-        *wheels("ABS", SPEED, YAW_RATE), candidate_signal(Kind.STEERING, "A.ANGLE", steering)
+        *wheels("ABS", SPEED, YAW_RATE), candidate_signal(SignalKind.STEERING, "A.ANGLE", steering)
     )
 
     assert "does not follow" in found.steering[0].verdict.wrong[0]
@@ -151,7 +151,7 @@ def test_yaw_rate_sign_is_undetermined_on_straight_road() -> None:
     rng = np.random.default_rng(2)
     found = choices_among(
         *wheels("ABS", SPEED, STRAIGHT),
-        candidate_signal(Kind.YAW_RATE, "A.YAW", 0.001 * rng.standard_normal(len(T_S))),
+        candidate_signal(SignalKind.YAW_RATE, "A.YAW", 0.001 * rng.standard_normal(len(T_S))),
         yaw_rate=STRAIGHT,
     )
 
@@ -163,9 +163,9 @@ def test_signs_are_undetermined_without_wheels_and_gnss() -> None:
     bend = 0.02 * np.sin(0.3 * T_S)
     steering = np.arctan(2.7 * bend / SPEED) * 15.0
     found = choices_among(
-        candidate_signal(Kind.SPEED, "A.SPEED", SPEED),
-        candidate_signal(Kind.YAW_RATE, "A.YAW", -bend),
-        candidate_signal(Kind.STEERING, "A.ANGLE", -steering),
+        candidate_signal(SignalKind.SPEED, "A.SPEED", SPEED),
+        candidate_signal(SignalKind.YAW_RATE, "A.YAW", -bend),
+        candidate_signal(SignalKind.STEERING, "A.ANGLE", -steering),
         with_gnss=False,
     )
 
@@ -198,10 +198,10 @@ def test_candidates_exclude_requested_and_target_signals(tmp_path: Path) -> None
     found = {one.name: one.kind for one in candidates(CanDatabase.load([file]).messages)}
 
     assert found == {
-        "Wheels.WhlSpdRL": Kind.WHEEL,
-        "Wheels.WhlSpdRR": Kind.WHEEL,
-        "ESP.YawRate": Kind.YAW_RATE,
-        "EPS.SteerAngle": Kind.STEERING,
+        "Wheels.WhlSpdRL": SignalKind.WHEEL,
+        "Wheels.WhlSpdRR": SignalKind.WHEEL,
+        "ESP.YawRate": SignalKind.YAW_RATE,
+        "EPS.SteerAngle": SignalKind.STEERING,
     }
 
 

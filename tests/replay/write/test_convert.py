@@ -29,7 +29,7 @@ from crosscue.replay.files.partial_file import PartialFile
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.write.convert import BAD_SCHEMA, NO_TYPE, TOO_EARLY, LogWriter
-from crosscue.replay.write.mcap import Compression, McapWriter, Stretch
+from crosscue.replay.write.mcap import ChannelMessages, Compression, McapWriter
 from support.data import shared
 from support.ros_messages import (
     messages_of,
@@ -42,11 +42,11 @@ from support.ros_messages import (
 SCHEMA = b"float64 data\n"
 
 
-def stretch_of(channel: int, log_ns: list[int], payloads: list[bytes]) -> Stretch:
+def stretch_of(channel: int, log_ns: list[int], payloads: list[bytes]) -> ChannelMessages:
     n = len(log_ns)
     times = np.array(log_ns, np.int64)
     sequence = np.arange(n, dtype=np.uint32) + channel * 1000
-    return Stretch(channel, times, times + channel, sequence, messages_of(payloads, 2))
+    return ChannelMessages(channel, times, times + channel, sequence, messages_of(payloads, 2))
 
 
 def messages_in_file_order(path: Path) -> list[tuple[str, int, int, int, bytes]]:

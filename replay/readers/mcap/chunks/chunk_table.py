@@ -156,7 +156,9 @@ def run_of(records: bytes, at: int, size: int) -> int:
     return count
 
 
-def table_of(records: bytes, begins: Sequence[int], sizes: Sequence[int], base: int) -> ChunkTable:
+def parse_chunk_indexes(
+    records: bytes, begins: Sequence[int], sizes: Sequence[int], base: int
+) -> ChunkTable:
     """Parse the ChunkIndex contents at ``begins``, each of ``sizes`` bytes.
 
     Args:

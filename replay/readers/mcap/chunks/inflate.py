@@ -22,7 +22,7 @@ UNKNOWN_SIZES: Final = (-1, 0)
 LZ4_STEP: Final = 256 << 10
 
 
-def inflate(body: Bytes, head: ChunkHead, room: Bytes) -> Bytes:
+def inflate_chunk(body: Bytes, head: ChunkHead, room: Bytes) -> Bytes:
     """Decompress the records of a chunk, and verify their size and checksum.
 
     Args:

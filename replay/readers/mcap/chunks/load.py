@@ -17,10 +17,10 @@ from typing import Final, Self
 from crosscue.replay.columns import Bytes
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.bytes import ByteFile
-from crosscue.replay.readers.mcap.chunks.inflate import inflate, inflate_prefix
+from crosscue.replay.readers.mcap.chunks.inflate import inflate_chunk, inflate_prefix
 from crosscue.replay.readers.mcap.records import BrokenRecordError
-from crosscue.replay.readers.mcap.segments import Segment
-from crosscue.replay.readers.mcap.walk import Chunk, Item
+from crosscue.replay.readers.mcap.segments import RecordingSegment
+from crosscue.replay.readers.mcap.walk import Item, UnreadChunk
 
 # Number of threads. One hides most of the work; more would only compete for the interpreter.
 WORKERS: Final = 1
@@ -36,7 +36,7 @@ WORTHWHILE: Final = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stretch:
+class ChunkRecords:
     """The records of one chunk within a buffer: bytes ``begin`` to ``end`` of ``whole``."""
 
     whole: Bytes
@@ -50,7 +50,7 @@ class Stretch:
 
 
 @dataclass(slots=True, eq=False)
-class Group:
+class ChunkGroup:
     """Chunks that are loaded together.
 
     Attributes:
@@ -61,19 +61,19 @@ class Group:
         future: The records or the error of each chunk, if another thread loads them.
     """
 
-    chunks: list[Chunk] = field(default_factory=list)
+    chunks: list[UnreadChunk] = field(default_factory=list)
     begins: list[int] = field(default_factory=list)
     size: int = 0
     whole: Bytes | None = None
-    future: Future[list[Stretch | BrokenRecordError]] | None = None
+    future: Future[list[ChunkRecords | BrokenRecordError]] | None = None
 
-    def add(self, chunk: Chunk) -> None:
+    def add(self, chunk: UnreadChunk) -> None:
         """Add a chunk."""
         self.chunks.append(chunk)
         self.begins.append(self.size)
         self.size += _size(chunk)
 
-    def has_room_for(self, chunk: Chunk) -> bool:
+    def has_room_for(self, chunk: UnreadChunk) -> bool:
         """Return whether ``chunk`` can be loaded together with the others."""
         if not self.chunks:
             return True
@@ -87,7 +87,7 @@ class Load:
     """One chunk of a group."""
 
     loader: Loader
-    group: Group
+    group: ChunkGroup
     number: int
 
     @property
@@ -95,7 +95,7 @@ class Load:
         """True for the last chunk of the group."""
         return self.number + 1 == len(self.group.chunks)
 
-    def stretch(self) -> Stretch:
+    def stretch(self) -> ChunkRecords:
         """Return the chunk's records.
 
         Raises:
@@ -130,22 +130,22 @@ class Loader:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def ahead(
-        self, items: Iterator[Item], wanted: Callable[[Chunk], bool]
+        self, items: Iterator[Item], wanted: Callable[[UnreadChunk], bool]
     ) -> Iterator[tuple[Item, Load | None]]:
         """Yield the items in order, each selected chunk with its load in progress."""
-        queue: deque[tuple[list[tuple[Item, Load | None]], Group]] = deque()
+        queue: deque[tuple[list[tuple[Item, Load | None]], ChunkGroup]] = deque()
         entries: list[tuple[Item, Load | None]] = []
-        group = Group()
+        group = ChunkGroup()
         under_way = 0
         for item in items:
-            is_wanted = isinstance(item, Chunk) and wanted(item)
-            joins = isinstance(item, Chunk) and is_wanted and group.has_room_for(item)
+            is_wanted = isinstance(item, UnreadChunk) and wanted(item)
+            joins = isinstance(item, UnreadChunk) and is_wanted and group.has_room_for(item)
             if entries and not (joins and group.chunks):
                 self._start(group)
                 queue.append((entries, group))
                 under_way += group.size
-                entries, group = [], Group()
-            if isinstance(item, Chunk) and is_wanted:
+                entries, group = [], ChunkGroup()
+            if isinstance(item, UnreadChunk) and is_wanted:
                 entries.append((item, Load(self, group, len(group.chunks))))
                 group.add(item)
             else:
@@ -159,12 +159,12 @@ class Loader:
             yield from first
         yield from entries
 
-    def _start(self, group: Group) -> None:
+    def _start(self, group: ChunkGroup) -> None:
         stored = sum(c.head.body_size for c in group.chunks if c.head is not None)
         if group.size > WORTHWHILE * stored:
             group.future = self._pool.submit(self.load_group, group)
 
-    def section_crc(self, segment: Segment) -> Future[int | None]:
+    def section_crc(self, segment: RecordingSegment) -> Future[int | None]:
         """Compute the checksum of a segment's data section from its bytes."""
         return self.crc(segment.base, segment.end)
 
@@ -172,9 +172,9 @@ class Loader:
         """Compute the checksum of the bytes from ``begin`` to ``end``."""
         return self._pool.submit(self._file.crc, begin, end, self._stop)
 
-    def load_group(self, group: Group) -> list[Stretch | BrokenRecordError]:
+    def load_group(self, group: ChunkGroup) -> list[ChunkRecords | BrokenRecordError]:
         """Load each chunk of a group; return its records or its error."""
-        loaded: list[Stretch | BrokenRecordError] = []
+        loaded: list[ChunkRecords | BrokenRecordError] = []
         for number in range(len(group.chunks)):
             try:
                 loaded.append(self.load_of(group, number))
@@ -182,7 +182,7 @@ class Loader:
                 loaded.append(error)
         return loaded
 
-    def load_of(self, group: Group, number: int) -> Stretch:
+    def load_of(self, group: ChunkGroup, number: int) -> ChunkRecords:
         """Load one chunk of a group; chunks must be loaded in order.
 
         Raises:
@@ -191,7 +191,7 @@ class Loader:
         chunk = group.chunks[number]
         if len(group.chunks) == 1:
             records = self.load(chunk)
-            return Stretch(records, 0, len(records))
+            return ChunkRecords(records, 0, len(records))
         if group.whole is None:
             group.whole = self._file.buffers.take(group.size + 1)
         whole, begin = group.whole, group.begins[number]
@@ -199,9 +199,9 @@ class Loader:
             group.whole = None  # reusable once no message refers to it
         end = begin + _size(chunk)
         self.load(chunk, whole[begin : end + 1])
-        return Stretch(whole, begin, end)
+        return ChunkRecords(whole, begin, end)
 
-    def load(self, chunk: Chunk, room: Bytes | None = None) -> Bytes:
+    def load(self, chunk: UnreadChunk, room: Bytes | None = None) -> Bytes:
         """Load the verified records of a chunk, or the start of a truncated chunk.
 
         Args:
@@ -221,19 +221,19 @@ class Loader:
                 f"declares {size} bytes, the limit is {max_bytes} (--max-chunk)"
             )
         if room is not None and not head.compression and head.body_size == head.size:
-            return inflate(self._file.read_into(chunk.body_at, room[: head.size]), head, room)
+            return inflate_chunk(self._file.read_into(chunk.body_at, room[: head.size]), head, room)
         body = self._file.read(chunk.body_at, head.body_size)
         if chunk.is_cut:
             return inflate_prefix(body, head)
         if room is None:
             room = self._file.buffers.take(head.size + 1) if head.compression else body
-        return inflate(body, head, room)
+        return inflate_chunk(body, head, room)
 
 
-def _size(chunk: Chunk) -> int:
+def _size(chunk: UnreadChunk) -> int:
     return 0 if chunk.head is None else chunk.head.size
 
 
-def _is_plain_case(chunk: Chunk) -> bool:
+def _is_plain_case(chunk: UnreadChunk) -> bool:
     """Return whether header and summary agree, so that the chunk can be loaded with others."""
     return chunk.head is not None and not (chunk.fault or chunk.differs or chunk.is_cut)

@@ -206,7 +206,7 @@ def _between_messages(
     return definitions, ignored
 
 
-def join(whole: NDArray[np.uint8], parts: Sequence[tuple[Rows, int]]) -> Rows:
+def join_chunks(whole: NDArray[np.uint8], parts: Sequence[tuple[Rows, int]]) -> Rows:
     """Join the messages of consecutive chunks.
 
     Args:

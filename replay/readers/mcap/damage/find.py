@@ -15,7 +15,7 @@ import numpy as np
 from crosscue.replay.columns import Bytes
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.bytes import PIECE, ByteFile
-from crosscue.replay.readers.mcap.chunks.inflate import inflate
+from crosscue.replay.readers.mcap.chunks.inflate import inflate_chunk
 from crosscue.replay.readers.mcap.chunks.rows import NEVER_IN_A_CHUNK, rows_by_scan
 from crosscue.replay.readers.mcap.records import (
     CHUNK,
@@ -116,7 +116,7 @@ def _is_verified(file: ByteFile, at: int, limits: Limits) -> bool:
     body_at = at + PREFIX.size + head.body_at
     try:
         room = file.buffers.take(head.size + 1)
-        records = inflate(file.read(body_at, head.body_size), head, room)
+        records = inflate_chunk(file.read(body_at, head.body_size), head, room)
         return bool(head.crc) or _is_filled(records, head, limits)
     except BrokenRecordError:
         return False
@@ -152,7 +152,7 @@ def verified_head(file: ByteFile, index: ChunkIndex, limits: Limits) -> ChunkHea
     head = ChunkHead(index.start, index.end, index.size, crc, name, body_at, index.body_size)
     try:
         body = file.read(index.at + PREFIX.size + body_at, index.body_size)
-        inflate(body, head, file.buffers.take(index.size + 1))
+        inflate_chunk(body, head, file.buffers.take(index.size + 1))
     except BrokenRecordError:
         return None
     return head

@@ -31,7 +31,7 @@ from crosscue.replay.readers.mcap.records import (
     PREFIX,
     SCHEMA,
     BrokenRecordError,
-    Fields,
+    FieldParser,
     Heads,
     check_metadata,
     heads_at,
@@ -121,7 +121,7 @@ def _within(log: NDArray[np.uint64], first: int, last: int) -> NDArray[np.bool_]
     return is_in
 
 
-class Resync:
+class McapResync:
     """Finds plausible records in a data section."""
 
     def __init__(
@@ -289,7 +289,7 @@ def is_definition(found: Definition) -> bool:
     record's end, they end inside it and are legible text. A message read by these fields has its
     sequence number and times as lengths and names, which are neither.
     """
-    fields = Fields(found.content)
+    fields = FieldParser(found.content)
     try:
         number = fields.number(2)
         if found.opcode == CHANNEL:

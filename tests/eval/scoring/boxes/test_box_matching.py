@@ -11,10 +11,10 @@ import pytest
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from crosscue.eval.scoring.boxes.matching import ALL, NOBODY, OVERLAPS, SIZES, Boxes, match
-from crosscue.eval.scoring.boxes.reliability import reliability
+from crosscue.eval.scoring.boxes.matching import ALL, NOBODY, OVERLAPS, SIZES, LabelledBoxes, match
+from crosscue.eval.scoring.boxes.reliability import class_calibration
 from crosscue.eval.scoring.boxes.scores import (
-    Measured,
+    IntervalEstimate,
     _measured,
     average_precision,
     drawn,
@@ -27,12 +27,12 @@ def boxes(
     scores: list[float] | None = None,
     ignored: tuple[int, ...] = (),
     range_m: list[float] | None = None,
-) -> Boxes:
+) -> LabelledBoxes:
     """Build boxes from rows of picture, class and corners."""
     n = len(rows)
     is_ignored = np.zeros(n, np.bool_)
     is_ignored[list(ignored)] = True
-    return Boxes(
+    return LabelledBoxes(
         np.array([row[0] for row in rows], np.int64),
         np.array([row[1] for row in rows], np.int64),
         np.array([row[2] for row in rows], np.float64).reshape(-1, 4),
@@ -42,7 +42,7 @@ def boxes(
     )
 
 
-def random_boxes(seed: int) -> tuple[Boxes, Boxes]:
+def random_boxes(seed: int) -> tuple[LabelledBoxes, LabelledBoxes]:
     """Random labels and detections of 12 pictures and 3 classes, with overlaps and equal scores."""
     rng = np.random.default_rng(seed)
     labels, found, scores = [], [], []
@@ -62,7 +62,7 @@ def random_boxes(seed: int) -> tuple[Boxes, Boxes]:
     return boxes(*labels, ignored=ignored), boxes(*found, scores=scores)
 
 
-def pycocotools_precision(truth: Boxes, found: Boxes) -> np.ndarray:
+def pycocotools_precision(truth: LabelledBoxes, found: LabelledBoxes) -> np.ndarray:
     """Precision from pycocotools: overlap, recall, class, size, max detections."""
     coco = COCO()
     coco.dataset = {
@@ -181,7 +181,9 @@ def test_bootstrap_requires_enough_blocks_and_is_reproducible() -> None:
     np.testing.assert_array_equal(first[:, 0], first[:, 1])
 
 
-def _blocks_of_pictures(rng: np.random.Generator, blocks: int) -> tuple[Boxes, Boxes]:
+def _blocks_of_pictures(
+    rng: np.random.Generator, blocks: int
+) -> tuple[LabelledBoxes, LabelledBoxes]:
     """Blocks of four pictures with four labels each and a random recall per block."""
     found_at = np.repeat(rng.beta(4.0, 1.0, blocks), 16)
     rows = [
@@ -201,7 +203,7 @@ def test_intervals_of_six_blocks_cover_value_of_many() -> None:
     """In 150 simulations, 93 % of intervals cover AP50; bootstrap percentiles cover 77 %."""
     rng = np.random.default_rng(5)
 
-    def of(blocks: int, rounds: int) -> Measured:
+    def of(blocks: int, rounds: int) -> IntervalEstimate:
         truth, found = _blocks_of_pictures(rng, blocks)
         which = np.repeat(np.arange(blocks), 4)
         matched = match(truth, found, 0, overlaps=np.array([0.5]))
@@ -219,7 +221,7 @@ def test_calibration_error_is_zero_for_calibrated_scores_only() -> None:
     scores = rng.random(20_000)
     is_right = rng.random(20_000) < scores
 
-    assert reliability("car", scores, is_right).error < 0.02
-    assert reliability("car", np.full(1000, 0.95), np.zeros(1000, np.bool_)).error == pytest.approx(
-        0.95
-    )
+    assert class_calibration("car", scores, is_right).error < 0.02
+    assert class_calibration(
+        "car", np.full(1000, 0.95), np.zeros(1000, np.bool_)
+    ).error == pytest.approx(0.95)
