@@ -3,8 +3,8 @@
     decision = argmin over options of |heading after - bearing to goal after| + penalty
 
 ``choose_option`` maps headings and bearings to a decision, for any number of roads at any angle.
-The penalty grows each time the same option is taken at the same intersection, which the dissertation
-compares to tabu search. Intersections are recognised by the *estimated* position only.
+The penalty grows each time the same option is taken at the same intersection, which the
+dissertation compares to tabu search. Intersections are recognised by the *estimated* position only.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 No network is used. Masks come from the renderer, and missed objects, false detections and errors
 are drawn according to ``DetectorFaults``, whose values are plausible but were not measured. Faults
-are correlated in time: the error of each object, road and false detection is the sum of a part that is
-constant during the drive, a part that decays over a second, and a part of the single frame.
+are correlated in time: the error of each object, road and false detection is the sum of a part that
+is constant during the drive, a part that decays over a second, and a part of the single frame.
 Consecutive frames are therefore wrong together, as they are with networks.
 """
 

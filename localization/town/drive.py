@@ -5,7 +5,8 @@ show the roads of the next intersection relative to the vehicle, and the result 
 the end. Decisions use the estimate.
 
 All functions are plain Python on numbers and arrays. ``simulate_town_drive`` runs them uncompiled,
-for example in a debugger; ``drive_many`` compiles the same functions and is thousands of times as fast.
+for example in a debugger; ``drive_many`` compiles the same functions and is thousands of times as
+fast.
 """
 
 from __future__ import annotations
