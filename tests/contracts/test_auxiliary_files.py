@@ -40,6 +40,8 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("landmarks add", "LOG"): ("{out}.db {gone} --poses {truth} --vehicle {car}", INPUT),
     ("truth", "LOG"): ("{gone} -o {out}", INPUT),
     ("estimate", "RUN"): ("{gone}", INPUT),
+    ("estimate", "--start"): ("{run} --start {gone}", INPUT),
+    ("replay", "--start"): ("{log} --vehicle {car} -o {out} --start {gone}", INPUT),
     ("score", "RUN"): ("{gone} --truth {truth}", INPUT),
     ("score detector", "RUN"): ("{gone} --labels {coco}", INPUT),
     ("score detector", "--labels"): ("{run} --labels {gone}.json", INPUT),

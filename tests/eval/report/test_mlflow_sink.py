@@ -82,10 +82,10 @@ def test_unusable_mlflow_store_is_refused_before_scoring(
     assert printed.count("\n") == 1
 
 
-def test_missing_mlflow_names_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_mlflow_names_the_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "mlflow.tracking", None)
 
-    with pytest.raises(crosscue.UsageError, match=r"pip install 'crosscue\[mlflow\]'"):
+    with pytest.raises(crosscue.UsageError, match=r"pip install mlflow-skinny"):
         crosscue.open_mlflow("http://localhost:1")
 
 
