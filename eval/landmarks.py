@@ -38,7 +38,8 @@ if TYPE_CHECKING:
     from crosscue.localization.landmarks.features import Match, Matcher
 
 NearGiven: TypeAlias = Annotated[
-    tuple[float, float, float] | str | None, Option("--near", metavar="X,Y,R")
+    tuple[float, float, float] | str | None,
+    Option("--near", metavar="X,Y,R", is_one_word=True),
 ]
 
 

@@ -112,7 +112,9 @@ def fault_of(command: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     known = {*BUILTIN, "none", *(model.name for model in crosscue.models())}
     unknown = {
         detector
-        for detector in str(given.get("detectors") or "none").split(",")
+        for option, value in given.items()
+        if option.rpartition(".")[2] == "detectors"
+        for detector in str(value or "none").split(",")
         if detector not in known and not detector.endswith(".toml")
     }
     return f"no detector {unknown}" if unknown else ""
