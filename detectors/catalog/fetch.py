@@ -65,16 +65,16 @@ def _fetched(
     environment: Mapping[str, str],
 ) -> FetchedFile:
     place, owner = weights_path(card, file), f"model {name}"
-    if is_there(file, place):
+    source = None if given is None else given / file.name if given.is_dir() else given
+    if is_there(file, place) and (source is None or source.exists()):
         return FetchedFile(place, "the cache")
-    if given is not None:
-        source = given / file.name if given.is_dir() else given
+    if source is not None:
         take(source, file, place, owner)
         return FetchedFile(place, str(source))
-    for source in _local_copies(file, environment):
-        if is_there(file, source):
-            take(source, file, place, owner)
-            return FetchedFile(place, str(source))
+    for copy in _local_copies(file, environment):
+        if is_there(file, copy):
+            take(copy, file, place, owner)
+            return FetchedFile(place, str(copy))
     mirror = environment.get(MIRROR)
     url = f"{mirror.rstrip('/')}/{file.name}" if mirror else file.url
     download(url, file, place, owner, OTHERWISE, on_progress)

@@ -210,6 +210,15 @@ def test_weights_are_copied_from_a_file_or_folder(
         fetch.fetch_weights("net", tmp_path / "gone.onnx")
 
 
+def test_file_that_is_named_must_exist_also_if_the_weights_are_cached(
+    card: ModelCard, server: Served, tmp_path: Path
+) -> None:
+    fetch.fetch_weights("net")
+
+    with pytest.raises(UsageError, match=r"gone\.onnx"):
+        fetch.fetch_weights("net", tmp_path / "gone.onnx")
+
+
 def test_weights_are_found_in_the_data_folder(
     card: ModelCard, server: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
