@@ -47,9 +47,9 @@ CLASSES = {"car": 1, "stop sign": 2, "traffic light": 3}
 MEMORY = """
 import sys
 from pathlib import Path
-from crosscue.eval.recording import save
+from crosscue.eval.recording import save_rrd
 from crosscue.eval.runs.folder import open_run
-save(open_run(Path(sys.argv[1])), Path(sys.argv[2]))
+save_rrd(open_run(Path(sys.argv[1])), Path(sys.argv[2]))
 status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
 print(int(status["VmHWM"].split()[0]) // 1024)
 """

@@ -108,7 +108,8 @@ CHECKS: Final = """
 import sys, pathlib
 import crosscue, dummy_package
 from crosscue import testing
-from crosscue.detectors.registry import Choice, make
+from crosscue.detectors.base import DetectorChoice
+from crosscue.detectors.registry import make
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -125,7 +126,7 @@ text = "".join(f"{10 * i} {i}\\n" for i in range(10))
 (here / "drive" / "drive.lines").write_text(text)
 with crosscue.open(here / "a.lines") as log:
     assert log["/value"].table()["value"].to_pylist() == list(range(10))
-testing.check_detector(lambda: make(Choice("bright", "bright")))
+testing.check_detector(lambda: make(DetectorChoice("bright", "bright")))
 testing.check_cue(CUES["zebra"])
 assert Vehicle(version=1).fusion.cues["zebra"].precision == 0.61
 testing.check_reader(here / "a.lines", damage)

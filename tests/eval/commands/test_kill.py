@@ -107,7 +107,7 @@ def _check_complete_or_marked(run: Path, *expected: dict[str, str]) -> None:
 
 
 def test_run_killed_anywhere_restarts_to_equal_bytes(drive: Drive, tmp_path: Path) -> None:
-    run = tmp_path / "run"
+    run = drive.folder / tmp_path.name
     argv = drive.replay(run)
     count = len(faults.operations(run, faults.CHANGES, argv))
     assert count > 30
@@ -126,7 +126,7 @@ def test_run_killed_anywhere_restarts_to_equal_bytes(drive: Drive, tmp_path: Pat
 def test_run_killed_while_replacing_another_is_complete_or_marked(
     drive: Drive, tmp_path: Path
 ) -> None:
-    run = tmp_path / "run"
+    run = drive.folder / tmp_path.name
     argv = drive.replay(run, "--overwrite")
     shutil.copytree(drive.folder / "complete", run)
     text = run.joinpath("manifest.json").read_text()
@@ -170,7 +170,7 @@ def test_killed_estimate_is_complete_or_marked(drive: Drive, tmp_path: Path) -> 
 def test_failed_write_anywhere_leaves_no_partial_files(
     drive: Drive, tmp_path: Path, once: bool
 ) -> None:
-    run = tmp_path / "run"
+    run = drive.folder / tmp_path.name
     argv = drive.replay(run)
     count = len(faults.operations(run, faults.WRITES, argv))
 
@@ -207,7 +207,7 @@ def _check_clean(run: Path, drive: Drive) -> None:
 
 
 def test_locked_run_is_refused_and_names_the_process(drive: Drive, tmp_path: Path) -> None:
-    run = tmp_path / "run"
+    run = drive.folder / tmp_path.name
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
@@ -294,7 +294,7 @@ def test_missing_permissions_are_reported(drive: Drive, tmp_path: Path) -> None:
     assert tree(drive.folder / "complete") == drive.complete
 
 
-def test_time_zone_locale_and_hash_seed_do_not_change_output(drive: Drive, tmp_path: Path) -> None:
+def test_time_zone_locale_and_hash_seed_do_not_change_output(drive: Drive) -> None:
     variants = (
         {"TZ": "America/Los_Angeles", "LC_ALL": "C", "PYTHONHASHSEED": "1", "COLUMNS": "20"},
         {"TZ": "Asia/Kolkata", "LC_ALL": "tr_TR.UTF-8", "PYTHONHASHSEED": "2", "HOME": "/nowhere"},
@@ -302,7 +302,7 @@ def test_time_zone_locale_and_hash_seed_do_not_change_output(drive: Drive, tmp_p
     code = "import sys; from crosscue.eval.cli import main; main(sys.argv[1:])"
     commands = [
         subprocess.Popen(
-            [sys.executable, "-c", code, *drive.replay(tmp_path / f"run{i}", "-q")],
+            [sys.executable, "-c", code, *drive.replay(drive.folder / f"zone{i}", "-q")],
             env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **variant},
             stderr=subprocess.PIPE,
         )
@@ -311,7 +311,7 @@ def test_time_zone_locale_and_hash_seed_do_not_change_output(drive: Drive, tmp_p
     stderr = [command.communicate(timeout=60)[1] for command in commands]
 
     assert stderr == [b"", b""]
-    assert [tree(tmp_path / f"run{i}") == drive.complete for i in (0, 1)] == [True, True]
+    assert [tree(drive.folder / f"zone{i}") == drive.complete for i in (0, 1)] == [True, True]
 
 
 def test_replay_opens_no_socket(drive: Drive, tmp_path: Path) -> None:
