@@ -309,7 +309,7 @@ def test_missing_openvino_is_reported_with_its_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, "openvino", None)
 
-    with pytest.raises(VehicleError, match=r"not installed.*pip install 'crosscue\[openvino\]'"):
+    with pytest.raises(VehicleError, match=r"not installed.*pip install openvino"):
         build(backend="openvino")
 
 

@@ -57,7 +57,8 @@ def test_range_decreases_and_interval_contains_truth(drive: RunFolder, reference
     range_m, sd_m, gone_m = columns(drive, reference)
     true_m = TRUTH_M[reference] + CAMERA_M - gone_m
 
-    assert len(range_m) >= 65
+    # The car stands in its first 23 of 80 frames, in which no approach opens.
+    assert len(range_m) >= 55
     steps_m, moved_m = np.diff(range_m), np.diff(gone_m)
     # While the vehicle stands, wheels and poses move back by millimetres.
     assert (steps_m <= np.maximum(-moved_m, 0.0) + 0.01).all()
