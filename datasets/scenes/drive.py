@@ -190,13 +190,15 @@ def write_scene(
     log = folder / "drive.mcap"
     record = _Record(layout, conditions, world, settings, imager)
     with LogWriter(log, Ledger(str(log)), overwrite=overwrite, beside=FILES_OF_DRIVE) as writer:
+        # Before the log is complete, so that a drive that was cut short can be made again.
+        made = made_of([], _settings_of(settings, imager))
+        write_text(folder / MADE_OF, strict_json(made) + "\n")
         for topic in TOPICS:
             writer.add_topic(topic)
         for block in record.blocks():
             writer.write(block)
     write_bytes(folder / "simulated_car.dbc", dbc_path().read_bytes())
     write_text(folder / "vehicle.toml", record.vehicle_text(is_calibrated=is_calibrated))
-    write_text(folder / MADE_OF, strict_json(made_of([], _settings_of(settings, imager))) + "\n")
     return SceneFiles(
         log,
         folder / "vehicle.toml",
