@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
-from typing import Any, Concatenate, Final, ParamSpec, TypeVar, overload
+from typing import Any, Concatenate, Final, Literal, ParamSpec, TypeVar, overload
 
 A = TypeVar("A")
 B = TypeVar("B")
@@ -59,7 +59,11 @@ def keywords(
 ) -> Callable[[Callable[[A, S], R]], Callable[Concatenate[A, P], R]]: ...
 @overload
 def keywords(
-    record: Callable[P, S], leading: int
+    record: Callable[P, S], leading: Literal[0]
+) -> Callable[[Callable[[S], R]], Callable[P, R]]: ...
+@overload
+def keywords(
+    record: Callable[P, S], leading: Literal[2]
 ) -> Callable[[Callable[[A, B, S], R]], Callable[Concatenate[A, B, P], R]]: ...
 def keywords(record: Callable[..., Any], leading: int = 1) -> Any:
     """Let a verb take the fields of its record of settings as arguments.
@@ -69,7 +73,7 @@ def keywords(record: Callable[..., Any], leading: int = 1) -> Any:
 
     Args:
         record: The frozen dataclass of settings.
-        leading: Number of parameters before the settings: 1 or 2.
+        leading: Number of parameters before the settings.
     """
 
     def wrap(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -76,7 +76,7 @@ COMMANDS: Final[dict[str, str | tuple[str, str]]] = {
     "landmarks match": "eval.landmarks:match_landmarks",
     "truth": "datasets.truth.carried:write_truth",
     "truth from-gnss": "eval.fit.gnss_truth:truth_from_gnss",
-    "truth import": ("truth.import_annotations", "import annotations of labelling tools as truth"),
+    "truth import": "eval.failures.imported_truth:import_truth",
     "truth check": "eval.fit.truth_check:check_truth",
     "run schema": "eval.schemas:run",
     "truth schema": "eval.schemas:truth",
@@ -90,9 +90,9 @@ COMMANDS: Final[dict[str, str | tuple[str, str]]] = {
     "study landmarks": "eval.studies.town.run:run_landmark_study",
     "study field": "eval.studies.town.field_study:run_field_study",
     "study drive": "eval.studies.town.replayed:run_study_drive",
-    "demo": ("demo", "simulate, replay, score and show a small drive"),
+    "demo": "eval.drives.demo:demo",
     "plugins": "detectors.plugins:plugins",
-    "completion": ("completion", "print a completion script for bash, zsh or fish"),
+    "completion": "eval.completion:completion",
 }
 
 EXIT_STATUS: Final = """\
@@ -152,7 +152,7 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     _prepare_streams()
     warnings.formatwarning = lambda message, *_, **__: f"crosscue: {visible(str(message))}\n"
     if "_ARGCOMPLETE" in os.environ:
-        from crosscue.eval.commands.completion import complete
+        from crosscue.eval.completion import complete
 
         complete(COMMANDS, lambda name: parser_of(name)[1])
     try:

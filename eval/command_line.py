@@ -98,7 +98,8 @@ class Call:
 def with_options(text: str, parser: argparse.ArgumentParser) -> str:
     """Return an error about parameters with the names of their options.
 
-    ``bin_m: -1, expected more than 0`` becomes ``--bin-m -1: expected more than 0``.
+    ``bin_m: -1, expected more than 0`` becomes ``--bin-m -1: expected more than 0``, and
+    ``real=True`` becomes ``--real``.
     """
     options = {
         action.dest.rpartition(".")[2]: action.option_strings[-1]
@@ -110,7 +111,8 @@ def with_options(text: str, parser: argparse.ArgumentParser) -> str:
         return text
     named = ", ".join(options[name] for name in lead["names"].split(", "))
     value = "" if lead["value"] is None else f" {lead['value']}"
-    return f"{named}{value}: {text[lead.end() :]}"
+    rest = re.sub(r"\b(\w+)=True\b", lambda m: options.get(m[1], m[0]), text[lead.end() :])
+    return f"{named}{value}: {rest}"
 
 
 def described(documented: object) -> Described:
@@ -142,7 +144,7 @@ def fill(parser: argparse.ArgumentParser, verb: Callable[..., Any]) -> Call:
     groups: Groups = {}
     call = add_parameters(parser, verb, groups)
     returned = _returned(verb)
-    if returned is dict or returned is type(None):
+    if returned in (dict, str, type(None)):
         parser.set_defaults(json=False)
     else:
         shown = groups.get("json") or parser.add_mutually_exclusive_group()

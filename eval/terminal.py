@@ -173,12 +173,12 @@ def print_found(found: Any, args: argparse.Namespace) -> int:
     """Print what a verb returned, as text or as JSON; return its exit status."""
     if not isinstance(found, Result):
         if found is not None:
-            print_json(found)
+            print(found if isinstance(found, str) else strict_json(found))
         return 0
     shown = found.reported
     chosen = next((name for name in shown.formats if getattr(args, name)), None)
     if args.json:
-        print_json(shown.as_dict())
+        print(strict_json(shown.as_dict()))
     elif not args.quiet and not shown.is_printed_in_parts:
         text = repr(shown) if chosen is None else getattr(shown, chosen)()
         if text:
@@ -192,11 +192,6 @@ def print_found(found: Any, args: argparse.Namespace) -> int:
 def is_shown(args: argparse.Namespace) -> bool:
     """Return True unless ``--quiet`` is set or stderr is not a terminal."""
     return not args.quiet and sys.stderr.isatty()
-
-
-def print_json(value: object) -> None:
-    """Print strict JSON on stdout: sorted keys, NaN and infinities as null."""
-    print(strict_json(value))
 
 
 def warn(sentence: str) -> None:

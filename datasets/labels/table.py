@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
 from crosscue.datasets.truth.annotations import Annotations, Sizes
 from crosscue.datasets.truth.coco import read_coco, write_coco
@@ -39,7 +39,8 @@ class LabelFormat:
     title: str
 
 
-LABEL_FORMATS: Final[dict[str, LabelFormat]] = {
+ToolFormat: TypeAlias = Literal["coco", "cvat", "yolo", "fiftyone", "labelstudio"]
+LABEL_FORMATS: Final[dict[ToolFormat, LabelFormat]] = {
     "coco": LabelFormat(write_coco, lambda path, _: read_coco(path), "images", "COCO"),
     "cvat": LabelFormat(write_cvat, lambda path, _: read_cvat(path), "images", "CVAT 1.1"),
     "yolo": LabelFormat(write_yolo, read_yolo, "images", "YOLO"),
@@ -50,7 +51,7 @@ LABEL_FORMATS: Final[dict[str, LabelFormat]] = {
 }
 
 
-def read_tool_labels(path: Path, sizes: Sizes, kind: str | None = None) -> Annotations:
+def read_tool_labels(path: Path, sizes: Sizes, kind: ToolFormat | None = None) -> Annotations:
     """Read the export of a labelling tool.
 
     Args:
@@ -67,7 +68,7 @@ def read_tool_labels(path: Path, sizes: Sizes, kind: str | None = None) -> Annot
     return LABEL_FORMATS[kind or _recognised(path)].read(path, sizes)
 
 
-def _recognised(path: Path) -> str:
+def _recognised(path: Path) -> ToolFormat:
     suffix = path.suffix.lower()
     if path.is_dir():
         return "fiftyone" if (path / FIFTYONE).is_file() else "yolo"

@@ -1,40 +1,29 @@
-"""Export failing frames for a labelling tool, and import the corrected labels."""
+"""Export failing frames for a labelling tool."""
 
 from __future__ import annotations
 
-import os
-import re
 import shutil
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final
 
-from crosscue.datasets.labels.table import LABEL_FORMATS, read_tool_labels
-from crosscue.datasets.truth.annotations import Annotations, Picture, cues_by_label
-from crosscue.datasets.truth.coco import WRITTEN, write_coco
+from crosscue.datasets.labels.table import LABEL_FORMATS, ToolFormat
+from crosscue.datasets.truth.annotations import Annotations
 from crosscue.eval.failures.export import ExportedRun, export_run
 from crosscue.eval.failures.record import Failure, read_failures
-from crosscue.eval.fit.truth_check import FILE, ImportedTruth, import_part
 from crosscue.eval.pipeline.run import moved_to
 from crosscue.eval.runs import owned
 from crosscue.replay.errors import (
-    AnnotationError,
     CrosscueError,
     EmptyResultError,
     OutputError,
-    SchemaError,
     UsageError,
 )
-from crosscue.replay.files import door
-from crosscue.replay.files.tree_text import json_tree, unspelled
 from crosscue.replay.files.whole_file import cannot_write
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.safe_text import visible
-from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import Result
 from crosscue.verb import Option
 
@@ -56,7 +45,7 @@ class ExportedLabels(Result):
     """
 
     file: Path
-    format: str
+    format: ToolFormat
     pictures: int
     boxes: int
     labels: tuple[str, ...]
@@ -81,7 +70,7 @@ class ExportedLabels(Result):
 def export(
     failures: Annotated[Path | str | Sequence[Failure], Option(metavar="FAILURES")],
     output: Path | str,
-    to: Literal["coco", "cvat", "yolo", "fiftyone", "labelstudio"] = "coco",
+    to: ToolFormat = "coco",
     *,
     classes: Sequence[str] = (),
     logs: Annotated[Path | str | None, Option(metavar="DIR")] = None,
@@ -188,159 +177,3 @@ def _together(where: str, runs: Sequence[ExportedRun]) -> Annotations:
         raise UsageError(f"{where}: two runs would write {twice[0]}; export them one by one")
     labels = dict.fromkeys(label for run in runs for label in run.labels)
     return Annotations(where, tuple(labels), tuple(one for run in runs for one in run.pictures))
-
-
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class ImportedLabels(Result):
-    """Corrected labels by drive; its text is the output of ``crosscue truth import --export``.
-
-    Attributes:
-        coco: COCO file with all pictures, for training and fitting.
-        images: Folder of the exported pictures.
-        drives: Imported truth by name of the drive.
-        missing: Number of exported pictures that the annotations lack.
-        ignored: Numbers of shapes and tasks that were not imported, by kind.
-    """
-
-    coco: Path
-    images: Path
-    drives: Mapping[str, ImportedTruth]
-    missing: int
-    ignored: Mapping[str, int]
-
-    def lines(self) -> Iterator[str]:
-        """Yield counts, what is missing or ignored, and the files that were written."""
-        pictures = sum(one.pictures for one in self.drives.values())
-        things = sum(one.things for one in self.drives.values())
-        yield f"pictures   {pictures:,} with {things:,} objects, of {len(self.drives):,} drives"
-        if self.missing:
-            yield f"missing    {self.missing:,} exported pictures are not in the annotations"
-        yield from (f"ignored    {count:,} {visible(kind)}" for kind, count in self.ignored.items())
-        yield from (f"truth      {visible(str(one.truth))}" for one in self.drives.values())
-        yield f"to train   --data {visible(str(self.coco))} --images {self.images}"
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the files, the truth of each drive, and what was not imported."""
-        drives = {name: one.as_dict() for name, one in self.drives.items()}
-        return {**Result.as_dict(self), "drives": drives}
-
-
-def import_labels(
-    annotations: Path | str,
-    exported: Path | str,
-    output: Path | str,
-    vehicle: Vehicle | Path | str | None = None,
-    *,
-    labels: Mapping[str, str] = MappingProxyType({}),
-    add: bool = False,
-    overwrite: bool = False,
-    kind: str | None = None,
-    limits: LimitsGiven = DEFAULT_LIMITS,
-) -> ImportedLabels:
-    """Import corrected labels of an export: truth and objects of each drive, and one COCO file.
-
-    Args:
-        annotations: Annotations from the labelling tool, in any of the formats of ``export``.
-        exported: Folder that ``export`` wrote, with an index of the time of each picture.
-        output: Output folder, with one folder per drive, and ``coco.json``.
-        vehicle: Vehicle file that defines your own cues.
-        labels: Cue by label; an empty cue ignores the label.
-        add: Replace only the cues and objects of existing truth files.
-        overwrite: Replace existing truth files.
-        kind: Format of the annotations; default: detected.
-        limits: Limits for reading the logs.
-
-    Raises:
-        SchemaError: The labels or the export cannot be read, or a picture was not exported, has
-            another size, or occurs twice.
-        OutputError: A truth file exists, or cannot be written.
-    """
-    source, folder, target = Path(annotations), Path(exported), Path(output)
-    drives = _read_index(folder)
-    known = {
-        Path(name).stem: (name, row) for one in drives for name, row in one["pictures"].items()
-    }
-    sizes = {stem: (row["width"], row["height"]) for stem, (_, row) in known.items()}
-    read = read_tool_labels(source, sizes, kind)
-    placed = tuple(_placed(one, known, read.where) for one in read.pictures)
-    for name, count in Counter(one.name for one in placed).items():
-        if count > 1:
-            raise SchemaError(f"{read.where}: {name}: expected once, found {count} times")
-    settings = vehicle_given(vehicle)
-    exported_as = {label: cue for one in drives for label, cue in one["labels"].items()}
-    meant = {label: cue for label, cue in exported_as.items() if label in read.labels}
-    cues = cues_by_label(read, meant | dict(labels), tuple(settings.cues.own), any_thing=True)
-    wanted = {name for one in drives for name in one["pictures"]}
-    there = {one["drive"]: target / one["drive"] / FILE for one in drives}
-    for path in (target / "coco.json", target / WRITTEN, *there.values()):
-        if path.exists() and not (add or overwrite):
-            raise OutputError(f"{path}: exists; use --add, --overwrite, or another name")
-    done: dict[str, ImportedTruth] = {}
-    for one in drives:
-        mine = tuple(picture for picture in placed if picture.name in one["pictures"])
-        if not mine:
-            continue
-        log = _log_of(one["log"], folder)
-        part = replace(read, pictures=mine)
-        keeps = add and there[one["drive"]].exists()
-        path = there[one["drive"]]
-        done[one["drive"]] = import_part(part, cues, log, path, settings, add=keeps, limits=limits)
-    if not done:
-        raise EmptyResultError(f"{source}: contains no labelled picture of the export")
-    whole = replace(read, pictures=placed)
-    coco = write_coco(target, whole).replace(target / "coco.json")
-    images = folder / LABEL_FORMATS[_format(folder)].pictures
-    missing = len(wanted - {one.name for one in placed})
-    return ImportedLabels(coco, images, done, missing, read.ignored)
-
-
-def _placed(
-    picture: Picture, known: Mapping[str, tuple[str, Mapping[str, Any]]], where: str
-) -> Picture:
-    """Return a picture with its name and time in the export.
-
-    Raises:
-        SchemaError: The picture was not exported, or has another size.
-    """
-    stem = re.split(r"[/\\]", picture.name)[-1]
-    found = known.get(stem) or known.get(re.sub(r"\.[A-Za-z]+$", "", stem))
-    if found is None:
-        # CVAT and Label Studio add a prefix to the names of uploaded files.
-        ends = [name for name in known if re.sub(r"\.[A-Za-z]+$", "", stem).endswith(name)]
-        found = known[ends[0]] if len(ends) == 1 else None
-    if found is None:
-        raise SchemaError(
-            f"{where}: {picture.name}: not in the export; use the export that contains it"
-        )
-    name, row = found
-    if picture.size_px != (row["width"], row["height"]):
-        raise SchemaError(
-            f"{where}: {picture.name}: expected {row['width']} x {row['height']} pixels, found "
-            f"{picture.size_px[0]} x {picture.size_px[1]}; label pictures in their exported size"
-        )
-    return replace(picture, name=name, t_ns=row["t_ns"])
-
-
-def _read_index(folder: Path) -> list[dict[str, Any]]:
-    path = folder / INDEX
-    try:
-        drives = json_tree(door.read(path))["drives"]
-        for one in drives:
-            assert Path(one["drive"]).name == one["drive"] != ""
-            assert isinstance(one["log"], str)
-            assert isinstance(one["labels"], dict)
-            for row in one["pictures"].values():
-                assert all(isinstance(row[name], int) for name in ("t_ns", "width", "height"))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, AssertionError):
-        raise AnnotationError(
-            f"{path}: missing or damaged; use a folder that crosscue export wrote"
-        ) from None
-    return list(drives)
-
-
-def _format(folder: Path) -> str:
-    return str(json_tree(door.read(folder / INDEX))["to"])
-
-
-def _log_of(log: str, folder: Path) -> Path:
-    return Path(os.path.normpath(folder / unspelled(log)))

@@ -1,43 +1,33 @@
-"""Checking a truth file against its log, and importing annotations of a log's pictures as truth."""
+"""Checking a truth file against its log."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Final
 
 import numpy as np
 
-from crosscue.datasets.labels.table import read_tool_labels
-from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.annotations import (
-    Annotations,
     LogPictures,
-    PictureTimes,
     check_boxes,
-    coco_tree,
-    cue_truths,
     cues_by_label,
     match_frames,
 )
 from crosscue.datasets.truth.coco import read_coco
-from crosscue.datasets.truth.objects import OBJECTS_FILE
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import read_tum
 from crosscue.eval.scoring import truth as score_truth
-from crosscue.replay.errors import OutputError, SchemaError
-from crosscue.replay.files.tree_text import strict_json
-from crosscue.replay.files.whole_file import sha256_of, write_text
-from crosscue.replay.limits import DEFAULT_LIMITS, Limits, LimitsGiven
-from crosscue.replay.vehicle.vehicle import CUES, Vehicle, vehicle_given
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.files.whole_file import sha256_of
+from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
+from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import Result
 from crosscue.verb import Option
 
 from .log_images import LogSpan, log_pictures, log_span
 
-FILE: Final = truth_file.FILE
 # Max time by which truth may exceed its log, because clocks and last pictures differ slightly.
 SLACK_NS: Final = 1_000_000_000
 
@@ -84,39 +74,6 @@ class TruthFit(Result):
             yield f"moments    {met} meet a picture of the log"
         if not self.is_checked_by_hash:
             yield "log        not checked by hash: the truth names none (log_sha256)"
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class ImportedTruth(Result):
-    """Result of an import.
-
-    Attributes:
-        truth: Path of the truth file.
-        objects: Path of the COCO file next to it.
-        pictures: Number of annotated pictures.
-        things: Number of annotated objects.
-        rule: Rule by which pictures were matched to frames.
-        cues: Number of pictures in which a cue is present, by cue.
-        ignored: Number of shapes that were not imported, by kind.
-    """
-
-    truth: Path
-    objects: Path
-    pictures: int
-    things: int
-    rule: str
-    cues: dict[str, int]
-    ignored: Mapping[str, int]
-
-    def lines(self) -> Iterator[str]:
-        """Yield the numbers of pictures, objects and cues, and the files."""
-        yield f"pictures   {self.pictures} with {self.things} objects, matched {self.rule}"
-        yield from (f"           {cue}: present in {count}" for cue, count in self.cues.items())
-        if not self.cues:
-            yield "           no label is a cue; only objects were imported"
-        yield from (f"ignored    {count} {kind}" for kind, count in self.ignored.items())
-        yield f"written to {self.truth}"
-        yield f"           {self.objects}"
 
 
 def check_truth(
@@ -234,150 +191,3 @@ def _check_objects(path: Path, pictures: LogPictures, own_cues: Sequence[str]) -
     match_frames(annotations, pictures)
     check_boxes(annotations)
     return sum(len(picture.things) for picture in annotations.pictures)
-
-
-def import_truth(
-    annotations: Path | str,
-    log: Path | str,
-    output: Path | str,
-    vehicle: Vehicle | Path | str | None = None,
-    *,
-    labels: Mapping[str, str] = MappingProxyType({}),
-    add: bool = False,
-    overwrite: bool = False,
-    kind: str | None = None,
-    limits: Limits = DEFAULT_LIMITS,
-) -> ImportedTruth:
-    """Turn annotated pictures of a log into its truth.
-
-    Args:
-        annotations: COCO, FiftyOne or Label Studio (``.json``), CVAT 1.1 (``.xml``), or a folder of
-            YOLO or FiftyOne.
-        log: The log whose pictures were annotated.
-        output: The truth file, or its folder; labelled objects are written next to it.
-        vehicle: Vehicle file that names the camera, if the log has several, and user-defined cues.
-        labels: Cue of each label; an empty cue leaves the label out.
-        add: Keep everything but cues and objects of an existing truth file.
-        overwrite: Replace an existing truth file.
-        kind: One of ``coco``, ``cvat``, ``yolo``, ``fiftyone``, ``labelstudio``; recognised if left
-            out.
-        limits: Limits for reading the log.
-
-    Raises:
-        SchemaError: The annotations do not fit the log.
-        OutputError: The truth file exists, or the files cannot be written.
-    """
-    source, log_path, place_of = Path(annotations), Path(log), Path(output)
-    target = place_of / truth_file.FILE if place_of.is_dir() else place_of
-    if target.exists() and not (add or overwrite):
-        raise OutputError(f"{target}: exists; --add to it, --overwrite it, or give another name")
-    settings = vehicle_given(vehicle)
-    pictures = log_pictures(log_path, settings, limits)
-    read = read_tool_labels(source, {"*": pictures.size_px}, kind)
-    cues = cues_by_label(read, labels, tuple(settings.cues.own))
-    return write_imported(read, cues, pictures, log_path, target, add=add)
-
-
-def import_part(
-    annotations: Annotations,
-    cues: Mapping[str, str | None],
-    log: Path,
-    output: Path,
-    vehicle: Vehicle,
-    *,
-    add: bool = False,
-    limits: Limits = DEFAULT_LIMITS,
-) -> ImportedTruth:
-    """Write the annotated pictures of one log with ``write_imported``.
-
-    Args:
-        annotations: The annotations.
-        cues: Cue of each label.
-        log: The log.
-        output: The truth file.
-        vehicle: Settings that name the camera, if the log has several.
-        add: Keep everything but cues and objects of an existing truth file.
-        limits: Limits for reading the log.
-
-    Raises:
-        LogError: The log cannot be read.
-        SchemaError: The annotations do not fit the log.
-        OutputError: The files cannot be written.
-    """
-    pictures = log_pictures(log, vehicle, limits)
-    return write_imported(annotations, cues, pictures, log, output, add=add)
-
-
-def write_imported(
-    annotations: Annotations,
-    cues: Mapping[str, str | None],
-    pictures: LogPictures,
-    log_path: Path,
-    output: Path,
-    *,
-    add: bool = False,
-) -> ImportedTruth:
-    """Write the annotated pictures of one log as its truth and its labelled objects.
-
-    Args:
-        annotations: The annotations.
-        cues: Cue of each label; None for a label that is not a cue.
-        pictures: Times and size of the log's pictures.
-        log_path: The log.
-        output: The truth file; objects are written next to it.
-        add: Keep everything but cues and objects of an existing truth file.
-
-    Raises:
-        SchemaError: The annotations do not fit the log.
-        OutputError: The files cannot be written.
-    """
-    check_boxes(annotations)
-    placed = match_frames(annotations, pictures)
-    truth = _truth(annotations, placed, cues, pictures, log_path, Path(annotations.where))
-    if add:
-        before = truth_file.read_truth(output)
-        kept = {
-            "start_ns": min(before.start_ns, truth.start_ns),
-            "end_ns": max(before.end_ns, truth.end_ns),
-            "cues": truth.cues,
-            "own_cues": truth.own_cues,
-            "objects": truth.objects,
-            "log_sha256": truth.log_sha256,
-        }
-        truth = before.model_copy(update=kept)
-    objects = output.parent / OBJECTS_FILE
-    write_text(objects, strict_json(coco_tree(annotations, placed, cues)) + "\n")
-    write_text(output, strict_json(truth.model_dump(mode="json")) + "\n")
-    there: dict[str, int] = {}
-    for one in truth.cues:
-        there[one.cue] = there.get(one.cue, 0) + one.present
-    return ImportedTruth(
-        output,
-        objects,
-        len(annotations.pictures),
-        sum(len(picture.things) for picture in annotations.pictures),
-        placed.rule,
-        there,
-        annotations.ignored,
-    )
-
-
-def _truth(
-    annotations: Annotations,
-    placed: PictureTimes,
-    cues: Mapping[str, str | None],
-    pictures: LogPictures,
-    log_path: Path,
-    source: Path,
-) -> Truth:
-    return Truth(
-        version=1,
-        log=log_path.name,
-        log_sha256=sha256_of(log_path),
-        start_ns=int(pictures.t_ns[0]),
-        end_ns=int(pictures.t_ns[-1]) + 1,
-        source=f"annotations in {source.name}",
-        cues=cue_truths(annotations, placed, cues),
-        own_cues=tuple(sorted({cue for cue in cues.values() if cue} - {*CUES})),
-        objects=OBJECTS_FILE,
-    )

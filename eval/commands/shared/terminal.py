@@ -10,9 +10,9 @@ from crosscue.eval.command_line import add_parameters
 from crosscue.eval.terminal import Done as Done
 from crosscue.eval.terminal import ProgressLine as ProgressLine
 from crosscue.eval.terminal import is_shown
-from crosscue.eval.terminal import print_json as print_json
 from crosscue.eval.terminal import warn as warn
 from crosscue.replay import limits
+from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.limits import Limits
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class Result(Protocol):
 def print_result(found: Result, args: argparse.Namespace) -> None:
     """Print the result as JSON (``--json``) or as text; print nothing with ``--quiet``."""
     if args.json:
-        print_json(found.as_dict())
+        print(strict_json(found.as_dict()))
     elif not args.quiet:
         print(found)
 

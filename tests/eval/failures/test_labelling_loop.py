@@ -75,7 +75,8 @@ def test_corrected_boxes_are_imported_and_used_for_training_and_fitting(
         box["bbox"] = [*box["bbox"][:2], 44.0, 12.0]  # type: ignore[index]
 
     corrected_file = write_corrected(exported, tmp_path / "corrected.json", wider)
-    found = crosscue.import_labels(corrected_file, exported.parent, tmp_path / "labelled")
+    found = crosscue.import_truth(corrected_file, tmp_path / "labelled", export=exported.parent)
+    assert isinstance(found, crosscue.ImportedLabels)
 
     (drive,) = found.drives.values()
     assert found.missing == 0
@@ -108,7 +109,8 @@ def test_corrected_boxes_are_imported_and_used_for_training_and_fitting(
 
 
 def test_imported_picture_without_cue_records_its_absence(exported: Path, tmp_path: Path) -> None:
-    found = crosscue.import_labels(exported, exported.parent, tmp_path / "labelled")
+    found = crosscue.import_truth(exported, tmp_path / "labelled", export=exported.parent)
+    assert isinstance(found, crosscue.ImportedLabels)
 
     (drive,) = found.drives.values()
     assert drive.cues["stop_sign"] == 0
@@ -121,27 +123,30 @@ def test_missing_pictures_are_counted_and_unknown_or_duplicate_ones_refused(
     gone = tree["images"].pop()
     tree["annotations"] = [one for one in tree["annotations"] if one["image_id"] != gone["id"]]
     (tmp_path / "fewer.json").write_text(json.dumps(tree))
-    found = crosscue.import_labels(tmp_path / "fewer.json", exported.parent, tmp_path / "fewer")
+    found = crosscue.import_truth(
+        tmp_path / "fewer.json", tmp_path / "fewer", export=exported.parent
+    )
+    assert isinstance(found, crosscue.ImportedLabels)
     assert found.missing == 1
 
     tree["images"].append({**tree["images"][0], "id": 999})
     (tmp_path / "twice.json").write_text(json.dumps(tree))
     with pytest.raises(SchemaError, match=r"expected once, found 2 times"):
-        crosscue.import_labels(tmp_path / "twice.json", exported.parent, tmp_path / "twice")
+        crosscue.import_truth(tmp_path / "twice.json", tmp_path / "twice", export=exported.parent)
     tree["images"].pop()
 
     tree["images"][0]["file_name"] = "another.jpg"
     (tmp_path / "other.json").write_text(json.dumps(tree))
     with pytest.raises(SchemaError, match=r"another.jpg: not in the export"):
-        crosscue.import_labels(tmp_path / "other.json", exported.parent, tmp_path / "other")
+        crosscue.import_truth(tmp_path / "other.json", tmp_path / "other", export=exported.parent)
     assert not (tmp_path / "other").exists()
 
 
 def test_existing_output_is_not_replaced(worst: Path, exported: Path, tmp_path: Path) -> None:
-    crosscue.import_labels(exported, exported.parent, tmp_path / "labelled")
+    crosscue.import_truth(exported, tmp_path / "labelled", export=exported.parent)
     with pytest.raises(OutputError, match="exists"):
-        crosscue.import_labels(exported, exported.parent, tmp_path / "labelled")
-    crosscue.import_labels(exported, exported.parent, tmp_path / "labelled", add=True)
+        crosscue.import_truth(exported, tmp_path / "labelled", export=exported.parent)
+    crosscue.import_truth(exported, tmp_path / "labelled", export=exported.parent, add=True)
 
     with pytest.raises(OutputError, match="holds files already"):
         crosscue.export(worst, exported.parent)
@@ -153,7 +158,7 @@ def test_folder_without_export_and_unknown_format_are_refused(
     worst: Path, exported: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(AnnotationError, match="crosscue export wrote"):
-        crosscue.import_labels(exported, tmp_path, tmp_path / "labelled")
+        crosscue.import_truth(exported, tmp_path / "labelled", export=tmp_path)
     with pytest.raises(UsageError, match="expected one of coco"):
         crosscue.export(worst, tmp_path / "x", to="voc")  # type: ignore[arg-type]
 

@@ -15,7 +15,7 @@ from crosscue.datasets.truth.truth import read_truth as load_truth
 from crosscue.detectors.catalog import fetch as weights
 from crosscue.detectors.catalog import places
 from crosscue.eval.cli import run
-from crosscue.eval.interface import demo as real_demo
+from crosscue.eval.drives import demo as real_demo
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
 from support.data import shared
 from support.range_server import serving

@@ -1,13 +1,4 @@
-"""Shell completion of commands, options, choices and files.
-
-Prints a script for the shell's start-up file. The script asks the installed crosscue for
-completions, so they always match its version.
-
-examples:
-  crosscue completion bash >> ~/.bashrc
-  crosscue completion zsh >> ~/.zshrc
-  crosscue completion fish > ~/.config/fish/completions/crosscue.fish
-"""
+"""Shell completion of commands, options, choices and files."""
 
 from __future__ import annotations
 
@@ -15,21 +6,30 @@ import argparse
 import os
 import shlex
 from collections.abc import Callable, Collection
+from typing import Annotated, Literal
 
-SHELLS = ("bash", "zsh", "fish")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options to the parser."""
-    parser.add_argument("shell", choices=SHELLS, metavar="SHELL", help="bash, zsh or fish")
+from crosscue.verb import Option
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print the completion script of a shell."""
+def completion(
+    shell: Annotated[Literal["bash", "zsh", "fish"], Option(metavar="SHELL")],
+) -> str:
+    """Print a completion script for bash, zsh or fish.
+
+    It is meant for the shell's start-up file. The script asks the installed crosscue for
+    completions, so they always match its version.
+
+    Examples:
+        crosscue completion bash >> ~/.bashrc
+        crosscue completion zsh >> ~/.zshrc
+        crosscue completion fish > ~/.config/fish/completions/crosscue.fish
+
+    Args:
+        shell: Shell: bash, zsh or fish.
+    """
     from argcomplete.shell_integration import shellcode
 
-    print(shellcode(["crosscue"], shell=args.shell))
-    return 0
+    return shellcode(["crosscue"], shell=shell)
 
 
 def complete(names: Collection[str], parser_of: Callable[[str], argparse.ArgumentParser]) -> None:

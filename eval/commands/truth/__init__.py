@@ -1,1 +1,0 @@
-"""``crosscue truth ...``: write, import and check truth files."""
