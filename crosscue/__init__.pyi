@@ -12,6 +12,10 @@ from crosscue.detectors.base import Frame as Frame
 from crosscue.detectors.base import View as View
 from crosscue.detectors.base import nothing_found as nothing_found
 from crosscue.detectors.box_detector import BoxDetector as BoxDetector
+from crosscue.detectors.catalog.cards import CardCheck as CardCheck
+from crosscue.detectors.catalog.cards import CardDraft as CardDraft
+from crosscue.detectors.catalog.cards import check_card as check_card
+from crosscue.detectors.catalog.cards import draft_card as draft_card
 from crosscue.detectors.catalog.known_models import FetchedModel as FetchedModel
 from crosscue.detectors.catalog.known_models import Model as Model
 from crosscue.detectors.catalog.known_models import Models as Models
@@ -39,6 +43,8 @@ from crosscue.eval.drives.demo import Demo as Demo
 from crosscue.eval.drives.demo import KnownDrive as KnownDrive
 from crosscue.eval.drives.demo import demo as demo
 from crosscue.eval.drives.demo import fetch_drive as fetch_drive
+from crosscue.eval.drives.detector_score import DetectorScore as DetectorScore
+from crosscue.eval.drives.detector_score import score_detector as score_detector
 from crosscue.eval.drives.many import ReplayedDrives as ReplayedDrives
 from crosscue.eval.drives.many import find_drives as find_drives
 from crosscue.eval.drives.many import replay_drives as replay_drives
@@ -77,12 +83,6 @@ from crosscue.eval.fleet.compare import compare_runs as compare_runs
 from crosscue.eval.fleet.history import history as history
 from crosscue.eval.fleet.tags import TaggedRuns as TaggedRuns
 from crosscue.eval.fleet.tags import tag_runs as tag_runs
-from crosscue.eval.interface.models.cards import CardCheck as CardCheck
-from crosscue.eval.interface.models.cards import CardDraft as CardDraft
-from crosscue.eval.interface.models.cards import check_card as check_card
-from crosscue.eval.interface.models.cards import draft_card as draft_card
-from crosscue.eval.interface.runs.detector_scores import DetectorScore as DetectorScore
-from crosscue.eval.interface.runs.detector_scores import score_detector as score_detector
 from crosscue.eval.landmarks import add_landmarks as add_landmarks
 from crosscue.eval.landmarks import list_landmarks as list_landmarks
 from crosscue.eval.landmarks import match_landmarks as match_landmarks

@@ -330,26 +330,3 @@ def _numbers(words: Sequence[str], where: str) -> list[float]:
     if not all(map(math.isfinite, found)):
         raise AnnotationError(f"{where}: {' '.join(words)}: expected numbers; correct the line")
     return found
-
-
-def class_names_given(given: Sequence[str] | Path | str) -> tuple[str, ...]:
-    """Return class names, or read them from a file with one name per line.
-
-    Raises:
-        UsageError: The file cannot be read, or is empty.
-    """
-    if not isinstance(given, Path | str):
-        return tuple(given)
-    path = Path(given)
-    try:
-        content = read_at_most(path, MIB)
-        if content is None:
-            raise UsageError(f"{path}: over 1 MiB; expected class names, one per line")
-        lines = content.decode("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise UsageError(f"{path}: {why}; expected class names, one per line") from None
-    names = tuple(line.strip() for line in lines if line.strip())
-    if not names:
-        raise UsageError(f"{path}: contains no names; expected class names, one per line")
-    return names

@@ -1,9 +1,15 @@
-"""COCO's class names, and the labels of crosscue's cues for names of other vocabularies."""
+"""Class names: COCO's, those that a user gives, and the labels of cues for other vocabularies."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
+
+from crosscue.replay.errors import UsageError
+from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.limits import MIB
 
 COCO_80: Final = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
@@ -65,3 +71,26 @@ def cue_label(name: str) -> str | None:
     bare = re.sub(r"[^a-z]", "", name.lower())
     by_spelling = {re.sub(r"[^a-z]", "", label): label for label in CUE_LABELS}
     return by_spelling.get(bare) or _MEANINGS.get(bare)
+
+
+def class_names_given(given: Sequence[str] | Path | str) -> tuple[str, ...]:
+    """Return class names, or read them from a file with one name per line.
+
+    Raises:
+        UsageError: The file cannot be read, or is empty.
+    """
+    if not isinstance(given, Path | str):
+        return tuple(given)
+    path = Path(given)
+    try:
+        content = read_at_most(path, MIB)
+        if content is None:
+            raise UsageError(f"{path}: over 1 MiB; expected class names, one per line")
+        lines = content.decode("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise UsageError(f"{path}: {why}; expected class names, one per line") from None
+    names = tuple(line.strip() for line in lines if line.strip())
+    if not names:
+        raise UsageError(f"{path}: contains no names; expected class names, one per line")
+    return names

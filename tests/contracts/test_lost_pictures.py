@@ -74,11 +74,11 @@ LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
 # Reasons why other files have no command in the table above.
 HOW_OTHERS_DO: Final = {
     "datasets/adapters/road_folder.py": "files that the user names",
+    "detectors/catalog/cards.py": "files that the user names",
     "detectors/images.py": "the functions themselves",
     "detectors/overlay.py": "for eval/failures/pictures.py",
     "detectors/training/samples.py": "files that the user names",
     "eval/landmarks.py": "files that the user names",
-    "eval/interface/models/cards.py": "files that the user names",
     "eval/logs/log.py": "a call of the user for one picture, which raises",
     "eval/report/worst_boxes.py": "frames with detections, thus decoded before",
     "eval/report/worst_frames.py": "frames with detections, thus decoded before",

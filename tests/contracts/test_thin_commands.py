@@ -16,11 +16,7 @@ from crosscue.eval import cli
 
 ROOT: Final = Path(__file__).parents[2]
 # Public functions that each command calls.
-CALLS: Final = {
-    "score detector": ("score_detector",),
-    "model init": ("draft_card",),
-    "model check": ("check_card",),
-}
+CALLS: Final[dict[str, tuple[str, ...]]] = {}
 # Modules that a command may import: the public interface, options and safe text. Constants of other
 # modules are allowed as well, for the help.
 ALLOWED: Final = re.compile(r"crosscue(\.eval\.commands(\..+)?|\.replay\.(base|safe_text))?")

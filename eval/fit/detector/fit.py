@@ -15,10 +15,10 @@ import numpy as np
 from crosscue.datasets.truth.box_labels import (
     LabelFormat,
     Meanings,
-    class_names_given,
     read_box_labels,
 )
 from crosscue.detectors.catalog.card import read_card
+from crosscue.detectors.catalog.class_names import class_names_given
 from crosscue.detectors.catalog.places import card_path, names
 from crosscue.eval.fit.detector.card_text import check_card_place, with_fit
 from crosscue.eval.fit.detector.class_fit import (

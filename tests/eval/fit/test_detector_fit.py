@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from pathlib import Path
 
 import cv2
@@ -247,6 +248,10 @@ def test_class_without_labelled_box_is_not_labelled(tmp_path: Path) -> None:
     (scored,) = [one for one in found.scores if one.label == "truck"]
     assert np.isnan(scored.precision.value)
     assert "truck      not labelled, 1 detections" in str(fitted)
+    (row,) = re.findall("<tr><td>truck</td>.*?</tr>", found.report.read_text(), re.DOTALL)
+    assert "not labelled: 3 detections not judged" in row
+    assert "<td>-" not in row
+    assert "truck 0.000" not in found.report.read_text()
 
 
 @pytest.mark.parametrize(

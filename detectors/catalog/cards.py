@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Annotated, ClassVar, Final
 
-from crosscue.datasets.truth.box_labels import class_names_given
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.catalog.architectures import WEIGHTS_SUFFIXES
+from crosscue.detectors.catalog.class_names import class_names_given
 from crosscue.detectors.catalog.draft import Draft, draft_card_text
 from crosscue.detectors.catalog.places import card_named
 from crosscue.detectors.catalog.recognise import closed, guesses, plausible, read_interface
@@ -23,6 +23,8 @@ from crosscue.detectors.overlay import encode_overlay
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import LogError, UsageError, VehicleError
 from crosscue.replay.files.whole_file import write_bytes, write_text
+from crosscue.results import HIDDEN, Result, json_key
+from crosscue.verb import Option, keywords
 
 # Supported tasks in the metadata of Ultralytics' exports.
 _TASKS: Final = ("detect", "segment")
@@ -30,8 +32,8 @@ _MAX_TASK_CHARACTERS: Final = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class CardDraft:
-    """A drafted model card, with its assumptions to check.
+class CardDraft(Result):
+    """A drafted model card, with its assumptions to check; its text is that of ``model init``.
 
     Attributes:
         path: The card.
@@ -40,34 +42,30 @@ class CardDraft:
         boxes: Number of detections; None without a picture, and for a road network.
     """
 
-    path: Path
-    draft: Draft
+    path: Path = field(metadata=json_key("card"))
+    draft: Draft = field(metadata=HIDDEN)
     picture: Path | None = None
-    boxes: int | None = None
+    boxes: int | None = field(default=None, metadata=HIDDEN)
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue model init``."""
-        return {
-            "card": str(self.path),
-            "kind": self.draft.kind,
-            "certain": list(self.draft.certain),
-            "assumed": list(self.draft.assumed),
-            "picture": None if self.picture is None else str(self.picture),
-        }
+    also: ClassVar = {
+        "kind": "draft.kind",
+        "certain": "draft.certain",
+        "assumed": "draft.assumed",
+    }
 
-    def __repr__(self) -> str:
-        lines = [f"{self.path}: {self.draft.kind}; the network runs with it"]
-        lines += [f"certain    {line}" for line in self.draft.certain]
-        lines += [f"assumed    {line}" for line in self.draft.assumed]
+    def lines(self) -> Iterator[str]:
+        """Yield the kind of output, what is certain and assumed, and where boxes are drawn."""
+        yield f"{self.path}: {self.draft.kind}; the network runs with it"
+        yield from (f"certain    {line}" for line in self.draft.certain)
+        yield from (f"assumed    {line}" for line in self.draft.assumed)
         if self.picture is not None:
             what = "road" if self.boxes is None else f"{self.boxes} boxes"
-            lines.append(f"picture    {what}, drawn in {self.picture}: please check them")
-        return "\n".join(lines)
+            yield f"picture    {what}, drawn in {self.picture}: please check them"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class CardCheck:
-    """A card that fits its network.
+class CardCheck(Result):
+    """A card that fits its network; its text is that of ``model check``.
 
     Attributes:
         path: The card.
@@ -76,54 +74,65 @@ class CardCheck:
         found: Number of detections by label; None without a picture, and for a road network.
     """
 
-    path: Path
+    path: Path = field(metadata=json_key("card"))
     identity: str
     picture: Path | None = None
     found: Mapping[str, int] | None = None
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue model check``."""
-        result: dict[str, object] = {"card": str(self.path), "identity": self.identity}
+    def lines(self) -> Iterator[str]:
+        """Yield that the card fits, and what was found in the picture."""
+        yield f"{self.path}: fits its network"
         if self.picture is not None:
-            result["picture"] = str(self.picture)
-            result["found"] = None if self.found is None else dict(self.found)
-        return result
-
-    def __repr__(self) -> str:
-        fits = f"{self.path}: fits its network"
-        if self.picture is None:
-            return fits
-        counts = self.found
-        text = "road" if counts is None else ", ".join(f"{n} {name}" for name, n in counts.items())
-        return f"{fits}\nfound      {text or 'nothing'}; drawn in {self.picture}"
+            counts = self.found
+            named = [] if counts is None else [f"{n} {name}" for name, n in counts.items()]
+            text = "road" if counts is None else ", ".join(named) or "nothing"
+            yield f"found      {text}; drawn in {self.picture}"
 
 
+@dataclass(frozen=True, slots=True)
+class CardSettings:
+    """What a model file does not say, and where its card is written.
+
+    Attributes:
+        output: Card to write, in the folder of the weights (default: their name with .toml).
+        kind: Network, or layout of its outputs, if several fit.
+        class_names: Class names in the order of the outputs, one per line, for a file without them.
+        classes: The same names in one argument: road,curb,mark.
+        size_px: Input size, such as 1280x736, for a network that accepts any.
+        picture: Draw detections in a copy of this picture, CARD.PICTURE.found.jpg next to the card.
+        overwrite: Replace an existing card.
+    """
+
+    output: Annotated[Path | str | None, Option(metavar="CARD.toml")] = None
+    _: KW_ONLY
+    kind: Annotated[str | None, Option(metavar="KIND")] = None
+    class_names: Annotated[Path, Option(metavar="FILE")] | Sequence[str] | str | None = None
+    classes: Annotated[str | None, Option(metavar="NAME,NAME")] = None
+    size_px: Annotated[str, Option("--size", metavar="WxH")] | tuple[int, int] | None = None
+    picture: Path | str | None = None
+    overwrite: bool = False
+
+
+@keywords(CardSettings)
 def draft_card(
-    weights: Path | str,
-    output: Path | str | None = None,
-    *,
-    kind: str | None = None,
-    class_names: Sequence[str] | Path | str | None = None,
-    classes: str | None = None,
-    size_px: tuple[int, int] | str | None = None,
-    picture: Path | str | None = None,
-    overwrite: bool = False,
+    weights: Annotated[Path | str, Option(metavar="MODEL")], settings: CardSettings
 ) -> CardDraft:
-    """Write a model card from the contents of a model file, and run the network with it.
+    """Write a model card for an ONNX or OpenVINO file, or for weights.
+
+    The network, or the layout of its outputs, is recognised from names, shapes and metadata, and
+    the network runs with the card before it is written. Properties that the file does not record
+    are listed in the card as assumptions to check. If several kinds fit, the error lists all of
+    them, for --kind. Weights are a state_dict of a torchvision network (.pth, .pt) or safetensors:
+    tensors, without code.
+
+    Examples:
+        crosscue model init my.onnx --picture street.jpg
+        crosscue model init weights.pth --class-names names.txt
+        crosscue replay drive.mcap --vehicle car.toml --detectors my.toml -o run
 
     Args:
-        weights: An ONNX file, an OpenVINO ``.xml``, or the ``state_dict`` of a torchvision network
-            (``.pth``, ``.pt``, ``.safetensors``).
-        output: Card to write, in the folder of the weights; default: their name with ``.toml``.
-        kind: Layout of the outputs, or torchvision's name of the network, if several fit.
-        class_names: Names in the order of the outputs, or a file with one name per line, if the
-            model file has none.
-        classes: The same names as text, separated by commas: ``road,curb,mark``.
-        size_px: Width and height of the input, also as text, ``1280x736``, if the network accepts
-            any.
-        picture: Picture to detect in; a copy with detections is written next to the card, as
-            ``CARD.PICTURE.found.jpg``.
-        overwrite: Replace an existing card.
+        weights: .onnx, OpenVINO .xml, .pth, .pt or .safetensors.
+        settings: What the file does not say.
 
     Raises:
         UsageError: The card exists, the file is damaged or of another kind, no layout or several
@@ -133,31 +142,32 @@ def draft_card(
             written.
         LogError: The picture cannot be read or decoded.
     """
+    output, class_names = settings.output, settings.class_names
     path = Path(weights)
     place = path.with_suffix(".toml") if output is None else Path(output)
-    if place.exists() and not overwrite:
+    if place.exists() and not settings.overwrite:
         raise UsageError(f"{place}: exists; give another name or --overwrite")
     if place.resolve().parent != path.resolve().parent:
         raise UsageError(f"{place}: expected a card in the folder of its weights, {path.parent}")
-    if classes is not None:
+    if settings.classes is not None:
         if class_names is not None:
             raise UsageError("--classes and --class-names: give one of the two")
-        class_names = [name.strip() for name in classes.split(",")]
-    size = _size(size_px) if isinstance(size_px, str) else size_px
+        class_names = [name.strip() for name in settings.classes.split(",")]
+    size = _size(settings.size_px) if isinstance(settings.size_px, str) else settings.size_px
     if path.suffix.lower() in WEIGHTS_SUFFIXES:
         from crosscue.detectors.catalog.recognise_weights import recognise_weights
 
-        model, guess = recognise_weights(path, kind, size)
+        model, guess = recognise_weights(path, settings.kind, size)
     else:
         model = read_interface(path)
-        guess = _guess(path, closed(path, model, size), kind)
+        guess = _guess(path, closed(path, model, size), settings.kind)
     written = draft_card_text(
         path, model, guess, () if class_names is None else class_names_given(class_names), size
     )
-    if picture is None:
+    if settings.picture is None:
         _try(place, written)
         return CardDraft(place, written)
-    seen = Path(picture)
+    seen = Path(settings.picture)
     # Errors in the picture are reported before a card is written.
     _try(place, written, _pixels_of(seen)[0])
     found = _look(build(card=str(place)), seen, drawing := _drawing(place, seen))
@@ -165,15 +175,20 @@ def draft_card(
 
 
 def check_card(
-    model: Path | str, picture: Path | str | None = None, output: Path | str | None = None
+    model: Annotated[Path | str, Option(metavar="MODEL")],
+    picture: Path | str | None = None,
+    output: Annotated[Path | str | None, Option(metavar="FILE.jpg")] = None,
 ) -> CardCheck:
-    """Check that a model card fits its network, by running it.
+    """Run a network with its card, and draw its detections in a picture.
+
+    Examples:
+        crosscue model check my.toml --picture street.jpg
 
     Args:
-        model: Name in the catalog, or file name of a card, which ends in ``.toml``.
-        picture: JPEG, PNG or WebP file to detect in.
-        output: Copy of the picture with detections; default: ``CARD.PICTURE.found.jpg`` next to the
-            card, or in the current folder for a model of the catalog.
+        model: Name in the catalog, or model card, which ends in .toml.
+        picture: Run it on this JPEG, PNG or WebP file.
+        output: Picture with detections to write (default: CARD.PICTURE.found.jpg, next to the card,
+            or in the current folder for a model of the catalog).
 
     Raises:
         UsageError: The catalog has no such model.
@@ -235,7 +250,7 @@ def _shape(shape: tuple[int | str | None, ...]) -> str:
 def _size(text: str) -> tuple[int, int]:
     found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
     if found is None:
-        raise UsageError(f"--size {text}: expected WxH, such as 1280x736")
+        raise UsageError(f"size_px: {text}, expected WxH, such as 1280x736")
     return int(found[1]), int(found[2])
 
 

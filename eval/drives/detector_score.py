@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
 
-from crosscue.datasets.truth.box_labels import BoxLabels, class_names_given, read_box_labels
+from crosscue.datasets.truth.box_labels import BoxLabels, LabelFormat, Meanings, read_box_labels
+from crosscue.detectors.catalog.class_names import class_names_given
 from crosscue.eval.pipeline.run import Run, open_run
 from crosscue.eval.report.detector_page import write_detector_page
 from crosscue.eval.report.worst_boxes import worst_pictures
@@ -22,8 +24,10 @@ from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.limits import DEFAULT_LIMITS, Limits
+from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.safe_text import visible
+from crosscue.results import Result
+from crosscue.verb import Option, keywords
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -33,8 +37,8 @@ MEASURES: Final = ("ap50", "ap", "precision", "recall")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class DetectorScore:
-    """Scores of a detector; its repr is the output of ``crosscue score detector``.
+class DetectorScore(Result):
+    """Scores of a detector; its text is the output of ``crosscue score detector``.
 
     Attributes:
         labelled: Detections and labels that were compared.
@@ -51,6 +55,11 @@ class DetectorScore:
     calibration: tuple[Reliability, ...]
     block_s: float
     report: Path
+
+    @property
+    def exit_status(self) -> int:
+        """3 when the run has drops."""
+        return 0 if self.is_whole else 3
 
     @property
     def is_whole(self) -> bool:
@@ -105,40 +114,42 @@ class DetectorScore:
             "report": str(self.report),
         }
 
-    def __repr__(self) -> str:
+    def lines(self) -> Iterator[str]:
+        """Yield what was compared, the scores of each class and part, and the calibration."""
         of = self.labelled
         asked = int((~of.truth.is_ignored).sum())
-        lines = [
-            f"run        {visible(str(of.run.path))}",
-            f"detector   {visible(of.detector.name)}",
-            f"labels     {visible(self.labels.where)} ({self.labels.format}): {len(of.names)} of "
-            f"{len(self.labels.pictures)} images in the run, {of.rule};",
+        yield f"run        {of.run.path}"
+        yield f"detector   {of.detector.name}"
+        yield (
+            f"labels     {self.labels.where} ({self.labels.format}): {len(of.names)} of "
+            f"{len(self.labels.pictures)} images in the run, {of.rule};"
+        )
+        yield (
             f"           {asked:,} boxes to detect, {len(of.truth) - asked:,} not judged; "
-            f"{of.frames - len(of.names):,} frames without labels",
-            *(f"left out   {count:,} {visible(why)}" for why, count in of.left_out.items()),
-        ]
-        others = ", ".join(f"{n:,} {visible(label)}" for label, n in of.not_judged.items())
+            f"{of.frames - len(of.names):,} frames without labels"
+        )
+        yield from (f"left out   {count:,} {why}" for why, count in of.left_out.items())
+        others = ", ".join(f"{n:,} {label}" for label, n in of.not_judged.items())
         if others:
-            lines.append(f"not judged {others}: the labels have no such class")
-        lines += [
-            "",
+            yield f"not judged {others}: the labels have no such class"
+        yield ""
+        yield (
             f"{'class':14} {'part':11} {'labels':>6} {'AP50':>6} {'AP':>6}   above  "
-            f"{'precision':>17} {'recall':>17}",
-            *map(_line, self.scores),
-            "",
-        ]
-        lines += [
-            f"calibration error {one.error:.3f} of {visible(one.label)}, "
-            f"{one.detections:,} detections"
-            for one in self.calibration
-            if one.detections
-        ]
+            f"{'precision':>17} {'recall':>17}"
+        )
+        yield from map(_line, self.scores)
+        yield ""
+        for one in self.calibration:
+            if one.detections:
+                yield (
+                    f"calibration error {one.error:.3f} of {one.label}, "
+                    f"{one.detections:,} detections"
+                )
         unit = f"blocks of {self.block_s:g} s" if self.block_s > 0.0 else "single images"
-        lines.append(f"intervals  95 %, bootstrap over {unit}, seed {SEED}")
+        yield f"intervals  95 %, bootstrap over {unit}, seed {SEED}"
         if any(np.isnan(one.ap50.low) and one.labels for one in self.scores):
-            lines.append(f"{TOO_FEW}: no intervals below {MIN_CLUSTERS} blocks or images")
-        lines.append(f"written to {visible(str(self.report))}")
-        return "\n".join(lines)
+            yield f"{TOO_FEW}: no intervals below {MIN_CLUSTERS} blocks or images"
+        yield f"written to {self.report}"
 
 
 def _line(one: PartScore) -> str:
@@ -179,41 +190,78 @@ def _row(one: PartScore) -> dict[str, object]:
     return row
 
 
+@dataclass(frozen=True, slots=True)
+class DetectorScoreSettings:
+    """How a detector is compared with labels.
+
+    Attributes:
+        output: Folder for the page and its numbers (default: RUN/score).
+        detector: Name of the detector, if the run has several.
+        kind: Format of the labels (default: detected).
+        class_names: Class names, one per line: for YOLO in index order, for VOC and KITTI all
+            classes.
+        meanings: Class that a label of the file or detector counts as; an empty one ignores it.
+        overlap: Min IoU of a correct detection, for precision, recall and calibration.
+        block_s: Count images within this many seconds as one, because they are similar.
+        draw: Draw the N worst images.
+        logs: Folder that the run's logs have moved to; they are recognised by content.
+        without_images: Leave out camera images, so the run's logs are not needed.
+        has_figures: Omit the reliability diagram, which needs matplotlib.
+        limits: Limits for reading the logs.
+    """
+
+    output: Path | str | None = None
+    _: KW_ONLY
+    detector: str | None = None
+    kind: Annotated[LabelFormat | None, Option("--format")] = None
+    class_names: Annotated[Path, Option(metavar="FILE")] | Sequence[str] | str = ()
+    meanings: Meanings = field(default_factory=lambda: MappingProxyType({}))
+    overlap: float = 0.5
+    block_s: float = 1.0
+    draw: int = 8
+    logs: Annotated[Path | str | None, Option(metavar="DIR")] = None
+    without_images: bool = False
+    has_figures: bool = True
+    limits: LimitsGiven = DEFAULT_LIMITS
+
+    def __post_init__(self) -> None:
+        """Check numbers.
+
+        Raises:
+            UsageError: A number is out of range.
+        """
+        if not 0.0 < self.overlap <= 1.0:
+            raise UsageError(f"overlap: {self.overlap}, expected above 0, at most 1")
+        if not 0.0 <= self.block_s < 1e6:
+            raise UsageError(f"block_s: {self.block_s}, expected seconds from 0")
+        if self.draw < 0:
+            raise UsageError(f"draw: {self.draw}, expected 0 or more")
+
+
+@keywords(DetectorScoreSettings, 2)
 def score_detector(
-    run: Run | Path | str,
-    labels: Path | str,
-    output: Path | str | None = None,
-    *,
-    detector: str | None = None,
-    kind: str | None = None,
-    class_names: Sequence[str] | Path | str = (),
-    meanings: Mapping[str, str] | None = None,
-    overlap: float = 0.5,
-    block_s: float = 1.0,
-    draw: int = 8,
-    logs: Path | str | None = None,
-    without_images: bool = False,
-    has_figures: bool = True,
-    limits: Limits = DEFAULT_LIMITS,
+    run: Annotated[Path | str, Option(metavar="RUN")] | Run,
+    labels: Annotated[Path | str, Option("--labels", metavar="LABELS")],
+    settings: DetectorScoreSettings,
 ) -> DetectorScore:
-    """Score a detector's boxes in a run against labelled boxes.
+    """Score a detector of a run against labelled boxes of its images.
+
+    LABELS is a COCO .json, or a folder of YOLO .txt, Pascal VOC .xml or KITTI .txt files. Images
+    are matched to frames by file name if the log is a folder of images, else by log time (t_ns of a
+    COCO file, or a file name that is a time in nanoseconds), else by the frame number, from 0, at
+    the end of the file name. Frames without labels are not judged.
+
+    Prints AP50 and AP (COCO), precision and recall above the detector's threshold, by class, size
+    and range, and the calibration of scores. The page in RUN/score shows the worst images.
+
+    Examples:
+        crosscue score detector runs/A-01 --labels labels.json
+        crosscue score detector runs/A-01 --labels labels.json --map car=vehicle truck=vehicle
 
     Args:
-        run: Run with stored detections.
-        labels: A COCO file, or a folder of YOLO, Pascal VOC or KITTI files.
-        output: Folder for the page and its numbers; default: ``RUN/score``.
-        detector: Name of the detector, if the run has several.
-        kind: Format of the labels; default: detected.
-        class_names: Class names of YOLO labels in their order, or a file with one per line.
-        meanings: Class that a class of the labels or of the detector counts as; empty for a class
-            to ignore.
-        overlap: Min IoU of a correct detection, for precision, recall and calibration.
-        block_s: Pictures within this time count as one block, because they are similar.
-        draw: Number of the worst pictures to draw.
-        logs: Folder that the run's logs have moved to.
-        without_images: Draw no pictures, so that the logs are not needed.
-        has_figures: Draw the reliability diagram, which needs matplotlib.
-        limits: Limits for reading the logs.
+        run: Run folder with detections.
+        labels: Labelled boxes of its images.
+        settings: How to compare.
 
     Raises:
         UsageError: A value is out of range, the detector does not exist, or neither labels nor
@@ -222,30 +270,32 @@ def score_detector(
         EmptyResultError: No labelled box has a class that the detector reports.
         RunError: The run does not exist or is damaged, or its log is missing.
     """
-    if not 0.0 < overlap <= 1.0:
-        raise UsageError(f"--overlap {overlap}: expected above 0, at most 1")
-    if not 0.0 <= block_s < 1e6:
-        raise UsageError(f"--block-s {block_s}: expected seconds from 0")
-    if draw < 0:
-        raise UsageError(f"--draw {draw}: expected 0 or more")
+    output, overlap = settings.output, settings.overlap
     path = run.path if isinstance(run, Run) else run
-    folder = open_run(path, logs, without_images=without_images, limits=limits).folder
-    read = read_box_labels(Path(labels), kind, class_names_given(class_names))
-    of = labelled_run(folder, read, detector, meanings)
+    folder = open_run(
+        path, settings.logs, without_images=settings.without_images, limits=settings.limits
+    ).folder
+    read = read_box_labels(Path(labels), settings.kind, class_names_given(settings.class_names))
+    of = labelled_run(folder, read, settings.detector, dict(settings.meanings))
     scores = score_parts(
         of.truth,
         of.found,
         of.classes,
         {name: of.threshold(name) for name in of.classes},
-        of.blocks(block_s),
+        of.blocks(settings.block_s),
         overlap,
     )
     place = folder.file(FOLDER) if output is None else Path(output)
     stem = "detector_" + re.sub(r"[^\w.-]", "_", of.detector.name)
     found = DetectorScore(
-        of, read, tuple(scores), calibration_of(of, overlap), block_s, place / f"{stem}.html"
+        of,
+        read,
+        tuple(scores),
+        calibration_of(of, overlap),
+        settings.block_s,
+        place / f"{stem}.html",
     )
-    worst = [] if without_images else worst_pictures(of, overlap, draw)
+    worst = [] if settings.without_images else worst_pictures(of, overlap, settings.draw)
     content: dict[str, Any] = {
         "detector": of.detector.name,
         "run": str(folder.path),
@@ -260,12 +310,12 @@ def score_detector(
         "parts": scores,
         "lowest": float(of.found.scores.min(initial=1.0)),
         "overlap": overlap,
-        "block_s": block_s,
+        "block_s": settings.block_s,
         "seed": SEED,
         "worst": worst,
     }
     place.mkdir(parents=True, exist_ok=True)
-    write_detector_page(found.report, content, found.calibration, has_figures=has_figures)
+    write_detector_page(found.report, content, found.calibration, has_figures=settings.has_figures)
     write_text(place / f"{stem}.json", strict_json(found.as_dict()) + "\n")
     return found
 

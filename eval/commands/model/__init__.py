@@ -1,1 +1,0 @@
-"""Commands for networks: the model catalog, and model cards."""

@@ -1,1 +1,0 @@
-"""Commands that make, re-estimate, score, compare, merge and view runs."""

@@ -1,1 +1,0 @@
-"""Make, re-estimate, score, compare and merge runs of one or many drives."""
