@@ -29,7 +29,7 @@ DBC: Final = FORD / "ford_lincoln_base_pt.dbc"
 
 _OURS: Final = """
 from crosscue.replay.can.database import CanDatabase
-from crosscue.replay.can.decode import BusDecoder, DecodeSettings
+from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 import crosscue.replay.readers.can_text.candump, crosscue.replay.seal.log
@@ -40,8 +40,8 @@ decoders, count = {}, 0
 with open_log(log) as opened:
     for block in opened.read(ledger):
         if block.topic not in decoders:
-            settings = DecodeSettings(allow_longer=True)
-            decoders[block.topic] = BusDecoder(database, block.topic, ledger, None, settings)
+            decoders[block.topic] = BusDecoder(
+                database, block.topic, ledger, allow_longer=True)
         for one in decoders[block.topic](block):
             count += len(one) * len(one.rows.columns)
 """

@@ -40,18 +40,17 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 def ours(log: Path, database: Any) -> dict[str, list[Any]]:
     """Return the decoded blocks of each message, by topic."""
-    from crosscue.replay.can.decode import BusDecoder, DecodeSettings
+    from crosscue.replay.can.decode import BusDecoder
     from crosscue.replay.ledger import Ledger
     from crosscue.replay.logs.opening import open_log
 
     ledger = Ledger(str(log))
     found: dict[str, list[Any]] = {}
     decoders: dict[str, BusDecoder] = {}
-    settings = DecodeSettings(allow_longer=True, engine="numpy")
     with open_log(log) as opened:
         for block in opened.read(ledger):
             if block.topic not in decoders:
-                decoders[block.topic] = BusDecoder(database, block.topic, ledger, None, settings)
+                decoders[block.topic] = BusDecoder(database, block.topic, ledger, allow_longer=True)
             for one in decoders[block.topic](block):
                 found.setdefault(one.topic, []).append(one)
     return found

@@ -7,10 +7,9 @@ counted by identifier and reason, in the ledger and in ``BusDecoder.counts``.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from importlib.util import find_spec
-from typing import Final, Literal, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +27,9 @@ from crosscue.replay.columns import (
 from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
 
 from .database import CanDatabase, spell_id
-from .extract import PRESENT_SUFFIX, MessageExtractor
-from .grouping import STANDARD_IDS, CanDecoder, Grouped, MessageRules
-from .layout import Arithmetic, CanMessage
-from .numpy_engine import NumpyEngine
+from .extract import MessageExtractor
+from .grouping import STANDARD_IDS, Grouped, GroupedDecoder, MessageRules
+from .layout import CanMessage
 
 UNKNOWN_ID: Final = "id not in the database"
 REMOTE_FRAME: Final = "remote frame"
@@ -52,27 +50,8 @@ RARE_REASONS: Final = (
 OTHERS: Final = (-1, False)
 COUNTS_KEPT: Final = 20_000
 
-# Number of frames that NumPy decodes in the time that loading Numba takes (measured: 0.6 s).
-AUTO_FRAMES: Final = 16_000_000
-
-EngineName: TypeAlias = Literal["auto", "numpy", "numba"]
 Wanted: TypeAlias = Collection[str] | Collection[tuple[str, str]]
 CountKey: TypeAlias = tuple[int, bool, str]
-
-
-@dataclass(frozen=True, slots=True)
-class DecodeSettings:
-    """Settings of frame decoding.
-
-    Attributes:
-        allow_longer: Decode frames that have more bytes than their message, and ignore the rest;
-            for logs that pad frames.
-        engine: ``numpy``; ``numba``; or ``auto``, which starts with NumPy and, if Numba is
-            installed, switches to it after ``AUTO_FRAMES`` frames. All yield the same values.
-    """
-
-    allow_longer: bool = False
-    engine: EngineName = "auto"
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +81,8 @@ class BusDecoder:
         bus: str,
         ledger: Ledger,
         wanted: Wanted | None = None,
-        settings: DecodeSettings = DecodeSettings(),
+        *,
+        allow_longer: bool = False,
         elsewhere: Collection[int] = (),
     ) -> None:
         """Prepare the columns.
@@ -112,7 +92,8 @@ class BusDecoder:
             bus: Topic of the frames, and first part of the topics of the decoded rows.
             ledger: Records every frame that is not decoded; the reader has counted those found.
             wanted: Message names, or (message, signal) pairs; None for everything.
-            settings: Settings of decoding.
+            allow_longer: Decode frames that have more bytes than their message, and ignore the
+                rest; for logs that pad frames.
             elsewhere: 11-bit identifiers that another decoder of this bus reads and accounts for.
                 They are not counted as unknown where the database lacks them.
 
@@ -122,28 +103,14 @@ class BusDecoder:
         self._bus = bus
         self._ledger = ledger
         self._elsewhere = frozenset(elsewhere)
-        self._engine_name = settings.engine
-        self._frames_seen = 0
         self.counts: dict[CountKey, int] = {}
         chosen = _chosen(database, wanted)
         entries = [_entry(database, message, chosen) for message in database.messages]
-        # The engines expect decodable messages first.
+        # The grouping expects decodable messages first.
         self._entries = tuple(sorted(entries, key=lambda entry: bool(entry.refusal)))
         self._refused = np.array([False, *(bool(entry.refusal) for entry in self._entries)])
-        self._rules = [_rules(entry, settings) for entry in self._entries]
-        is_compiled = settings.engine == "numba"
-        self._engine = compiled_engine(self._rules) if is_compiled else NumpyEngine(self._rules)
-
-    def columns_of(self, message: str) -> dict[str, np.dtype[np.generic]]:
-        """Return names and dtypes of the columns of ``message``.
-
-        Raises:
-            ValueError: The database has no such message, or it is not decoded.
-        """
-        for entry in self._entries:
-            if message in (entry.message.name, entry.message.topic_name) and entry.extractor:
-                return _dtypes(entry.extractor)
-        raise ValueError(f"{self._bus}: no message {message!r} is decoded")
+        self._rules = [_rules(entry, allow_longer) for entry in self._entries]
+        self._decoder = GroupedDecoder(self._rules)
 
     def __call__(self, block: Block) -> list[Block]:
         """Decode the frames of a block.
@@ -160,15 +127,14 @@ class BusDecoder:
         frames = block.rows
         if not isinstance(frames, CanFrames):
             raise ValueError(f"{block.topic}: expected CanFrames, got {type(frames).__name__}")
-        self._choose_engine(len(frames))
-        grouped = self._engine.group(frames)
+        grouped = self._decoder.group(frames)
         if len(grouped.order) < len(frames):
             self._account(frames, grouped, block.log_ns)
         times = _Times(block, grouped.order)
         decoded = []
         for number in (np.flatnonzero(np.diff(grouped.stops)) + 1).tolist():
             entry = self._entries[number - 1]
-            columns, strange = self._engine.columns(number)
+            columns, strange = self._decoder.columns(number)
             topic = f"{self._bus}/{entry.message.topic_name}"
             assert entry.extractor is not None
             one = times.block(topic, grouped.rows(number), columns, entry.extractor.units)
@@ -180,13 +146,6 @@ class BusDecoder:
             if len(one):
                 decoded.append(one)
         return decoded
-
-    def _choose_engine(self, frames: int) -> None:
-        self._frames_seen += frames
-        if self._engine_name == "auto" and self._frames_seen > AUTO_FRAMES:
-            self._engine_name = "numba" if find_spec("numba") else "numpy"
-            if self._engine_name == "numba":
-                self._engine = compiled_engine(self._rules)
 
     def _account(self, frames: CanFrames, grouped: Grouped, log_ns: Int64s) -> None:
         """Count the frames that cannot be decoded, each under the first reason that applies."""
@@ -258,13 +217,6 @@ class BusDecoder:
         self._ledger.skip(self._bus, key[2], count, detail, int(log_ns[np.argmax(rows)]))
 
 
-def compiled_engine(rules: Sequence[MessageRules]) -> CanDecoder:
-    """Return the engine of compiled loops, importing Numba only now because that is slow."""
-    from .numba_engine import NumbaEngine
-
-    return NumbaEngine(rules)
-
-
 class _Times:
     """The times of a block in another order, from which blocks of single messages are built."""
 
@@ -318,25 +270,14 @@ def _entry(database: CanDatabase, message: CanMessage, chosen: _Chosen | None) -
     return _Entry(message, database.extractor(message, wanted), "")
 
 
-def _rules(entry: _Entry, settings: DecodeSettings) -> MessageRules:
+def _rules(entry: _Entry, allow_longer: bool) -> MessageRules:
     message = entry.message
     if entry.extractor is None:
         return MessageRules(message, None, (-1, -1))
-    if settings.allow_longer:
+    if allow_longer:
         classic = flexible = LENGTH_UNKNOWN
     else:
         classic, flexible = message.longest_frame(False), message.longest_frame(True)
     return MessageRules(
         message, entry.extractor, (classic, -1 if message.is_fd is False else flexible)
     )
-
-
-def _dtypes(extractor: MessageExtractor) -> dict[str, np.dtype[np.generic]]:
-    columns: dict[str, np.dtype[np.generic]] = {}
-    for signal in extractor.signals:
-        kind = signal.arithmetic
-        is_integer = kind in (Arithmetic.INT64, Arithmetic.UINT64)
-        columns[signal.name] = np.dtype(kind.value if is_integer else np.float64)
-        if is_integer and signal.may_be_absent:
-            columns[signal.name + PRESENT_SUFFIX] = np.dtype(np.bool_)
-    return columns

@@ -148,12 +148,6 @@ class _SignalGroup:
         return values.view(np.int64) if self.place.arithmetic == Arithmetic.INT64.name else values
 
 
-def is_short_integer(signal: CanSignal) -> bool:
-    """Return whether a signal can be converted by ``EXPONENT``."""
-    is_exact = signal.arithmetic is Arithmetic.FLOAT and not signal.is_float
-    return is_exact and signal.length <= SHORT_BITS
-
-
 def flip_and_bias(signal: CanSignal) -> tuple[int, float]:
     """Return the constants that convert the raw bits of a short integer to float64.
 

@@ -1,20 +1,23 @@
-"""Tables that assign frames to messages and check them; both engines share them."""
+"""Assign frames to messages, check them, and decode those of each message together."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Protocol, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import LENGTH_UNKNOWN, CanFrames
+from crosscue.replay.columns import DATA, LENGTH_UNKNOWN, CanFrames
 
 from .extract import Column, MessageExtractor, Words
 from .layout import CanMessage
 
 STANDARD_IDS: Final = 2048
+# Max number of messages for which searching for each is faster than sorting (0.11 ms against 0.21
+# ms for 10 messages in 58,000 frames).
+FEW: Final = 16
 
 Columns: TypeAlias = dict[str, Column]
 Strange: TypeAlias = NDArray[np.bool_] | None
@@ -110,19 +113,90 @@ class Grouped:
         return slice(int(self.stops[number - 1]), int(self.stops[number]))
 
 
-class CanDecoder(Protocol):
-    """Engine that groups frames and decodes the columns of each group."""
+class GroupedDecoder:
+    """Decoder that groups the frames of a block by message, and extracts the columns of each."""
+
+    def __init__(self, rules: Sequence[MessageRules]) -> None:
+        """Prepare the tables; rules without an extractor must be last."""
+        self._rules = rules
+        self._decodable = sum(rule.extractor is not None for rule in rules)
+        self._tables = RuleArrays.of(rules)
+        self._numbers = np.arange(len(rules) + 1, dtype=np.uint16)
+        self._grouped: Grouped | None = None
+        self._words: Words = np.zeros((0, 1), dtype=np.uint64)
 
     def group(self, frames: CanFrames) -> Grouped:
         """Look up, check and sort frames."""
-        ...
+        number = self._number(frames)
+        is_data = frames.kind == DATA
+        is_good = (number > 0) & (number <= self._decodable)
+        order, stops = self._sort(number)
+        seen = np.diff(stops, prepend=0)
+        if not self._all_fit(frames, order, stops):
+            is_good = self._fits(frames, number) & is_data
+            seen = np.bincount(number[is_data], minlength=len(self._rules) + 1)
+            order, stops = self._sort(np.where(is_good, number, np.uint16(0)))
+        order = order[stops[0] : stops[self._decodable]]
+        stops = np.minimum(stops, stops[self._decodable]) - stops[0]
+        words: Words = np.ascontiguousarray(frames.data).view("<u8").astype(np.uint64, copy=False)
+        self._words = words.take(order, axis=0)
+        unknown = is_data & (number == 0) & ~frames.is_extended
+        by_id = np.bincount(
+            np.minimum(frames.arbitration_id[unknown], STANDARD_IDS), minlength=STANDARD_IDS
+        )
+        self._grouped = Grouped(number, is_good, order, stops, seen, by_id[:STANDARD_IDS])
+        return self._grouped
+
+    def _sort(self, number: NDArray[np.uint16]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the frames in order of ``number``, and the end of each number."""
+        if len(self._numbers) <= FEW:
+            each = [np.flatnonzero(number == one) for one in self._numbers]
+            return np.concatenate(each), np.cumsum([len(rows) for rows in each])
+        order = np.argsort(number, kind="stable")  # a radix sort on 16 bits
+        return order, np.searchsorted(number.take(order), self._numbers, side="right")
+
+    def _all_fit(self, frames: CanFrames, order: NDArray[np.intp], stops: NDArray[np.intp]) -> bool:
+        """Check from the extreme lengths alone that all decodable frames fit, the usual case."""
+        if frames.kind.any() or frames.is_fd.any():
+            return False
+        ends = stops[: self._decodable + 1]
+        groups = np.flatnonzero(np.diff(ends))
+        if not len(groups):
+            return True
+        lengths = frames.length.take(order[: ends[-1]])
+        shortest = np.minimum.reduceat(lengths, ends[groups])
+        max_length = np.maximum.reduceat(lengths, ends[groups])
+        fits = self._tables.fits[frames.data.shape[1]][0, groups + 1]
+        at = np.arange(len(groups))
+        # All lengths between two fitting lengths fit, except the number that means "unknown".
+        in_one_piece = (max_length < LENGTH_UNKNOWN) | (shortest == LENGTH_UNKNOWN)
+        return bool((fits[at, shortest] & fits[at, max_length] & in_one_piece).all())
 
     def columns(self, number: int) -> tuple[Columns, Strange]:
-        """Return the columns of one message of the last group, like ``MessageExtractor``."""
-        ...
+        """Return the columns of one message of the last group of frames."""
+        extractor = self._rules[number - 1].extractor
+        assert extractor is not None
+        assert self._grouped is not None
+        return extractor(self._words[self._grouped.rows(number)])
 
+    def _number(self, frames: CanFrames) -> NDArray[np.uint16]:
+        tables = self._tables
+        number = tables.standard.take(frames.arbitration_id, mode="clip")
+        if not frames.is_extended.any():
+            return number
+        rows = np.flatnonzero(frames.is_extended)
+        if not len(tables.extended_ids):
+            number[rows] = 0
+            return number
+        ids = frames.arbitration_id[rows]
+        place = np.searchsorted(tables.extended_ids, ids)
+        place[place == len(tables.extended_ids)] = 0
+        is_known = tables.extended_ids[place] == ids
+        number[rows] = np.where(is_known, tables.extended_numbers[place], np.uint16(0))
+        return number
 
-def payload_words(frames: CanFrames) -> Words:
-    """Return payloads as little-endian words, shape (N, W / 8)."""
-    words: Words = np.ascontiguousarray(frames.data).view("<u8").astype(np.uint64, copy=False)
-    return words
+    def _fits(self, frames: CanFrames, number: NDArray[np.uint16]) -> NDArray[np.bool_]:
+        fits: NDArray[np.bool_] = self._tables.fits[frames.data.shape[1]][
+            frames.is_fd.view(np.uint8), number, frames.length
+        ]
+        return fits

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from crosscue.replay.can.database import CanDatabase
-from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
+from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.can.encode import encode
 from crosscue.replay.can.extract import PRESENT_SUFFIX
 from crosscue.replay.can.layout import Arithmetic, CanMessage, CanSignal, is_integer
@@ -26,7 +26,6 @@ from crosscue.replay.columns import Block, Table
 from crosscue.replay.ledger import Ledger
 from support.can_layouts import block_of, dbc_text, frames_of, messages
 
-ENGINES: tuple[EngineName, ...] = ("numpy", "numba")
 LAYOUTS = st.one_of(messages(), messages(multiplexed=True))
 SEEDS = st.integers(0, 2**32 - 1)
 ROWS = 24
@@ -55,11 +54,11 @@ def parsed_by_both(message: CanMessage, folder: Path) -> tuple[CanDatabase, Mess
 
 
 def decode_all(
-    database: CanDatabase, message: CanMessage, payload: NDArray[np.uint8], engine: EngineName
+    database: CanDatabase, message: CanMessage, payload: NDArray[np.uint8]
 ) -> tuple[Block | None, BusDecoder, Ledger]:
     ledger = Ledger("made up")
     ledger.find("can0", len(payload))
-    decode = BusDecoder(database, "can0", ledger, None, DecodeSettings(engine=engine))
+    decode = BusDecoder(database, "can0", ledger)
     blocks = decode(block_of(frames_of(payload, message.arbitration_id, message.is_extended)))
     assert len(blocks) <= 1
     return (blocks[0] if blocks else None), decode, ledger
@@ -98,16 +97,13 @@ def assert_same_values(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ENGINES)
 @given(message=LAYOUTS, seed=SEEDS)
 @hypothesis_settings(max_examples=60)
-def test_decoded_values_equal_cantools(
-    message: CanMessage, seed: int, engine: EngineName, tmp_path: Path
-) -> None:
+def test_decoded_values_equal_cantools(message: CanMessage, seed: int, tmp_path: Path) -> None:
     database, theirs = parsed_by_both(message, tmp_path)
     payload = payloads(message, seed)
 
-    block, decoder, ledger = decode_all(database, message, payload, engine)
+    block, decoder, ledger = decode_all(database, message, payload)
 
     expected = rows_by_cantools(theirs, payload)
     good = [i for i, row in enumerate(expected) if row is not None]
@@ -121,8 +117,6 @@ def test_decoded_values_equal_cantools(
         row = expected[i]
         assert row is not None
         assert_same_values(row_of(block.rows, at), row)
-    dtypes = {name: column.dtype for name, column in block.rows.columns.items()}
-    assert dtypes == decoder.columns_of("Random")
 
 
 def _is_integral(signal: CanSignal) -> bool:
@@ -152,14 +146,14 @@ def test_encoding_inverts_decoding_and_equals_cantools(
     database, theirs = parsed_by_both(message, tmp_path)
     (ours,) = database.messages
     payload = payloads(message, seed)
-    block, _, _ = decode_all(database, message, payload, "numpy")
+    block, _, _ = decode_all(database, message, payload)
     if block is None:
         return
     assert isinstance(block.rows, Table)
 
     encoded = encode(ours, block.rows.columns)
 
-    again, decoder, _ = decode_all(database, message, encoded, "numpy")
+    again, decoder, _ = decode_all(database, message, encoded)
     assert not decoder.counts
     assert again is not None
     assert isinstance(again.rows, Table)
@@ -186,7 +180,7 @@ def test_64_bit_counters_are_exact() -> None:
 
     payload = encode(WIDE, {"counter": column})
 
-    block, _, _ = decode_all(CanDatabase.of([WIDE]), WIDE, payload, "numpy")
+    block, _, _ = decode_all(CanDatabase.of([WIDE]), WIDE, payload)
     assert block is not None
     assert isinstance(block.rows, Table)
     assert block.rows["counter"].tolist() == [0, 2**53 + 1, top - 1, top]

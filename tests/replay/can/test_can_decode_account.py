@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.can import decode as decoding
 from crosscue.replay.can.database import CanDatabase
-from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
-from crosscue.replay.can.grouping import CanDecoder, MessageRules
+from crosscue.replay.can.decode import (
+    ERROR_FRAME,
+    NO_BRANCH,
+    REMOTE_FRAME,
+    TOO_LONG,
+    TOO_SHORT,
+    UNKNOWN_ID,
+    WRONG_FORMAT,
+    BusDecoder,
+)
 from crosscue.replay.can.layout import CanMessage, CanSignal
 from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Table
 from crosscue.replay.ledger import NOT_ASKED_TOPIC, Ledger
@@ -36,16 +42,13 @@ SWITCH = CanMessage(
 )
 EMPTY = CanMessage("Empty", 0x500, False, 8, (), problem="message has no signals")
 DATABASE = CanDatabase.of([SPEED, TWIN, LONG, CLASSIC, SWITCH, EMPTY])
-ENGINES: list[EngineName] = ["numpy", "numba"]
 
 
 def decoder(
-    engine: EngineName = "numpy", allow_longer: bool = False, selected: list[str] | None = None
+    allow_longer: bool = False, selected: list[str] | None = None
 ) -> tuple[BusDecoder, Ledger]:
     ledger = Ledger("made up")
-    return BusDecoder(
-        DATABASE, "can0", ledger, selected, DecodeSettings(allow_longer, engine)
-    ), ledger
+    return BusDecoder(DATABASE, "can0", ledger, selected, allow_longer=allow_longer), ledger
 
 
 def one_frame(
@@ -66,26 +69,23 @@ def one_frame(
     )
 
 
-@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(
     ("frame", "reason"),
     [
-        (one_frame(0x101, b"\0\0"), decoding.UNKNOWN_ID),
-        (one_frame(0x200, bytes(12), is_extended=True, is_fd=True), decoding.UNKNOWN_ID),
-        (one_frame(0x100, b"\0"), decoding.TOO_SHORT),
-        (one_frame(0x100, b"\0\0\0"), decoding.TOO_LONG),
-        (one_frame(0x100, b"\0\0", kind=REMOTE), decoding.REMOTE_FRAME),
-        (one_frame(0x100, b"\0\0", kind=ERROR), decoding.ERROR_FRAME),
-        (one_frame(0x300, bytes(8), is_fd=True), decoding.WRONG_FORMAT),
-        (one_frame(0x200, bytes(16), is_fd=True), decoding.TOO_LONG),
-        (one_frame(0x400, b"\1\0"), decoding.NO_BRANCH),
+        (one_frame(0x101, b"\0\0"), UNKNOWN_ID),
+        (one_frame(0x200, bytes(12), is_extended=True, is_fd=True), UNKNOWN_ID),
+        (one_frame(0x100, b"\0"), TOO_SHORT),
+        (one_frame(0x100, b"\0\0\0"), TOO_LONG),
+        (one_frame(0x100, b"\0\0", kind=REMOTE), REMOTE_FRAME),
+        (one_frame(0x100, b"\0\0", kind=ERROR), ERROR_FRAME),
+        (one_frame(0x300, bytes(8), is_fd=True), WRONG_FORMAT),
+        (one_frame(0x200, bytes(16), is_fd=True), TOO_LONG),
+        (one_frame(0x400, b"\1\0"), NO_BRANCH),
         (one_frame(0x500, bytes(8)), "message has no signals"),
     ],
 )
-def test_undecodable_frame_is_counted_by_id_and_reason(
-    frame: CanFrames, reason: str, engine: EngineName
-) -> None:
-    decode, ledger = decoder(engine)
+def test_undecodable_frame_is_counted_by_id_and_reason(frame: CanFrames, reason: str) -> None:
+    decode, ledger = decoder()
     ledger.find("can0", 3)
 
     for _ in range(3):
@@ -99,9 +99,8 @@ def test_undecodable_frame_is_counted_by_id_and_reason(
     assert f"0x{key[0]:03X}"[2:] in detail.detail
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_11_and_29_bit_ids_are_different_messages(engine: EngineName) -> None:
-    decode, _ = decoder(engine)
+def test_11_and_29_bit_ids_are_different_messages() -> None:
+    decode, _ = decoder()
 
     (plain,) = decode(block_of(one_frame(0x100, b"\x10\x27")))
     (extended,) = decode(block_of(one_frame(0x100, b"\x10\x27", is_extended=True)))
@@ -113,9 +112,8 @@ def test_11_and_29_bit_ids_are_different_messages(engine: EngineName) -> None:
     assert plain.rows.units == {"kph": "km/h"}
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_padded_fd_frame_is_decoded(engine: EngineName) -> None:
-    decode, _ = decoder(engine)
+def test_padded_fd_frame_is_decoded() -> None:
+    decode, _ = decoder()
     payload = bytes([0] * 8 + [1, 2, 0xFF, 0xFF])
 
     (block,) = decode(block_of(one_frame(0x200, payload, is_fd=True)))
@@ -124,9 +122,8 @@ def test_padded_fd_frame_is_decoded(engine: EngineName) -> None:
     assert block.rows["last"].tolist() == [0x0201]
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_longer_frames_are_decoded_with_allow_longer(engine: EngineName) -> None:
-    decode, ledger = decoder(engine, allow_longer=True)
+def test_longer_frames_are_decoded_with_allow_longer() -> None:
+    decode, ledger = decoder(allow_longer=True)
 
     (block,) = decode(block_of(one_frame(0x100, b"\x64\0\xff\xff")))
 
@@ -135,9 +132,8 @@ def test_longer_frames_are_decoded_with_allow_longer(engine: EngineName) -> None
     assert not ledger.topic("can0").skipped
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_frames_of_unknown_length_are_decoded_if_payload_fits(engine: EngineName) -> None:
-    decode, _ = decoder(engine)
+def test_frames_of_unknown_length_are_decoded_if_payload_fits() -> None:
+    decode, _ = decoder()
     lost = np.full(1, LENGTH_UNKNOWN, dtype=np.uint8)
     payload = np.zeros((1, 8), dtype=np.uint8)
 
@@ -146,12 +142,11 @@ def test_frames_of_unknown_length_are_decoded_if_payload_fits(engine: EngineName
 
     assert block.topic == "can0/Speed"
     assert nothing == []
-    assert decode.counts == {(0x200, False, decoding.TOO_SHORT): 1}
+    assert decode.counts == {(0x200, False, TOO_SHORT): 1}
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_signals_of_inactive_branches_are_nan(engine: EngineName) -> None:
-    decode, _ = decoder(engine)
+def test_signals_of_inactive_branches_are_nan() -> None:
+    decode, _ = decoder()
     payload = np.array([[0, 7], [9, 9], [3, 0x15], [0, 8]], dtype=np.uint8)
 
     (block,) = decode(block_of(frames_of(payload, 0x400)))
@@ -160,12 +155,11 @@ def test_signals_of_inactive_branches_are_nan(engine: EngineName) -> None:
     assert block.log_ns.tolist() == [0, 2_000_000, 3_000_000]
     np.testing.assert_array_equal(block.rows["zero"], [7.0, np.nan, 8.0])
     np.testing.assert_array_equal(block.rows["two"], [np.nan, 5.0, np.nan])
-    assert decode.counts == {(0x400, False, decoding.NO_BRANCH): 1}
+    assert decode.counts == {(0x400, False, NO_BRANCH): 1}
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_unselected_messages_are_counted_as_skipped(engine: EngineName) -> None:
-    decode, ledger = decoder(engine, selected=["Speed"])
+def test_unselected_messages_are_counted_as_skipped() -> None:
+    decode, ledger = decoder(selected=["Speed"])
     plain_and_extended = frames_of(np.zeros((4, 2), np.uint8), 0x100)
     plain_and_extended = replace(
         plain_and_extended, is_extended=np.array([False, True, False, True])
@@ -187,7 +181,6 @@ def test_single_signals_can_be_selected() -> None:
 
     assert isinstance(block.rows, Table)
     assert {name: column.tolist() for name, column in block.rows.columns.items()} == {"two": [5.0]}
-    assert list(decode.columns_of("Switch")) == ["two"]
     with pytest.raises(ValueError, match="Switch has no signal 'tow'; there are: page, zero, two"):
         BusDecoder(DATABASE, "can0", Ledger("made up"), [("Switch", "tow")])
     with pytest.raises(ValueError, match="no message 'Sped' among 6; did you mean Speed"):
@@ -209,9 +202,8 @@ def test_decoded_rows_keep_all_timestamps() -> None:
     assert speed.header_ns.tolist() == [25, 27]
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_strided_read_only_frames_are_decoded(engine: EngineName) -> None:
-    decode, _ = decoder(engine)
+def test_strided_read_only_frames_are_decoded() -> None:
+    decode, _ = decoder()
     payload = np.arange(8, dtype=np.uint8).reshape(4, 2)
     frames = frames_of(payload, np.array([0x100, 0x101, 0x100, 0x101], np.uint32)).take(
         slice(None, None, 2)
@@ -228,7 +220,7 @@ def test_strided_read_only_frames_are_decoded(engine: EngineName) -> None:
 def test_number_of_counted_unknown_ids_is_bounded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(decoding, "COUNTS_KEPT", 10)
+    monkeypatch.setattr("crosscue.replay.can.decode.COUNTS_KEPT", 10)
     decode, ledger = decoder()
     ids = np.arange(1000, 1100, dtype=np.uint32)
 
@@ -256,7 +248,7 @@ IDS = st.sampled_from([0x100, 0x101, 0x200, 0x300, 0x400, 0x500])
     allow_longer=st.booleans(),
 )
 @settings(max_examples=60, deadline=None)
-def test_engines_decode_or_count_every_frame_equally(
+def test_every_frame_is_decoded_or_counted(
     rows: list[tuple[int, bool, int, int, int, bool]], allow_longer: bool
 ) -> None:
     columns = (
@@ -272,44 +264,16 @@ def test_engines_decode_or_count_every_frame_equally(
         data=data,
         is_fd=columns[5].astype(np.bool_),
     )
-    results = []
-    for engine in ENGINES:
-        decode, ledger = decoder(engine, allow_longer)
-        ledger.find("can0", len(rows))
+    decode, ledger = decoder(allow_longer)
+    ledger.find("can0", len(rows))
 
-        blocks = decode(block_of(frames))
+    blocks = decode(block_of(frames))
 
-        account = ledger.topic("can0")
-        assert account.used == sum(map(len, blocks))
-        assert sum(decode.counts.values()) == account.skipped.total()
-        times = np.sort(np.concatenate([np.zeros(0, np.int64), *(b.log_ns for b in blocks)]))
-        assert len(np.unique(times)) == account.used
-        results.append((decode.counts, [(b.topic, b.log_ns.tolist()) for b in blocks]))
-    assert results[0] == results[1]
-
-
-def test_auto_engine_compiles_loops_after_enough_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decoding, "AUTO_FRAMES", 5)
-    compiled = []
-    compile_engine = decoding.compiled_engine
-
-    def counted(rules: Sequence[MessageRules]) -> CanDecoder:
-        compiled.append(len(rules))
-        return compile_engine(rules)
-
-    monkeypatch.setattr(decoding, "compiled_engine", counted)
-    decode, _ = decoder("auto")
-    block = block_of(frames_of(np.full((4, 2), 3, np.uint8), 0x100))
-
-    before = decode(block)
-    assert not compiled
-    after = decode(block)
-    decode(block)
-
-    assert compiled == [6]
-    assert isinstance(before[0].rows, Table)
-    assert isinstance(after[0].rows, Table)
-    np.testing.assert_array_equal(before[0].rows["kph"], after[0].rows["kph"])
+    account = ledger.topic("can0")
+    assert account.used == sum(map(len, blocks))
+    assert sum(decode.counts.values()) == account.skipped.total()
+    times = np.sort(np.concatenate([np.zeros(0, np.int64), *(b.log_ns for b in blocks)]))
+    assert len(np.unique(times)) == account.used
 
 
 def test_rows_that_are_not_can_frames_are_refused() -> None:

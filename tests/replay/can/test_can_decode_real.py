@@ -10,7 +10,7 @@ from cantools.database.can import Message
 from cantools.database.can.formats import dbc
 
 from crosscue.replay.can.database import CanDatabase
-from crosscue.replay.can.decode import TOO_SHORT, UNKNOWN_ID, BusDecoder, DecodeSettings, EngineName
+from crosscue.replay.can.decode import TOO_SHORT, UNKNOWN_ID, BusDecoder
 from crosscue.replay.can.layout import overlapping_signals
 from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
@@ -46,9 +46,7 @@ def test_wheel_speeds_of_real_drive_equal_published_values() -> None:
     ledger = Ledger("comma2k19")
     ledger.find(block.topic, len(block))
     database = CanDatabase.load([shared("comma2k19", "toyota_2017.dbc")])
-    decode = BusDecoder(
-        database, block.topic, ledger, ["WHEEL_SPEEDS"], DecodeSettings(allow_longer=True)
-    )
+    decode = BusDecoder(database, block.topic, ledger, ["WHEEL_SPEEDS"], allow_longer=True)
 
     (wheels,) = decode(block)
 
@@ -69,17 +67,14 @@ def test_wheel_speeds_of_real_drive_equal_published_values() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["numpy", "numba"])
 @pytest.mark.parametrize("bus", sorted(BUSES))
-def test_decodable_frames_of_real_bus_equal_cantools(bus: str, engine: EngineName) -> None:
+def test_decodable_frames_of_real_bus_equal_cantools(bus: str) -> None:
     parts, read = BUSES[bus]
     path, block = shared(*parts), read()
     ledger = Ledger(bus)
     ledger.find(block.topic, len(block))
     database = CanDatabase.load([path])
-    decode = BusDecoder(
-        database, block.topic, ledger, None, DecodeSettings(allow_longer=True, engine=engine)
-    )
+    decode = BusDecoder(database, block.topic, ledger, allow_longer=True)
 
     blocks = {b.topic.removeprefix(f"{block.topic}/"): b for b in decode(block)}
 

@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 import pytest
 
-from crosscue.replay.can import numpy_engine
+from crosscue.replay.can import grouping
 from crosscue.replay.can.database import CanDatabase
-from crosscue.replay.can.decode import BusDecoder, DecodeSettings
+from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 
@@ -43,11 +43,10 @@ def test_sorting_and_searching_yield_same_rows(
     few_limit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = {}
-    for name, limit in (("wanted", numpy_engine.FEW), ("other", few_limit)):
-        monkeypatch.setattr(numpy_engine, "FEW", limit)
+    for name, limit in (("wanted", grouping.FEW), ("other", few_limit)):
+        monkeypatch.setattr(grouping, "FEW", limit)
         ledger = Ledger("log")
-        settings = DecodeSettings(engine="numpy")
-        decoder = BusDecoder(_database(tmp_path), "/can", ledger, None, settings)
+        decoder = BusDecoder(_database(tmp_path), "/can", ledger)
         frames = _frames(4000)
         blocks = decoder(Block("/can", np.arange(4000), frames))
         rows = {

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.can.database import CanDatabase
-from crosscue.replay.can.decode import BusDecoder, DecodeSettings, EngineName
+from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.can.layout import CanMessage, CanSignal
 from crosscue.replay.columns import DATA, ERROR, REMOTE, Block, CanFrames
 from crosscue.replay.ledger import Ledger
@@ -28,9 +28,9 @@ FRAME = st.tuples(
 
 
 @settings(deadline=None)
-@given(frames=st.lists(FRAME, min_size=1, max_size=30), engine=st.sampled_from(["numpy", "numba"]))
+@given(frames=st.lists(FRAME, min_size=1, max_size=30))
 def test_each_frame_is_accounted_for_by_exactly_one_decoder(
-    frames: list[tuple[int, int, bool, bool, int]], engine: EngineName
+    frames: list[tuple[int, int, bool, bool, int]],
 ) -> None:
     ids, kinds, extended, fd, lengths = (np.array(column) for column in zip(*frames, strict=True))
     rows = CanFrames(
@@ -47,8 +47,6 @@ def test_each_frame_is_accounted_for_by_exactly_one_decoder(
         CanDatabase.of([SPEED, TWIN]),
         "can0",
         ledger,
-        None,
-        DecodeSettings(engine=engine),
         elsewhere=all_ids(TEN_SLOTS),
     )
 
