@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
+from crosscue.eval.report.frame_pictures import draw_pictures
 from crosscue.eval.report.html import page_template, template_text
 from crosscue.eval.runs import owned
 from crosscue.eval.runs.folder import RunFolder, open_run
@@ -25,7 +26,6 @@ from crosscue.replay.files.whole_file import write_bytes, write_text
 from crosscue.replay.limits import Limits
 
 from .chart import ChartTables, belief_around
-from .pictures import draw_pictures
 from .record import Failure, distance_bin
 
 if TYPE_CHECKING:

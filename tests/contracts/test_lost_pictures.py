@@ -69,14 +69,14 @@ LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
     "eval/vehicle/check.py": {"vehicle check": "vehicle check {log} --vehicle {car} -o {out}.html"},
     "eval/recording/camera.py": {"view": "view {run} -o {out}.rrd"},
     "eval/failures/export.py": {"export": "export {failures} -o {out}"},
-    "eval/failures/pictures.py": {"browse": "browse {failures} -o {out}"},
+    "eval/report/frame_pictures.py": {"browse": "browse {failures} -o {out}"},
 }
 # Reasons why other files have no command in the table above.
 HOW_OTHERS_DO: Final = {
     "datasets/adapters/road_folder.py": "files that the user names",
     "detectors/catalog/cards.py": "files that the user names",
     "detectors/images.py": "the functions themselves",
-    "detectors/overlay.py": "for eval/failures/pictures.py",
+    "detectors/overlay.py": "for eval/report/frame_pictures.py",
     "detectors/training/samples.py": "files that the user names",
     "eval/landmarks.py": "files that the user names",
     "eval/logs/log.py": "a call of the user for one picture, which raises",

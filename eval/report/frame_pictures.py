@@ -1,4 +1,4 @@
-"""Pictures of failing frames with boxes, masks, road and regions, and a thumbnail of each."""
+"""Pictures of frames with boxes, masks, road and regions, and a thumbnail of each."""
 
 from __future__ import annotations
 
