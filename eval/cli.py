@@ -52,6 +52,7 @@ COMMANDS: Final[dict[str, str | tuple[str, str]]] = {
     "tag": "eval.fleet.tags:tag",
     "query": "eval.fleet.query:query",
     "view": "eval.recording.view:view",
+    "report": "eval.drives.report:report",
     "failures": "eval.failures.search:failures",
     "browse": "eval.failures.browse:browse",
     "export": "eval.failures.labels:export",

@@ -8,12 +8,13 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from crosscue.eval.runs.candidates import CandidateRow, candidate_lines, not_looked_lines
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest
 from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.drives import PooledScores
@@ -23,7 +24,9 @@ from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import spelled, strict_json
 from crosscue.replay.vehicle.cue_table import CUES
 
+from . import scene_figures
 from .html import write_page
+from .opening import Opening, curves_of, opening_of
 from .pose_figures import draw_all
 from .scene_figures import WorstFrame
 
@@ -49,6 +52,7 @@ YEAR_2000_NS: Final = 946_684_800_000_000_000
 @dataclass(frozen=True, slots=True)
 class _Run:
     name: str
+    path: str
     manifest: DriveManifest
     clocks: str
     candidates: Mapping[str, CandidateRow]
@@ -107,25 +111,91 @@ def write_report(
         RunError: A run's manifest or tables cannot be read.
         OutputError: A file cannot be written.
     """
-    content = _content(scored, metrics, worst)
+    content = _content([one.run for one in scored], metrics, worst) | {
+        "sources": sorted({one.truth.truth.source for one in scored}),
+        "simulated": sum(map(_is_simulated, scored)),
+        "opening": _opening(scored, scores, worst),
+    }
     if has_figures and len(scored) == 1 and scored[0].poses is not None:
         draw_all(scored[0].poses, folder)
     content["figures"] = _figures(scored, scores) if has_figures else NO_FIGURES
     content["pose_figures"] = _pose_figures(folder) if has_figures and len(scored) == 1 else []
-    write_page(
-        folder / REPORT,
-        TEMPLATE,
-        content,
-        {
-            "number": _number,
-            "signed": _signed,
-            "never": _never,
-            "span": _span,
-            "ends": _ends,
-            "by_cluster": _by_cluster,
-        },
-    )
+    _write(folder / REPORT, content)
     return folder / REPORT
+
+
+def write_report_without_truth(run: RunFolder, path: Path, threshold: float) -> None:
+    """Write the report of a run whose truth is unknown: what was found, where, and how sure.
+
+    Args:
+        run: A finished run.
+        path: The page.
+        threshold: Probability above which a feature is believed.
+
+    Raises:
+        RunError: The run's manifest or tables cannot be read.
+        OutputError: The file cannot be written.
+    """
+    nothing: dict[str, Any] = {"not_scored": {}, "frames": 0, "frames_ambiguous": 0}
+    metrics = {
+        "coverage": nothing,
+        "account": {"scoring": {}},
+        "cues": {},
+        "belief": {},
+        "range": {},
+        "settings": {},
+        "approaches": None,
+        "pose": None,
+    }
+    curves, cues = curves_of(run)
+    gaps = gaps_of(run.drive_manifest().timeline)
+    charts = tuple(
+        _Chart(
+            scene_figures.draw_belief(curve, cues, threshold, gaps),
+            f"{curve.intersection}. Dashed: believed above it.",
+        )
+        for curve in curves[:BELIEFS]
+    )
+    logs = run.drive_manifest().logs
+    content = _content([run], metrics, ()) | {
+        "sources": (),
+        "simulated": int(all(log.is_simulated for log in logs)),
+        "opening": opening_of(run, threshold),
+        "figures": replace(NO_FIGURES, beliefs=charts, beliefs_left_out=len(curves[BELIEFS:])),
+        "pose_figures": [],
+    }
+    _write(path, content)
+
+
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    formats = {
+        "number": _number,
+        "style_of": scene_figures.style_of,
+        "signed": _signed,
+        "never": _never,
+        "span": _span,
+        "ends": _ends,
+        "by_cluster": _by_cluster,
+    }
+    write_page(path, TEMPLATE, content, formats)
+
+
+def _opening(
+    scored: Sequence[RunScored], scores: PooledScores, worst: Sequence[WorstFrame]
+) -> Opening:
+    if len(scored) == 1:
+        return opening_of(scored[0].run, scores.settings.threshold, scored[0], worst)
+    of = scores.approaches
+    if of is None:
+        return Opening(())
+    detected, full, false = of.detected, of.full, of.false_features
+    detected_m, full_m = _number(of.detected_m.value, 1), _number(of.full_m.value, 1)
+    found = (
+        f"{detected.right} of {detected.of} intersections found, {detected_m} m ahead on average"
+    )
+    whole = f"all their roads in {full.right}, {full_m} m ahead"
+    wrong = f"A road that is not there was believed in {false.right} of {false.of}."
+    return Opening((f"{found}; {whole}. {wrong}",))
 
 
 def _is_simulated(one: RunScored) -> bool:
@@ -135,19 +205,16 @@ def _is_simulated(one: RunScored) -> bool:
 
 
 def _content(
-    scored: Sequence[RunScored], metrics: Mapping[str, Any], worst: Sequence[WorstFrame]
+    folders: Sequence[RunFolder], metrics: Mapping[str, Any], worst: Sequence[WorstFrame]
 ) -> dict[str, Any]:
-    runs = [_run(one) for one in scored]
-    sources = [one.truth.truth.source for one in scored]
+    runs = [_run(one) for one in folders]
     cues = [_cue(name, one) for name, one in metrics["cues"].items()]
     pose = metrics["pose"]
-    is_alone = len(scored) == 1
+    is_alone = len(folders) == 1
     accounts = [account for run in runs for account in run.manifest.account.reading]
     return {
         "title": runs[0].name if is_alone else f"{len(runs)} drives",
         "runs": runs,
-        "sources": sorted(set(sources)),
-        "simulated": sum(map(_is_simulated, scored)),
         "failed": metrics["coverage"].get("failed", {}),
         "same_log": metrics["coverage"].get("same_log", ()),
         "dropped": sum(not account.is_whole for account in accounts),
@@ -167,14 +234,15 @@ def _content(
     }
 
 
-def _run(one: RunScored) -> _Run:
-    manifest = one.run.drive_manifest()
-    reported = manifest.with_files(one.run.relative).as_json()
+def _run(run: RunFolder) -> _Run:
+    manifest = run.drive_manifest()
+    reported = manifest.with_files(run.relative).as_json()
     scene = manifest.scene if isinstance(manifest, EstimateManifest) else None
     candidates, ranged = ({}, {}) if scene is None else (scene.candidates, scene.ranged)
     not_looked_for = {} if scene is None else scene.not_looked_for
     return _Run(
-        name=_name(one),
+        name=_name(run),
+        path=spelled(str(run.path)),
         manifest=manifest,
         clocks=strict_json(reported["clocks"]),
         candidates=candidates,
@@ -185,9 +253,9 @@ def _run(one: RunScored) -> _Run:
     )
 
 
-def _name(one: RunScored) -> str:
+def _name(run: RunFolder) -> str:
     """Return the folder's name, or its parent's if the folder has a generic name."""
-    path = one.run.path.resolve()
+    path = run.path.resolve()
     return spelled("/".join(path.parts[-2:]) if path.name.startswith("run") else path.name)
 
 
@@ -223,8 +291,6 @@ def reported_time(t_ns: int) -> str:
 
 
 def _figures(scored: Sequence[RunScored], scores: PooledScores) -> _Figures:
-    from . import scene_figures
-
     threshold = scores.settings.threshold
     curves = [
         (one, curve)
@@ -255,7 +321,7 @@ def _figures(scored: Sequence[RunScored], scores: PooledScores) -> _Figures:
 
 
 def _report_text(one: RunScored, intersection: str) -> str:
-    return f"{_name(one)}: approach to {intersection}. Dashed: established above it."
+    return f"{_name(one.run)}: approach to {intersection}. Dashed: established above it."
 
 
 def _pose_figures(folder: Path) -> list[_Picture]:

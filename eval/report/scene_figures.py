@@ -231,7 +231,6 @@ class WorstFrame:
         confidence: Highest score of the cue's detections, or None without scores.
         frames: Number of wrong frames of this cue around this one.
         picture: JPEG in base64; empty if the log or the picture is missing.
-        size_px: Width and height of the picture.
     """
 
     run: str
@@ -243,7 +242,6 @@ class WorstFrame:
     confidence: float | None
     frames: int
     picture: str = ""
-    size_px: tuple[int, int] = (0, 0)
 
 
 # Max width of a distance bin, which bounds the distance of its middle from its rows.

@@ -9,34 +9,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from crosscue.detectors.base import Detections, View
-from crosscue.detectors.images import Encoded, decode
-from crosscue.detectors.overlay import draw_detections
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.stored_images import picture_at, run_camera
+from crosscue.eval.runs.stored_images import run_camera
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.eval.scoring.scene.cues import CueFrames, is_wrong
-from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.vehicle import CUES, Vehicle
 
+from .frame_pictures import draw_pictures
 from .scene_figures import WorstFrame
 
 MAX_FRAMES: Final = 6
 # Wrong frames of one cue closer in time than this are one mistake, shown by its worst frame.
 APART_NS: Final = 2_000_000_000
-WIDTH_PX: Final = 640
-QUALITY: Final = 80
-FOUND: Final = (
-    "t_ns",
-    "label",
-    "score",
-    "x0",
-    "y0",
-    "x1",
-    "y1",
-    "picture_width_px",
-    "picture_height_px",
-)
 
 
 def worst_frames(scored: Sequence[RunScored], max_count: int = MAX_FRAMES) -> list[WorstFrame]:
@@ -48,8 +32,15 @@ def worst_frames(scored: Sequence[RunScored], max_count: int = MAX_FRAMES) -> li
     """
     found = [wrong for one in scored for wrong in _wrong(one)]
     found.sort(key=lambda one: (-(one.confidence or 0.0), -one.frames, one.run, one.t_ns, one.cue))
-    folders = {one.judged.coverage.drive: one.run for one in scored}
-    return [_with_picture(one, folders[one.run]) for one in found[:max_count]]
+    shown = found[:max_count]
+    drawn = {
+        (one.run, one.t_ns, one.cue): one
+        for each in scored
+        for mine in [[one for one in shown if one.run == each.judged.coverage.drive]]
+        if mine
+        for one in _with_pictures(mine, each.run)
+    }
+    return [drawn[one.run, one.t_ns, one.cue] for one in shown]
 
 
 def _wrong(scored: RunScored) -> list[WorstFrame]:
@@ -104,46 +95,20 @@ def _scores(run: RunFolder, times: set[int]) -> dict[int, list[dict[str, Any]]]:
     if not run.file("detections.parquet").exists():
         return found
     wanted = pa.array(sorted(times), pa.int64())
-    for batch in run.batches("detections", list(FOUND)):
+    for batch in run.batches("detections", ["t_ns", "label", "score"]):
         for row in batch.filter(pc.is_in(batch["t_ns"], wanted)).to_pylist():
             found.setdefault(row["t_ns"], []).append(row)
     return found
 
 
-def _with_picture(one: WorstFrame, run: RunFolder) -> WorstFrame:
-    labels = _labels(one.cue, run.drive_manifest().settings)
-    rows = [row for row in _scores(run, {one.t_ns}).get(one.t_ns, []) if row["label"] in labels]
-    camera = run_camera(run)
-    if camera is None:
-        return one
-    try:
-        picture = picture_at(camera, one.t_ns)
-        return one if picture is None else _drawn(picture, one, rows)
-    except CrosscueError:
-        # The page states that this picture cannot be read.
-        return one
+def _with_pictures(found: Sequence[WorstFrame], run: RunFolder) -> list[WorstFrame]:
+    """Return frames of one run with their pictures; the page states which cannot be read."""
+    if run_camera(run) is None:
+        return list(found)
+    pictures: dict[int, str] = {}
 
+    def keep(t_ns: int, picture: bytes, _: bytes) -> None:
+        pictures[t_ns] = base64.b64encode(picture).decode()
 
-def _drawn(picture: Encoded, one: WorstFrame, rows: Sequence[Mapping[str, Any]]) -> WorstFrame:
-    """Return the frame with its reduced picture and the boxes of the cue's detections."""
-    import cv2
-
-    pixels, whole = decode(picture, View(min_width_px=WIDTH_PX))
-    size = (WIDTH_PX, round(whole[1] * WIDTH_PX / whole[0]))
-    if pixels.shape[1] > WIDTH_PX:
-        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-    size = (pixels.shape[1], pixels.shape[0])
-    boxes = np.array([[row[k] for k in ("x0", "y0", "x1", "y1")] for row in rows], np.float64)
-    found = Detections(
-        one.t_ns,
-        size,
-        boxes.reshape(-1, 4) * (size[0] / whole[0]),
-        np.array([row["score"] for row in rows], np.float64),
-        tuple(row["label"] for row in rows),
-        (b"",) * len(rows),
-    )
-    canvas = draw_detections(pixels, (found,), {one.cue: one.count})
-    ok, jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    if not ok:
-        return one
-    return replace(one, picture=base64.b64encode(jpeg.tobytes()).decode(), size_px=size)
+    draw_pictures(run, [one.t_ns for one in found], keep)
+    return [replace(one, picture=pictures.get(one.t_ns, "")) for one in found]

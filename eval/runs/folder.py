@@ -50,7 +50,7 @@ STAGED: Final = ".new"
 MAX_MANIFEST_BYTES: Final = 256 << 20
 _RECORDS: Final = frozenset({MANIFEST, INPUT, FAILURE, LOCK, TAGS, TIMINGS})
 _RUN: Final = re.compile(
-    r"drive\.rrd|(?:frames|detections|road|skipped|pose|measurements|mobileye_(?:obstacles|lanes)"
+    r"drive\.rrd|report\.html|(?:frames|detections|road|skipped|pose|measurements|mobileye_(?:obstacles|lanes)"
     r"|cues|range|belief|ranged_objects)\.parquet"
     r"|score/(?:(?:metrics|smoother|detector_[\w.-]+)\.json|junit\.xml|(?:truth|estimate)\.tum"
     r"|(?:report|detector_[\w.-]+)\.html|(?:curves|cue_frames|approaches|by_drive)\.parquet"

@@ -1,0 +1,388 @@
+"""First screen of a report: what happened, and pictures of the moments that matter."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.moments import span_ns
+from crosscue.eval.scoring.columns import NONE, CueRows, RangeRows, RunTables
+from crosscue.eval.scoring.runs import RunScored, read_run_tables
+from crosscue.eval.scoring.scene.approaches import ApproachResult, Curve
+from crosscue.eval.scoring.scene.cues import SEEN, CueFrames
+from crosscue.replay.vehicle.cue_table import CUES
+
+from .frame_pictures import draw_pictures
+from .scene_figures import WorstFrame
+
+MAX_MOMENTS: Final = 8
+MAX_MISTAKES: Final = 2
+# Approaches that are told one by one; a page of many drives has them in its table.
+MAX_TOLD: Final = 4
+# Frames of one cue closer in time than this belong to one mistake.
+APART_NS: Final = 2_000_000_000
+# Which moments are kept first when there are too many.
+BELIEVED, MISTAKE, FIRST, FEATURE, LAST = range(5)
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A moment of a drive, shown with its picture.
+
+    Attributes:
+        t_ns: Log time of the picture.
+        at_s: Seconds from the run's first frame, as ``crosscue view --at`` expects.
+        what: What happened.
+        is_wrong: True if the run was wrong.
+        distance: Where the intersection is; empty if unknown.
+        belief: Probability of each feature.
+        picture: JPEG in base64; empty if it cannot be read.
+    """
+
+    t_ns: int
+    at_s: float
+    what: str
+    is_wrong: bool
+    distance: str
+    belief: tuple[tuple[str, float], ...]
+    picture: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """First screen of a report.
+
+    Attributes:
+        sentences: What was found, and whether that is right.
+        moments: Moments in the order of time.
+        missing: Why pictures are missing; empty if none is.
+    """
+
+    sentences: tuple[str, ...]
+    moments: tuple[Moment, ...] = ()
+    missing: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Event:
+    t_ns: int
+    rank: int
+    what: str
+
+
+def opening_of(
+    run: RunFolder,
+    threshold: float,
+    scored: RunScored | None = None,
+    worst: Sequence[WorstFrame] = (),
+) -> Opening:
+    """Return the first screen of the report of one run.
+
+    Args:
+        run: The run.
+        threshold: Probability above which a feature is believed.
+        scored: The run, compared with its truth; None without a truth.
+        worst: False positives of the run.
+
+    Raises:
+        RunError: A table is damaged.
+    """
+    tables = read_run_tables(run)
+    sentences = _told(run, tables, threshold) if scored is None else _judged(scored)
+    events = [*_events(tables, threshold)]
+    if scored is not None:
+        events += _mistakes(scored.judged.cues, worst)
+    kept = sorted(sorted(events, key=lambda one: (one.rank, one.t_ns))[:MAX_MOMENTS], key=_when)
+    frames = tables.frames_ns
+    if frames is None or not len(frames):
+        return Opening(sentences)
+    start_ns = span_ns(run)[0]
+    moments = [
+        _moment(tables, scored, at, start_ns, [one for one in kept if _frame(frames, one) == at])
+        for at in sorted({_frame(frames, one) for one in kept})
+    ]
+    pictures: dict[int, str] = {}
+
+    def keep(t_ns: int, picture: bytes, _: bytes) -> None:
+        pictures[t_ns] = base64.b64encode(picture).decode()
+
+    missing = draw_pictures(run, [one.t_ns for one in moments], keep) if moments else ""
+    shown = tuple(replace(one, picture=pictures.get(one.t_ns, "")) for one in moments)
+    return Opening(sentences, shown, missing)
+
+
+def curves_of(run: RunFolder) -> tuple[list[Curve], list[CueFrames]]:
+    """Return the belief over each approach of a run, and its cues, without a truth.
+
+    Raises:
+        RunError: A table is damaged.
+    """
+    tables = read_run_tables(run)
+    curves = []
+    for number in _approaches(tables):
+        assert tables.belief is not None
+        mine = tables.belief.approach == number
+        values = {name: p[mine] for name, p in tables.belief.features.items()}
+        unknown_m = np.full(int(mine.sum()), np.nan)
+        name = f"approach {number}"
+        curves.append(Curve("", number, name, tables.belief.t_ns[mine], unknown_m, values))
+    found = tables.cues
+    cues = [] if found is None else [_unjudged(found, name) for name in CUES]
+    return curves, [one for one in cues if len(one.t_ns)]
+
+
+def _unjudged(found: CueRows, name: str) -> CueFrames:
+    """Return the frames of a cue of which nothing is known to be true."""
+    mine = found.cue == name
+    unknown = np.full(int(mine.sum()), NONE, np.int8)
+    no_number = np.full(len(unknown), np.nan)
+    return CueFrames(
+        drive="",
+        cue=name,
+        t_ns=found.t_ns[mine],
+        count=found.count[mine],
+        approach=found.approach[mine],
+        distance_m=no_number,
+        is_object=unknown,
+        is_feature=unknown,
+        true_count=unknown.astype(np.int64),
+        visible=no_number,
+        frames=len(unknown),
+        moments_unmatched=0,
+        left_out={},
+        conditions={},
+    )
+
+
+def _when(event: _Event) -> tuple[int, int]:
+    return event.t_ns, event.rank
+
+
+def _frame(frames: np.typing.NDArray[np.int64], event: _Event) -> int:
+    """Return the time of the last frame up to an event, or of the first one."""
+    return int(frames[max(int(np.searchsorted(frames, event.t_ns, side="right")) - 1, 0)])
+
+
+def _judged(scored: RunScored) -> tuple[str, ...]:
+    """Return a sentence for each true approach, and for the pose."""
+    judged = scored.judged.approaches
+    results = () if judged is None else judged.results
+    told = [_verdict(one, scored.judged.cues, len(results) > 1) for one in results[:MAX_TOLD]]
+    if len(results) > MAX_TOLD:
+        told.append(f"{len(results) - MAX_TOLD} more approaches are in the table.")
+    if judged is not None and judged.extra_detected:
+        told.append(f"{judged.extra_detected} times an intersection was believed where none is.")
+    if scored.pose is not None:
+        pose = scored.pose
+        rms_m = pose.ape["none"].translation_m.rmse
+        told.append(f"The pose is {rms_m:.2f} m from the truth (rms) over {pose.distance_m:.0f} m.")
+    return tuple(told)
+
+
+def _verdict(result: ApproachResult, cues: Sequence[CueFrames], is_named: bool) -> str:
+    name = f"Intersection {result.intersection}" if is_named else "Intersection"
+    found = result.detected_m
+    if found is None:
+        parts = [f"{name} not found: {result.why_not_detected}."]
+    else:
+        ahead = "" if math.isnan(found) else f" {found:.1f} m ahead"
+        parts = [f"{name} found{ahead}."]
+    if result.spurious_m is not None:
+        at = "" if math.isnan(result.spurious_m) else f" {result.spurious_m:.1f} m ahead"
+        parts.append(f"A first detection{at} does not count: {result.why_spurious}.")
+    sides = [name for name in result.present if name != "intersection"]
+    believed = [name for name in sides if result.features_m.get(name) is not None]
+    if believed:
+        parts.append(f"{_listed(believed)} believed and there.")
+    for name in sides:
+        if name not in believed:
+            parts.append(
+                f"{name.capitalize()} is there and was not seen: {_why(result, name, cues)}."
+            )
+    if result.false_features:
+        parts.append(f"{_listed(result.false_features)} believed and not there.")
+    return " ".join(parts)
+
+
+def _why(result: ApproachResult, feature: str, cues: Sequence[CueFrames]) -> str:
+    """Return the reason why a feature was not established."""
+    shows = [
+        one.cue
+        for one in cues
+        if one.cue in CUES
+        and feature in CUES[one.cue].supports
+        and ((one.approach == result.approach) & (one.count > 0)).any()
+    ]
+    if not shows:
+        return "no cue shows it"
+    last = result.at_entering.get(feature, math.nan)
+    return "never probable enough" + ("" if math.isnan(last) else f", {last:.2f} at the end")
+
+
+def _listed(names: Sequence[str]) -> str:
+    text = " and ".join(", ".join(names).rsplit(", ", 1))
+    return text.capitalize()
+
+
+def _told(run: RunFolder, tables: RunTables, threshold: float) -> tuple[str, ...]:
+    """Return a sentence for each approach of the run, without a truth."""
+    numbers = _approaches(tables)
+    told = [] if numbers or tables.belief is None else ["No approach to an intersection."]
+    for number in numbers[:MAX_TOLD]:
+        name = f"Approach {number}: intersection" if len(numbers) > 1 else "Intersection"
+        first = {one: at for one, at in _established(tables, number, threshold).items() if at}
+        if "intersection" not in first:
+            told.append(f"{name} not believed.")
+            continue
+        ahead = _first_range(tables, number, first["intersection"])
+        sides = [one for one in first if one != "intersection"]
+        more = f" {_listed(sides)} believed." if sides else " No road of it believed."
+        told.append(f"{name} believed{f' {ahead}' if ahead else ''}.{more}")
+    if len(numbers) > MAX_TOLD:
+        told.append(f"{len(numbers) - MAX_TOLD} more approaches are in belief.parquet.")
+    return (*told, *_pose_told(run))
+
+
+def _pose_told(run: RunFolder) -> Iterator[str]:
+    """Yield a sentence about the pose of a run without a truth."""
+    if not run.file("pose.parquet").exists():
+        return
+    rows = run.table("pose", ["travelled_m", "major_axis_m"]).to_pylist()
+    if rows:
+        path_m, ellipse_m = rows[-1]["travelled_m"], rows[-1]["major_axis_m"]
+        yield (
+            f"The estimated path is {path_m:.0f} m long; the 2-sigma ellipse at its end is "
+            f"{ellipse_m:.1f} m long."
+        )
+
+
+def _approaches(tables: RunTables) -> list[int]:
+    if tables.belief is None:
+        return []
+    return [one for one in np.unique(tables.belief.approach).tolist() if one != NONE]
+
+
+def _established(tables: RunTables, approach: int, threshold: float) -> dict[str, int]:
+    """Return the time at which each feature first exceeds the threshold; 0 if it never does."""
+    assert tables.belief is not None
+    mine = tables.belief.approach == approach
+    times = tables.belief.t_ns[mine]
+    above = {name: times[p[mine] > threshold] for name, p in tables.belief.features.items()}
+    return {name: int(at[0]) if len(at) else 0 for name, at in above.items()}
+
+
+def _events(tables: RunTables, threshold: float) -> Iterator[_Event]:
+    """Yield the first evidence, each feature believed and the end of each approach."""
+    for number in _approaches(tables):
+        assert tables.belief is not None
+        if tables.cues is not None:
+            found = np.flatnonzero((tables.cues.approach == number) & (tables.cues.count > 0))
+            if len(found):
+                at = int(tables.cues.t_ns[found].min())
+                names = sorted(
+                    {str(tables.cues.cue[i]) for i in found if tables.cues.t_ns[i] == at}
+                )
+                yield _Event(at, FIRST, f"first evidence: {_words(names)}")
+        for name, at in _established(tables, number, threshold).items():
+            if at:
+                yield _Event(
+                    at, BELIEVED if name == "intersection" else FEATURE, f"{name} believed"
+                )
+        yield _Event(
+            int(tables.belief.t_ns[tables.belief.approach == number].max()), LAST, "the end"
+        )
+
+
+def _mistakes(cues: Sequence[CueFrames], worst: Sequence[WorstFrame]) -> Iterator[_Event]:
+    """Yield the worst wrong cues, and those missed for the longest time."""
+    for wrong in worst[:MAX_MISTAKES]:
+        yield _Event(wrong.t_ns, MISTAKE, f"wrong: {_words([wrong.cue])}")
+    missed = []
+    for cue in cues:
+        rows = np.flatnonzero((cue.is_object == 1) & (cue.count == 0) & ~(cue.visible < SEEN))
+        breaks = np.flatnonzero(np.diff(cue.t_ns[rows]) > APART_NS) + 1
+        longest = max(np.split(rows, breaks), key=len)
+        if len(longest) > 1:
+            missed.append((-len(longest), cue.cue, int(cue.t_ns[longest[len(longest) // 2]])))
+    for frames, name, t_ns in sorted(missed)[:MAX_MISTAKES]:
+        yield _Event(t_ns, MISTAKE, f"missed in {-frames} frames: {_words([name])}")
+
+
+def _words(names: Sequence[str]) -> str:
+    return ", ".join(name.replace("_", " ") for name in names)
+
+
+def _moment(
+    tables: RunTables,
+    scored: RunScored | None,
+    t_ns: int,
+    start_ns: int,
+    events: Sequence[_Event],
+) -> Moment:
+    whats = dict.fromkeys(one.what for one in events)
+    believed = [one.removesuffix(" believed") for one in whats if one.endswith(" believed")]
+    others = [one for one in whats if not one.endswith(" believed")]
+    text = "; ".join([*([f"{', '.join(believed)} believed"] if believed else []), *others])
+    belief: Mapping[str, float] = {}
+    if tables.belief is not None:
+        rows = np.flatnonzero(tables.belief.t_ns >= t_ns)
+        if len(rows):
+            belief = {k: float(p[rows[0]]) for k, p in tables.belief.features.items()}
+    distance = _range_text(tables, t_ns)
+    true_m = math.nan if scored is None else _true_m(scored, t_ns)
+    if math.isfinite(true_m):
+        distance = _place(true_m)
+    return Moment(
+        t_ns,
+        (t_ns - start_ns) * 1e-9,
+        text,
+        any(one.rank == MISTAKE for one in events),
+        distance,
+        tuple((name, p) for name, p in belief.items() if math.isfinite(p)),
+    )
+
+
+def _true_m(scored: RunScored, t_ns: int) -> float:
+    """Return the true distance to the start of the intersection in a frame; NaN if unknown."""
+    for cue in scored.judged.cues:
+        rows = np.flatnonzero(cue.t_ns == t_ns)
+        if len(rows):
+            return float(cue.distance_m[rows[0]])
+    return math.nan
+
+
+def _range_text(tables: RunTables, t_ns: int) -> str:
+    """Return the estimated range to the start with its 95 % interval; empty without one."""
+    if tables.ranges is None:
+        return ""
+    rows = np.flatnonzero((tables.ranges.t_ns <= t_ns) & (tables.ranges.reference == "start"))
+    if not len(rows) or t_ns - tables.ranges.t_ns[rows[-1]] > APART_NS:
+        return ""
+    return _ahead(tables.ranges, int(rows[-1]))
+
+
+def _first_range(tables: RunTables, approach: int, t_ns: int) -> str:
+    """Return the first range to the start from a moment on; empty without one."""
+    of = tables.ranges
+    if of is None:
+        return ""
+    later = (of.t_ns >= t_ns) & (of.approach == approach) & (of.reference == "start")
+    return _ahead(of, int(np.flatnonzero(later)[0])) if later.any() else ""
+
+
+def _ahead(ranges: RangeRows, row: int) -> str:
+    half_m = 1.96 * math.sqrt(max(float(ranges.var_m2[row]), 0.0))
+    return _place(float(ranges.range_m[row]), f" ± {half_m:.1f}")
+
+
+def _place(range_m: float, interval: str = "") -> str:
+    if not math.isfinite(range_m):
+        return ""
+    where = "ahead" if range_m >= 0.0 else "past its start"
+    return f"{abs(range_m):.1f}{interval} m {where}"
