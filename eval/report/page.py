@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -137,7 +137,7 @@ def write_report_without_truth(run: RunFolder, path: Path, threshold: float) -> 
         OutputError: The file cannot be written.
     """
     nothing: dict[str, Any] = {"not_scored": {}, "frames": 0, "frames_ambiguous": 0}
-    metrics = {
+    metrics: dict[str, Any] = {
         "coverage": nothing,
         "account": {"scoring": {}},
         "cues": {},
@@ -168,7 +168,7 @@ def write_report_without_truth(run: RunFolder, path: Path, threshold: float) -> 
 
 
 def _write(path: Path, content: Mapping[str, Any]) -> None:
-    formats = {
+    formats: dict[str, Callable[..., str]] = {
         "number": _number,
         "style_of": scene_figures.style_of,
         "signed": _signed,

@@ -40,6 +40,7 @@ LINES: Final[dict[str, tuple[str, int]]] = {
     "export": ("worst.parquet -o labelling", 0),
     "query": ("runs SQL", 0),
     "tag": ("runs/a weather=rain", 0),
+    "report": ("runs/a", 0),
     "status": ("runs", 0),
     "history": ("runs --by version", 0),
     "truth check": ("TRUTH --log LOG", 0),

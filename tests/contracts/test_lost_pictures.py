@@ -81,7 +81,6 @@ HOW_OTHERS_DO: Final = {
     "eval/landmarks.py": "files that the user names",
     "eval/logs/log.py": "a call of the user for one picture, which raises",
     "eval/report/worst_boxes.py": "frames with detections, thus decoded before",
-    "eval/report/worst_frames.py": "frames with detections, thus decoded before",
     "eval/studies/intersections/contact_sheet.py": "frames with detections, thus decoded before",
     "eval/vehicle/mounting.py": "a function of its own below, because it needs intrinsics",
     "localization/landmarks/images.py": "for the commands of landmarks",

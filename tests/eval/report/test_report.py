@@ -1,4 +1,4 @@
-"""The report page: it has no active content, coverage is first, and mistakes are shown."""
+"""The report page: it has no active content, says first what happened, and shows mistakes."""
 
 import base64
 import json
@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from markupsafe import Markup
 
 from crosscue.eval import cli
+from crosscue.eval.report.opening import opening_of
 from crosscue.eval.report.page import reported_time, write_report
 from crosscue.eval.report.scene_figures import (
     draw_belief,
@@ -28,12 +29,16 @@ from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.candidates import CandidateRow
 from crosscue.eval.runs.folder import RunFolder, write_manifest
 from crosscue.eval.runs.manifest import SceneSummary
+from crosscue.eval.runs.moments import moment_ns
 from crosscue.eval.scoring.files import FOLDER
 from crosscue.eval.scoring.runs import RunScored, judge_run, metrics_of, pooled_scores
 from support.manifests import estimate_manifest
 from support.scene_run import SIZE, scene_run
 from support.scoring import approach, at, good_truth, span, truth, truth_folder
 
+HEADINGS = [
+    f">{name}</h2>" for name in ("Intersections", "Cues", "Belief", "Range", "Account", "How")
+]
 HOSTILE = '<script>alert(1)</script>"onload="x'
 
 
@@ -77,20 +82,18 @@ def test_hostile_names_do_not_become_active_content(tmp_path: Path) -> None:
     seen = _ParsedPage(page)
     assert not {"script", "iframe", "object", "embed", "link", "b onload"} & set(seen.tags)
     assert seen.handlers == []
-    assert all(re.match(r"data:image/(jpeg|png);base64,", one) for one in seen.loads)
+    assert all(re.match(r"data:image/(jpeg|png);base64,|#", one) for one in seen.loads)
     assert "default-src 'none'" in page
     assert "<b>cut</b>" not in page
     assert "&lt;b&gt;cut&lt;/b&gt;" in page
     assert "/camera/[red]&lt;script&gt;" in page
 
 
-def test_coverage_is_first_and_losses_are_reported(tmp_path: Path) -> None:
+def test_what_happened_is_first_and_losses_are_reported(tmp_path: Path) -> None:
     page = _report_text(tmp_path, _scored(tmp_path / "drive"))
 
-    order = [
-        page.index(f"<h2>{name}</h2>")
-        for name in ("Coverage", "Intersections", "Cues", "Belief", "Range", "How")
-    ]
+    parts = ('class="told"', "rows known to be dropped", 'class="strip"')
+    order = [page.index(part) for part in (*parts, *HEADINGS)]
     assert order == sorted(order)
     assert "<b>50 of 50</b>" in page
     assert "rows were dropped." in page
@@ -171,7 +174,42 @@ def test_worst_frame_is_shown_with_picture_and_time(tmp_path: Path) -> None:
     assert pixels is not None
     assert pixels.shape == (SIZE[1], SIZE[0], 3)
     page = _report_text(tmp_path, one)
-    assert f"({at(21)} ns): <code>crosscue view {one.run.path}</code>" in page
+    assert f"<code>crosscue view {one.run.path} --at {at(21)}ns</code>" in page
+
+
+def test_report_opens_with_a_sentence_and_pictures_of_moments(tmp_path: Path) -> None:
+    one = _scored(tmp_path / "drive")
+
+    opening = opening_of(one.run, 0.9, one, worst_frames([one]))
+
+    told = " ".join(opening.sentences)
+    assert told.startswith("Intersection found 30.0 m ahead.")
+    assert "Left and right believed and there." in told
+    assert 4 <= len(opening.moments) <= 8
+    assert [m.t_ns for m in opening.moments] == sorted(m.t_ns for m in opening.moments)
+    assert all(m.picture for m in opening.moments)
+    (wrong,) = [m for m in opening.moments if m.t_ns == at(21)]
+    assert wrong.is_wrong
+    assert "wrong: cross traffic right" in wrong.what
+    seconds = f"{wrong.at_s:.2f}"
+    assert moment_ns(one.run, seconds) == pytest.approx(wrong.t_ns, abs=5e6)
+    page = _report_text(tmp_path, one)
+    assert f"crosscue view {one.run.path} --at {seconds}</code>" in page
+
+
+def test_run_without_a_truth_has_a_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = _scored(tmp_path / "drive").run
+
+    assert cli.run(["report", str(run.path)]) == 3
+    path = run.file("report.html")
+    assert capsys.readouterr().out.split() == [str(path)]
+    page = path.read_text(encoding="utf-8")
+    assert '<p class="told">Intersection believed' in page
+    assert "crosscue view" in page
+    assert not {"script", "link"} & set(_ParsedPage(page).tags)
+    assert cli.run(["report", str(run.path), "--threshold", "1.5"]) == 2
 
 
 def test_missing_log_is_an_error_unless_images_are_left_out(
