@@ -1,0 +1,325 @@
+"""Scoreboard of real drives: one line each for lights, legs, first distance, pieces and ranges.
+
+Run it as ``python benchmarks/real_roads.py OUT [DRIVE ...]``; without names it replays every drive
+of ``$CROSSCUE_DATA`` (or ``../shared/data``), pictures alone unless the name says otherwise.
+Detections are cached in OUT. Drives marked ``*`` were used in development and prove nothing.
+
+A leg counts by the highest belief within the annotated frames: above 0.9 it is believed, at its
+prior it is not seen, and anything else is undecided. Times, frames and distances are those of the
+annotations; ranges are scored only where a track gives the true distance.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from crosscue.detectors.catalog.fetch import fetch_weights
+from crosscue.eval.drives.replay import replay_drive
+from crosscue.eval.pipeline.run import Run
+from crosscue.replay.columns import Floats
+
+DATA: Final = Path(os.environ.get("CROSSCUE_DATA", "../shared/data"))
+FEATURES: Final = ("left", "right", "straight")
+BELIEVED: Final = 0.9
+DETECTORS: Final = """
+[cues]
+stop_sign_score = 0.5
+traffic_light_score = 0.5
+[cars]
+labels = ["car", "truck", "bus"]
+score = 0.5
+[detectors.yolox-nano]
+kind = "yolox-nano"
+[detectors.road-segmentation-adas-0001]
+kind = "road-segmentation-adas-0001"
+"""
+MODELS: Final = {
+    "yolox-nano": "yolox_nano/yolox_nano.onnx",
+    "road-segmentation-adas-0001": "road-segmentation-adas-0001",
+}
+KITTI: Final = "x_m = 1.03\nz_m = 1.65\n"
+
+
+class Approach(NamedTuple):
+    """One annotated approach, or a stretch without any: frames inclusive, None for uncertain."""
+
+    first: int
+    last: int
+    features: Mapping[str, bool | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """One real drive.
+
+    Attributes:
+        folder: Folder below ``sequences``.
+        pictures: Pattern of its pictures; ``*.mp4`` for a video of which every second is used.
+        rate_hz: Rate of the pictures.
+        camera: Lines of ``[camera]``; empty where nothing is known.
+        approaches: Approaches; empty to read ``annotation.json``.
+        mouth_m: Start and end of the intersection along the track of ``travelled``.
+        travelled: Distance of each picture along the true track of the camera.
+        is_development: True if it was used in development.
+        has_odometry: True to replay the folder itself, with its odometry.
+    """
+
+    folder: str
+    pictures: str
+    rate_hz: float
+    camera: str = ""
+    approaches: tuple[Approach, ...] = ()
+    mouth_m: tuple[float, float] | None = None
+    travelled: Callable[[Path], Floats] | None = None
+    is_development: bool = True
+    has_odometry: bool = False
+
+
+def kitti_travelled(folder: Path) -> Floats:
+    """Distance along the track of ``poses.txt``."""
+    lines = folder.joinpath("poses.txt").read_text().splitlines()
+    rows = np.array([[float(word) for word in line.split()[:12]] for line in lines])
+    return _along(rows.reshape(-1, 3, 4)[:, :, 3])
+
+
+def pandaset_travelled(folder: Path) -> Floats:
+    """Distance along the track of ``poses.json``."""
+    poses = json.loads(folder.joinpath("camera/front_camera/poses.json").read_text())
+    return _along(np.array([[one["position"][axis] for axis in "xyz"] for one in poses]))
+
+
+def _along(xyz_m: Floats) -> Floats:
+    steps = np.linalg.norm(np.diff(xyz_m, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+_PANDASET: Final = Drive(
+    "pandaset_002",
+    "camera/front_camera/*.jpg",
+    10.0,
+    "focal_px = 1970.0\ncenter_px = [970.0, 483.3]\nsize_px = [1920, 1080]\nz_m = 2.1\nx_m = 1.8\n",
+    (Approach(0, 79, dict.fromkeys(("intersection", *FEATURES), True)),),
+    (59.0, 79.0),
+    pandaset_travelled,
+)
+DRIVES: Final[dict[str, Drive]] = {
+    "kitti_t_junction": Drive(
+        "kitti_t_junction",
+        "image_0/*",
+        9.64,
+        f"focal_px = 707.0912\ncenter_px = [601.8873, 183.1104]\n{KITTI}",
+        # By eye: kerb corners in pictures 28 and 40, on the ground by the camera's height.
+        mouth_m=(45.0, 61.0),
+        travelled=kitti_travelled,
+    ),
+    "kitti_right_turn": Drive(
+        "kitti_seq2_right_turn_98deg",
+        "image_l/*",
+        9.64,
+        f"focal_px = 718.856\ncenter_px = [607.1928, 185.2157]\n{KITTI}",
+        # By eye: a slip road that meets a carriageway, which carries on to the right only.
+        (Approach(0, 28, {"intersection": True, "left": None, "right": True, "straight": False}),),
+        travelled=kitti_travelled,
+    ),
+    "pandaset_002": _PANDASET,
+    "pandaset_002_odometry": replace(_PANDASET, has_odometry=True),
+    "kitti_red_light_queue": Drive(
+        "kitti_red_light_queue",
+        "*.jpg",
+        10.0,
+        f"focal_px = 721.5\ncenter_px = [609.6, 172.9]\n{KITTI}",
+    ),
+    "camvid_0016e5_light": Drive("camvid_0016e5_light", "*.jpg", 15.0),
+    "highway_straight": Drive("highway_straight", "*.mp4", 12.5),
+    "us_dashcam": Drive(
+        "us_signalized_intersection_dashcam",
+        "*.jpg",
+        15.0,
+        approaches=(
+            Approach(0, 110, {"intersection": True, "left": None, "right": True, "straight": True}),
+        ),
+    ),
+}
+
+
+@dataclass(slots=True)
+class Score:
+    """Counts of one drive."""
+
+    lights: Counter[str] = field(default_factory=Counter)
+    legs: dict[str, str] = field(default_factory=dict)
+    first: str = "-"
+    pieces: int = 0
+    false_intersections: int = 0
+    ranges: tuple[int, int] = (0, 0)
+    minutes: float = 0.0
+
+
+def log_of(name: str, drive: Drive, out: Path) -> Path:
+    """Return the folder to replay, with the pictures and their rate."""
+    source = DATA / "sequences" / drive.folder
+    if drive.has_odometry:
+        return source
+    folder = out / "logs" / name
+    if folder.is_dir():
+        return folder
+    folder.mkdir(parents=True)
+    if drive.pictures == "*.mp4":
+        import cv2
+
+        video, number = cv2.VideoCapture(str(next(source.glob(drive.pictures)))), 0
+        while (read := video.read())[0]:
+            if number % 2 == 0:
+                cv2.imwrite(str(folder / f"{number:04}.png"), read[1])
+            number += 1
+    for path in sorted(source.glob(drive.pictures)) if drive.pictures != "*.mp4" else ():
+        if path.suffix in (".png", ".jpg"):
+            shutil.copy(path, folder)
+    folder.joinpath("timestamps.txt").write_text(f"rate_hz: {drive.rate_hz}\n")
+    return folder
+
+
+def replayed(name: str, drive: Drive, out: Path) -> Run:
+    """Replay a drive; detections come from the cache in ``out`` where they are known."""
+    vehicle = out / f"{name}.toml"
+    camera = f"[camera]\n{drive.camera}" if drive.camera else ""
+    topics = '[topics]\ncamera = "front_camera"\nodometry = "odometry"\n'
+    vehicle.write_text(f"version = 1\n{topics if drive.has_odometry else ''}{camera}{DETECTORS}")
+    return replay_drive(
+        log_of(name, drive, out),
+        out / "runs" / name,
+        vehicle=vehicle,
+        cache=out / "detections.sqlite",
+        overwrite=True,
+    )
+
+
+def annotated(drive: Drive) -> tuple[tuple[Approach, ...], dict[int, bool]]:
+    """Return the approaches, and by frame whether a light is in view where that is certain."""
+    file = DATA / "sequences" / drive.folder / "annotation.json"
+    if not file.is_file():
+        return drive.approaches, {}
+    tree = json.loads(file.read_text())
+    approaches = tuple(
+        Approach(one["frames"][0], one["frames"][1], one["features"]) for one in tree["approaches"]
+    )
+    lights = {one["frame"]: one["cues"]["traffic_light"] for one in tree["frames"]}
+    return approaches, {frame: seen for frame, seen in lights.items() if seen is not None}
+
+
+def scored(run: Run, drive: Drive) -> Score:
+    """Score one run."""
+    approaches, lights = annotated(drive)
+    times = np.sort(run["frames"]["t_ns"].to_numpy())
+    score = Score(minutes=float(times[-1] - times[0]) / 60e9)
+    cues = run["cues"].to_pylist()
+    found = {row["t_ns"]: row["count"] > 0 for row in cues if row["cue"] == "traffic_light"}
+    for frame, is_there in lights.items():
+        if frame < len(times) and times[frame] in found:
+            score.lights[
+                "right" if found[times[frame]] == is_there else "missed" if is_there else "false"
+            ] += 1
+    beliefs = run["belief"].to_pylist()
+    frame_of = {int(t_ns): i for i, t_ns in enumerate(times)}
+    believed: dict[int, list[int]] = {}
+    for row in beliefs:
+        if row["intersection"] > BELIEVED:
+            believed.setdefault(row["approach"], []).append(frame_of[row["t_ns"]])
+    travelled = None
+    if drive.travelled is not None:
+        travelled = drive.travelled(DATA / "sequences" / drive.folder)
+    claimed: set[int] = set()
+    for approach in approaches:
+        rows = [r for r in beliefs if approach.first <= frame_of[r["t_ns"]] <= approach.last]
+        _legs(score, approach, rows)
+        ours = {
+            number
+            for number, frames in believed.items()
+            if any(approach.first <= frame <= approach.last for frame in frames)
+        }
+        if not approach.features.get("intersection"):
+            continue
+        claimed |= ours
+        score.pieces += len(ours)
+        frames = [frame for number in ours for frame in believed[number]]
+        if frames:
+            score.first = f"frame {min(frames)}"
+            if travelled is not None and drive.mouth_m is not None:
+                score.first = f"{drive.mouth_m[0] - travelled[min(frames)]:.1f} m"
+    score.false_intersections = len(believed.keys() - claimed)
+    if travelled is not None and drive.mouth_m is not None:
+        score.ranges = _ranges(run, drive, frame_of, travelled)
+    return score
+
+
+def _legs(score: Score, approach: Approach, rows: Sequence[Mapping[str, float]]) -> None:
+    for name in FEATURES:
+        truth = approach.features.get(name)
+        if truth is None:
+            continue
+        best = max((row[name] for row in rows), default=0.5)
+        is_seen = any(row[name] != 0.5 for row in rows)
+        if best > BELIEVED:
+            score.legs[name] = "right" if truth else "WRONG"
+        elif not is_seen:
+            score.legs[name] = "not seen"
+        else:
+            lowest = min(row[name] for row in rows)
+            is_denied = not truth and lowest < 1.0 - BELIEVED
+            score.legs[name] = "right" if is_denied else f"undecided {rows[-1][name]:.2f}"
+
+
+def _ranges(
+    run: Run, drive: Drive, frame_of: Mapping[int, int], travelled: Floats
+) -> tuple[int, int]:
+    """Return the numbers of ranges inside their 95 % interval and of all before the mouth."""
+    assert drive.mouth_m is not None
+    x_m = 1.8 if drive.folder == "pandaset_002" else 1.03
+    inside = total = 0
+    for row in run["range"].to_pylist():
+        place_m = drive.mouth_m[row["reference"] == "end"]
+        frame = frame_of[row["t_ns"]]
+        if frame >= len(travelled) or travelled[frame] > drive.mouth_m[0]:
+            continue
+        total += 1
+        error_m = row["range_m"] - (place_m - travelled[frame] + x_m)
+        inside += abs(error_m) <= 1.96 * row["var_m2"] ** 0.5
+    return inside, total
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Replay and score the named drives, or all."""
+    out = Path(arguments[0])
+    out.mkdir(parents=True, exist_ok=True)
+    for model, folder in MODELS.items():
+        fetch_weights(model, DATA / "weights" / folder)
+    print(
+        f"{'drive':24} {'lights right/missed/false':26} {'legs':52} {'first':>9} {'pieces':>6} "
+        f"{'false':>6} {'in 95 %':>8}"
+    )
+    for name in arguments[1:] or DRIVES:
+        drive = DRIVES[name]
+        score = scored(replayed(name, drive, out), drive)
+        lights = "/".join(str(score.lights[kind]) for kind in ("right", "missed", "false"))
+        legs = ", ".join(f"{leg} {what}" for leg, what in score.legs.items()) or "-"
+        inside, total = score.ranges
+        print(
+            f"{name + ('*' if drive.is_development else ''):24} {lights:26} {legs:52} "
+            f"{score.first:>9} {score.pieces:6} {score.false_intersections:6} "
+            f"{f'{inside}/{total}' if total else '-':>8}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
