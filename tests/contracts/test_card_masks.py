@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.runs.manifest import DetectorRow, EstimateManifest
+from crosscue.eval.runs.manifest import DetectorRow
 from support.onnx_models import constant_model
 from support.pictures import picture_folder
 
@@ -73,12 +73,6 @@ def torchvision(nose: str) -> tuple[str, dict[str, NDArray[np.generic]]]:
 LAYOUTS = {"yolov8-seg": seg, "end-to-end": end_to_end, "torchvision": torchvision}
 
 
-def boxes_only() -> tuple[str, dict[str, NDArray[np.generic]]]:
-    """The same outputs without masks."""
-    output, found = torchvision("left")
-    return output.replace('masks = "masks"\n', ""), {k: v for k, v in found.items() if k != "masks"}
-
-
 def replay_constant_network(
     folder: Path, output: str, classes: list[str], outputs: Mapping[str, NDArray[np.generic]]
 ) -> Path:
@@ -125,20 +119,6 @@ def test_mask_shows_orientation_of_parked_car(tmp_path: Path, layout: str, nose:
     assert (found[f"parked_{nose}"], found[f"parked_{other}"]) == (2, 0)
     detector = detector_of(out)
     assert (detector.with_mask, detector.boxes_only) == (("car",), ())
-
-
-def test_parked_cars_are_not_evaluated_without_masks(tmp_path: Path) -> None:
-    out = replay_constant_network(tmp_path, boxes_only()[0], ["car"], boxes_only()[1])
-
-    found = positive(out)
-    assert "parked_left" not in found
-    assert found["cross_traffic_left"] == 0
-    manifest = open_run(out).drive_manifest()
-    assert isinstance(manifest, EstimateManifest)
-    assert manifest.scene is not None
-    assert "only masks show" in manifest.scene.not_looked_for["parked_left"]
-    detector = detector_of(out)
-    assert (detector.with_mask, detector.boxes_only) == ((), ("car",))
 
 
 def test_road_segmentation_card_yields_road_cue_on_its_side_only(tmp_path: Path) -> None:

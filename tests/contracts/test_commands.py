@@ -79,21 +79,7 @@ READS_NOTHING: Final = {
     "plugins",
     "completion",
 }
-ALWAYS_JSON: Final = {"run schema", "truth schema"}
-PRINTS_NO_RESULT: Final = {"completion"}
 
-# Options whose value has a different kind in each command.
-NAMED_BY_COMMAND: Final = {
-    "--output",
-    "--classes",
-    "--data",
-    "--init",
-    "--runs",
-    "--layouts",
-    "--truth",
-    "--test",
-    "--to",
-}
 
 STREAMS: Final = {
     "reader gone": "| true",
@@ -125,13 +111,6 @@ OPTIONS: Final = sorted(
 
 def test_every_command_has_missing_input_case_or_reads_nothing() -> None:
     assert MISSING.keys() | READS_NOTHING == cli.COMMANDS.keys()
-
-
-@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_help_contains_example_of_command(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run([*name.split(), "--help"]) == 0
-    message = capsys.readouterr().out
-    assert f"\n  crosscue {name}" in message.partition("example")[2]
 
 
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
@@ -169,12 +148,6 @@ def test_missing_input_is_reported_in_one_line_and_writes_nothing(
     _assert_one_line(captured.err)
     assert "gone" in captured.err
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("name", sorted(cli.COMMANDS.keys() - ALWAYS_JSON - PRINTS_NO_RESULT))
-def test_command_with_result_has_json_option(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    cli.run([*name.split(), "--help"])
-    assert "--json" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("streams", STREAMS)
@@ -239,54 +212,6 @@ def test_command_group_alone_lists_its_commands(capsys: pytest.CaptureFixture[st
     assert "fit: needs one of: fit compass, fit odometry" in capsys.readouterr().err
     assert cli.run(["fit", "--help"]) == 0
     assert capsys.readouterr().out.startswith("  fit compass ")
-
-
-@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_every_argument_has_one_line_help_and_metavar(name: str) -> None:
-    for action in actions(name):
-        where = f"{name} {'/'.join(action.option_strings) or action.dest}"
-        assert action.help, where
-        assert not action.help.rstrip().endswith((".", ";", ",")), where
-        assert action.help.splitlines() == [action.help], where
-        starts = action.help.split()[0]
-        assert starts.islower() or any(c.isupper() for c in starts[1:]) or starts[0] in "0<", where
-        takes_value = action.nargs != 0 and not action.choices
-        assert not takes_value or action.metavar, f"{where}: no metavar"
-
-
-def test_command_overview_entries_are_short_and_start_with_verb() -> None:
-    for name in cli.COMMANDS:
-        what = cli.summary_of(name)
-        assert what[0].islower(), name
-        assert what[-1].isalnum(), name
-        assert len(what) <= 75, name
-        # A verb first: "compare two runs", not "what changed between two runs".
-        assert what.split()[0] not in {"a", "an", "the", "what", "how", "who", "any", "every"}, name
-
-
-def test_option_has_same_kind_of_value_in_every_command() -> None:
-    kinds: dict[str, dict[object, list[str]]] = {}
-    for name, option in OPTIONS:
-        if (name, option) == ("model fetch", "--from"):
-            continue  # A source to fetch from; models have no times, so it cannot be mistaken.
-        action = next(one for one in actions(name) if option in one.option_strings)
-        kind = (type(action).__name__, action.type, str(action.metavar))
-        if option in NAMED_BY_COMMAND:
-            kind = kind[:1] + ("",) * 2
-        kinds.setdefault(option, {}).setdefault(kind, []).append(name)
-
-    assert {option: list(of.values()) for option, of in kinds.items() if len(of) > 1} == {}
-
-
-def test_options_follow_naming_conventions() -> None:
-    options = {option for _, option in OPTIONS}
-    assert not options & {"--jobs", "--threads-per-job", "--write", "--save", "--out", "--force"}
-    for name in cli.COMMANDS:
-        for action in actions(name):
-            if "--output" in action.option_strings or "-o" in action.option_strings:
-                assert action.option_strings == ["-o", "--output"], name
-            if "--json" in action.option_strings:
-                assert action.help == "print the result as JSON", name
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

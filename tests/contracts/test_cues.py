@@ -2,45 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow.compute as pc
 import pytest
 from rerun.chunk import RrdReader
 
 import crosscue
 from crosscue.datasets.scenes.cues import SIMULATED
-from crosscue.datasets.truth.truth import truth_schema
-from crosscue.detectors.base import Detections, Found, Frame
-from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import FrameDetections
 from crosscue.detectors.cues.rules import rule_of
-from crosscue.eval.recording.series import of_cue
-from crosscue.eval.report.page import write_report
-from crosscue.eval.report.summary import scores_text
-from crosscue.eval.report.worst_frames import worst_frames
-from crosscue.eval.scoring.files import FOLDER
-from crosscue.eval.scoring.runs import judge_run, metrics_of, pooled_scores
-from crosscue.eval.studies.intersections.tables import cue_rows
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.cue_table import CUES, groups
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.testing import check_cue
-from support.gap_drive import Clock, GreyNumber, write_drive
-from support.scoring import (
-    cue_table,
-    frame_table,
-    good_truth,
-    run_folder,
-    span,
-    truth,
-    truth_folder,
-)
+from support.gap_drive import Clock, write_drive
 
 DUMMY = CueSpec(
     name="zebra",
@@ -55,12 +33,6 @@ DUMMY = CueSpec(
     label="zebra",
     colour=(1, 2, 3),
 )
-
-
-def count_zebras(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
-    """Return twice the number of zebra crossings: the only function of the dummy cue."""
-    assert vehicle.version == 1
-    return 2 * sum(found.labels.count(cue.label or "") for found in boxes)
 
 
 @pytest.mark.parametrize("cue", CUES.values(), ids=lambda cue: str(cue.name))
@@ -94,16 +66,6 @@ def test_contract_check_reports_invalid_cue(changes: dict[str, Any], match: str)
         check_cue(replace(DUMMY, **changes))
 
 
-def always(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
-    """Return 1 for an empty picture, which violates the contract."""
-    return 1
-
-
-def a_fraction(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> float:
-    """Return a count that is not an integer, which violates the contract."""
-    return 0.5
-
-
 def test_cue_without_label_counts_any_label(monkeypatch: pytest.MonkeyPatch) -> None:
     """With such a cue, no detector is reported as unused."""
     assert not Vehicle(version=1).counts_any_label
@@ -118,23 +80,6 @@ def test_cues_of_group_have_same_row_of_table_5() -> None:
 
 def test_simulator_has_functions_of_existing_cues_only() -> None:
     assert [*SIMULATED] == [*CUES]
-
-
-class ZebraDetector(GreyNumber):
-    """A detector that adds a zebra crossing next to the drive's stop sign."""
-
-    def _one(self, frame: Frame) -> Found:
-        found = super()._one(frame)
-        assert isinstance(found, Detections)
-        if not len(found):
-            return found
-        return replace(
-            found,
-            boxes_px=np.concatenate([found.boxes_px, [[10.0, 60.0, 90.0, 80.0]]]),
-            scores=np.ones(2),
-            labels=(*found.labels, "zebra"),
-            masks=(b"", b""),
-        )
 
 
 def test_dummy_cue_appears_in_tables_scores_report_and_recording(
@@ -177,41 +122,3 @@ def _static(recording: Path, entity: str, component: str) -> list[object]:
         if name.endswith(component)
         for cell in batch[name].to_pylist()
     ]
-
-
-def test_dummy_cue_requires_only_one_row_and_one_function(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(CUES, DUMMY.name, DUMMY)
-
-    # It is detected by its rule and fused with its precision.
-    boxes = Detections(
-        t_ns=0,
-        size_px=(64, 48),
-        labels=("zebra", "dog"),
-        scores=np.array([0.9, 0.9]),
-        boxes_px=np.array([[0.0, 0.0, 9.0, 9.0]] * 2),
-        masks=(b"", b""),
-    )
-    assert CuePass(Vehicle(version=1))(FrameDetections(0, objects=(boxes,))).counts["zebra"] == 2
-    assert Fusion().cues["zebra"].precision == 0.61
-    schema = truth_schema()
-    assert "zebra" in schema["$defs"]["CueTruth"]["properties"]["cue"]["examples"]
-
-    # It is scored as its row states, reported with its published precision, drawn in its colour.
-    found = {"frames": frame_table(40), "cues": cue_table({"zebra": {5: 1, 6: 0}})}
-    run = run_folder(tmp_path / "run", found)
-    reported = truth([*good_truth().truth.cues, span("zebra", 0, 40, count=1)])
-    one = judge_run(run, truth_folder(tmp_path / "drive", reported))
-    scores = pooled_scores([one])
-    assert scores.cues["zebra"].reading == "feature"
-    assert scores.cues["zebra"].readings["object"].precision.right == 1
-    assert "zebra" in scores_text(scores)
-    page = write_report(
-        run.file(FOLDER), [one], scores, metrics_of([one], scores), worst_frames([one])
-    ).read_text()
-    assert "<td>zebra</td>" in page
-    assert "at least 0.61" in page
-    (row,) = [row for row in cue_rows(scores.cues) if row["cue"] == "zebra crossing"]
-    assert (row["positives"], row["published"]) == (1, 0.61)
-    assert of_cue("zebra") == (1, 2, 3)

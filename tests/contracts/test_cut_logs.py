@@ -185,12 +185,3 @@ def test_commands_suggest_salvage_for_damaged_log(
     message = " ".join("".join(capsys.readouterr()).split())
     assert "crosscue convert" in message
     assert "--salvage" in message
-
-
-def test_topic_missing_from_complete_log_is_wrong_usage(
-    drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    argv = ["decode", str(drive.log), "-o", str(tmp_path / "out"), "--topics", "/cam"]
-
-    assert cli.run(argv) == 2
-    assert "no such topic; there are: /can" in capsys.readouterr().err

@@ -23,12 +23,11 @@ from crosscue.eval.scoring.gates import load_gates
 from crosscue.replay.plugins import GROUPS
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from support.catalog_runs import runs_below
-from support.pages import PAGES, ROOT, Code, code_of_notebooks, code_of_pages, commands_of
+from support.pages import ROOT, Code, code_of_notebooks, code_of_pages, commands_of
 from support.public_calls import faults_in
 
 CODE: Final = code_of_pages()
 NOTEBOOKS: Final = code_of_notebooks()
-KINDS: Final = {"bash", "console", "python", "toml", "sql", "yaml", "text"}
 # Pages and languages of blocks that a test runs, and that test.
 EXECUTED: Final = {
     ("CONTRIBUTING.md", "python"): "tests/contracts/test_contributing.py",
@@ -125,25 +124,6 @@ def vehicle_of(text: str) -> Vehicle:
     return parse(text if "version =" in text else f"version = 1\n{text}", "example")
 
 
-def test_every_block_names_its_language() -> None:
-    wrong = [
-        f"{code.place}: {code.kind or 'no language'}"
-        for code in CODE
-        if code.kind != "inline" and not code.kind.startswith("{") and code.kind not in KINDS
-    ]
-
-    assert wrong == []
-
-
-@pytest.mark.parametrize(("page", "kind"), EXECUTED)
-def test_executed_blocks_are_read_by_their_test(page: str, kind: str) -> None:
-    test = (ROOT / EXECUTED[page, kind]).read_text(encoding="utf-8")
-
-    assert Path(page).name in test
-    assert f"```{kind}" in test
-    assert any((code.page, code.kind) == (page, kind) for code in CODE)
-
-
 @pytest.mark.parametrize("page", SHELL_PAGES)
 def test_commands_on_page_are_accepted_by_parser(
     page: str, capsys: pytest.CaptureFixture[str]
@@ -160,21 +140,6 @@ def test_commands_on_page_are_accepted_by_parser(
     for block in blocks:
         if re.search(r"^(\$ )?crosscue ", block.text, re.MULTILINE) and block.kind != "inline":
             assert any(code == block for code, _ in found), f"{block.place}: no command was run"
-
-
-@pytest.mark.parametrize("page", SHELL_PAGES)
-def test_commands_on_page_write_to_different_outputs(page: str) -> None:
-    written: dict[str, str] = {}
-    for code, (program, *command) in commands_on(page):
-        name = name_of(command)
-        if program != "crosscue" or not name:
-            continue
-        given = vars(cli.parser_of(name)[1].parse_args(command[len(name.split()) :]))
-        place = str(given.get("output"))
-        # A fit adds to the vehicle file that it read; commands without --overwrite may write again.
-        if place not in (str(given.get("vehicle")), "None") and given.get("overwrite") is False:
-            assert place not in written, f"{code.place}: {place}: written by {written[place]}"
-            written[place] = code.place
 
 
 def test_other_programs_on_a_page_exist() -> None:
@@ -237,17 +202,6 @@ def test_options_in_inline_code_exist() -> None:
 
     unknown = named.keys() - OPTIONS - OTHERS.keys()
     assert {option: named[option] for option in unknown} == {}
-
-
-def test_options_of_other_programs_are_still_named() -> None:
-    texts = [path.read_text(encoding="utf-8") for path in PAGES]
-    texts += [
-        path.read_text(encoding="utf-8")
-        for package in PACKAGES
-        for path in (ROOT / package).rglob("*.py")
-    ]
-
-    assert [option for option in OTHERS if not any(option in text for text in texts)] == []
 
 
 def test_options_in_messages_exist() -> None:
@@ -324,14 +278,3 @@ def test_invalid_example_is_reported(capsys: pytest.CaptureFixture[str]) -> None
     assert "no option --gnsss" in fault_of(["replay", "a", "-o", "b", "--gnsss", "off"], capsys)
     assert "invalid" in fault_of(["view", "run", "--approach", "last"], capsys)
     assert "yolox-pico" in fault_of(["replay", "a", "-o", "b", "--detectors", "yolox-pico"], capsys)
-
-
-def test_console_session_excludes_its_output(tmp_path: Path) -> None:
-    session = Code(
-        "page", 1, "console", '$ for i in 1 2; do \\\n crosscue info "$i"; done\ncrosscue x\n'
-    )
-
-    assert [words for _, words in commands_of([session], tmp_path)] == [
-        ["crosscue", "info", "1"],
-        ["crosscue", "info", "2"],
-    ]

@@ -93,11 +93,6 @@ def test_import_of_blocked_module_fails() -> None:
         run_without(("json",), "import json")
 
 
-def test_import_and_help_do_not_import_compiler() -> None:
-    run_without(COMPILER, "import crosscue")
-    assert "exit status" in run_without(COMPILER, COMMAND, "--help")
-
-
 def test_info_does_not_import_compiler(drive: Path) -> None:
     assert "/can" in run_without(COMPILER, COMMAND, "info", str(drive))
 

@@ -14,7 +14,6 @@ from typing import Final
 import numpy as np
 import pytest
 
-import crosscue
 from crosscue.eval import cli
 from support.empty_inputs import empty_inputs
 from support.failures import table_of_failures
@@ -324,38 +323,3 @@ def test_option_that_names_nonexistent_thing_is_refused_before_log_is_read(
     assert not list(tmp_path.iterdir())
     if option not in NEEDS_LOG:
         assert str(known["log"]) not in opened
-
-
-def test_named_detector_is_refused_in_python_as_on_the_command_line(
-    names: dict[str, Path], tmp_path: Path
-) -> None:
-    log, out = names["bus_log"], tmp_path / "out"
-    with _watched() as opened, pytest.raises(crosscue.UsageError, match="nosuch"):
-        crosscue.replay_drive(log, out, names["car"], ["nosuch"])
-    assert str(log) not in opened
-
-    with pytest.raises(crosscue.EmptyResultError, match="no camera in the logs"):
-        crosscue.replay_drive(log, out, names["car"].with_name("bus.toml"), ["signs"])
-    assert not out.exists()
-
-
-def test_detectors_of_vehicle_file_are_left_out_without_camera(
-    names: dict[str, Path], tmp_path: Path
-) -> None:
-    run = crosscue.replay_drive(
-        names["bus_log"], tmp_path / "out", names["car"].with_name("bus.toml")
-    )
-
-    assert run.made.exit_status == 0
-    assert "detections" not in run.tables
-
-
-def test_missing_drive_of_list_is_reported_and_others_are_replayed(
-    names: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "drives.txt").write_text(f"{names['log']}\nnosuch.mcap\n")
-
-    command = ["replay", f"@{tmp_path}/drives.txt", "-o", f"{tmp_path}/out", "--no-cache"]
-
-    assert cli.run([*command, "--vehicle", str(names["car"])]) == 3
-    assert f"{tmp_path}/nosuch.mcap: " in capsys.readouterr().out

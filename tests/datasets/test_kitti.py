@@ -16,18 +16,15 @@ from crosscue.datasets.adapters.kitti_oxts import COLUMNS, Packets, parse_oxts
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.truth import read_truth as load_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
-from crosscue.eval.cli import run
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block, Images, Table
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.drafting.camera import KnowsItsCameras
-from crosscue.replay.vehicle.roles import Role, role_of
 from support.data import shared
 from support.kitti_drive import (
-    FIRST_S,
     SPEED_MPS,
     YAW_RATE_RADPS,
     packet_lines,
@@ -35,10 +32,6 @@ from support.kitti_drive import (
     tracking_drive,
     true_path,
 )
-from support.pictures import picture
-
-S = 1_000_000_000
-FIRST_NS = FIRST_S * S + 964_389_445
 
 
 def read(path: Path, selection: Selection = EVERYTHING) -> tuple[dict[str, list[Block]], Ledger]:
@@ -67,18 +60,6 @@ def times(blocks: list[Block]) -> list[int]:
     return [t for block in blocks for t in block.log_ns.tolist()]
 
 
-def test_raw_drive_yields_all_streams_with_nanosecond_times(
-    tmp_path: Path,
-) -> None:
-    by_topic, ledger = read(raw_drive(tmp_path / "drive", 230, ("image_00", "image_02")))
-
-    assert set(by_topic) == {"image_00", "image_02", *TOPICS}
-    assert times(by_topic["oxts/imu"]) == [FIRST_NS + 100_000_000 * i for i in range(230)]
-    assert times(by_topic["image_00"])[0] == FIRST_S * S + 950_000_000
-    assert ledger.is_whole
-    assert "PNG: every chunk's CRC verified; OXTS text has no checksum" in ledger.integrity
-
-
 def test_columns_match_simulated_motion(tmp_path: Path) -> None:
     by_topic, _ = read(raw_drive(tmp_path / "drive", 60))
 
@@ -89,41 +70,6 @@ def test_columns_match_simulated_motion(tmp_path: Path) -> None:
     yaw = true_path(60)[1]
     course = np.array(column(by_topic["oxts/gnss"], "course_rad"))
     np.testing.assert_allclose(np.cos(course - yaw), 1.0)
-
-
-def test_topic_roles_are_known_and_ins_speed_has_none(tmp_path: Path) -> None:
-    with open_log(raw_drive(tmp_path / "drive", 3)) as log:
-        roles = {topic.name: role_of(topic) for topic in log.topics}
-
-    assert roles == {
-        "image_02": Role.CAMERA,
-        "oxts/imu": Role.IMU,
-        "oxts/gnss": Role.GNSS,
-        "oxts/ins_speed": None,
-    }
-
-
-def test_streams_are_interleaved_in_time_order(tmp_path: Path) -> None:
-    with open_log(raw_drive(tmp_path / "drive", 350)) as log:
-        firsts = [int(b.log_ns[0]) for b in log.read(Ledger("drive"))]
-
-    assert firsts == sorted(firsts)
-
-
-def test_tracking_layout_computes_times_with_notice(tmp_path: Path) -> None:
-    drive = tracking_drive(tmp_path / "drive")
-    (drive / "image_02" / "0003" / "000004.png").unlink()
-    (drive / "image_02" / "0003" / "cover.png").write_bytes(picture(1))
-
-    by_topic, ledger = read(drive)
-
-    assert times(by_topic["oxts/gnss"]) == [100_000_000 * i for i in range(30)]
-    assert times(by_topic["image_02"]) == [100_000_000 * i for i in range(30) if i != 4]
-    assert ledger.topic("image_02").dropped == {"a picture without its time": 1}
-    assert ledger.notices == [
-        "0003: the tracking set has no times; they are computed from frame numbers, "
-        "100 ms each (with which speeds match distances), starting at 0"
-    ]
 
 
 @pytest.mark.parametrize("period_ms", [103.5, 96.0])
@@ -181,19 +127,6 @@ def test_attitude_is_yaw_then_pitch_then_roll(roll: float, pitch: float, yaw: fl
     np.testing.assert_allclose(up, expected[:, 2], atol=1e-12)
 
 
-def test_unselected_rows_are_counted_but_not_read(tmp_path: Path) -> None:
-    drive = raw_drive(tmp_path / "drive", 30)
-    part = Selection(frozenset({"oxts/imu"}), FIRST_NS + S, FIRST_NS + 2 * S)
-
-    by_topic, ledger = read(drive, part)
-
-    assert list(by_topic) == ["oxts/imu"]
-    assert times(by_topic["oxts/imu"]) == [FIRST_NS + S + 100_000_000 * i for i in range(10)]
-    assert ledger.topic("oxts/imu").skipped == {NOT_ASKED_TIME: 20}
-    assert ledger.topic("oxts/gnss").skipped == {NOT_ASKED_TOPIC: 30}
-    assert ledger.topic("image_02").skipped == {NOT_ASKED_TOPIC: 30}
-
-
 @pytest.mark.parametrize(
     ("text", "why"),
     [
@@ -217,30 +150,6 @@ def test_damaged_packet_is_dropped_with_file_and_reason(
     assert any(why in loss.detail and "0000000003" in loss.detail for loss in ledger.drops())
 
 
-def test_missing_packet_or_picture_leaves_gap(tmp_path: Path) -> None:
-    drive = raw_drive(tmp_path / "drive", 5)
-    (drive / "oxts" / "data" / "0000000002.txt").unlink()
-    (drive / "image_02" / "data" / "0000000001.png").unlink()
-
-    by_topic, ledger = read(drive)
-
-    assert times(by_topic["oxts/imu"]) == [FIRST_NS + 100_000_000 * i for i in (0, 1, 3, 4)]
-    assert ledger.topic("oxts/imu").dropped == {"a time without its packet": 1}
-    assert ledger.topic("image_02").dropped == {"a time without its picture": 1}
-
-
-def test_stream_without_timestamps_is_dropped_and_others_are_read(tmp_path: Path) -> None:
-    drive = raw_drive(tmp_path / "drive", 5)
-    (drive / "image_02" / "timestamps.txt").unlink()
-
-    by_topic, ledger = read(drive)
-
-    assert set(by_topic) == set(TOPICS)
-    assert ledger.topic("image_02").dropped == {"rows without times": 5}
-    assert "image_02/timestamps.txt is missing" in next(ledger.drops()).detail
-    assert run(["info", str(drive)]) == 3
-
-
 def test_oxts_without_timestamps_is_dropped_and_yields_no_truth(tmp_path: Path) -> None:
     drive = raw_drive(tmp_path / "drive", 5)
     (drive / "oxts" / "timestamps.txt").unlink()
@@ -253,14 +162,6 @@ def test_oxts_without_timestamps_is_dropped_and_yields_no_truth(tmp_path: Path) 
     )
     with pytest.raises(LogFormatError, match="contains no truth"):
         write_kitti_truth(drive, tmp_path / "truth")
-
-
-def test_invalid_line_in_timestamps_is_refused_with_its_number(tmp_path: Path) -> None:
-    drive = raw_drive(tmp_path / "drive", 5, cameras=())
-    (drive / "oxts" / "timestamps.txt").write_text("2011-09-26 13:02:00.5\nnoon\n")
-
-    with pytest.raises(LogFormatError, match=r"timestamps.txt: line 2: 'noon'"):
-        open_log(drive)
 
 
 def test_drive_with_timestamps_only_is_refused(tmp_path: Path) -> None:

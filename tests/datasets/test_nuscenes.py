@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.datasets.adapters.nuscenes_tables import MAX_ROW_CHARS, RowsOf
 from crosscue.datasets.adapters.nuscenes_truth import write_nuscenes_truth
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.truth import read_truth
@@ -51,17 +50,6 @@ def test_wheels_steering_and_imu_report_left_turn_in_si_units(tmp_path: Path) ->
     # Published as positive to the right.
     np.testing.assert_allclose(steering["steering_rad"], 0.7)
     np.testing.assert_allclose(imu["gyro_z_radps"], YAW_RATE_RADPS)
-
-
-def test_odometry_is_derived_from_poses_without_can_expansion(tmp_path: Path) -> None:
-    drive = nuscenes_drive(tmp_path / "root", with_can=False)
-
-    found, _ = columns(drive, "odometry")
-
-    np.testing.assert_allclose(found["speed_x_mps"], SPEED_MPS, rtol=1e-3)
-    np.testing.assert_allclose(found["yaw_rate_radps"], YAW_RATE_RADPS, rtol=1e-9)
-    with open_log(nuscenes_drive(tmp_path / "with")) as log:
-        assert "odometry" not in {topic.name for topic in log.topics}
 
 
 def test_scene_is_selected_by_empty_file(tmp_path: Path) -> None:
@@ -137,45 +125,3 @@ def test_damaged_table_row_is_dropped_and_counted(tmp_path: Path, what: str) -> 
     assert pictures == 11
     assert ledger.topic("").dropped.total() == 1
     assert "sample_data.json" in next(iter(ledger.topic("").dropped))
-
-
-def test_damaged_can_row_is_dropped_from_its_topic(tmp_path: Path) -> None:
-    drive = nuscenes_drive(tmp_path / "root")
-    file = drive / "can_bus" / "scene-0061_zoe_veh_info.json"
-    rows = json.loads(file.read_text())
-    del rows[5]["RL_wheel_speed"]
-    file.write_text(json.dumps(rows))
-
-    wheels, ledger = columns(drive, "can/wheel_speed")
-
-    assert len(wheels["rear_left_mps"]) == 119
-    assert ledger.topic("can/wheel_speed").dropped.total() == 1
-    assert ledger.topic("can/wheel_speed").declared == 120
-
-
-def test_truncated_table_is_reported(tmp_path: Path) -> None:
-    drive = nuscenes_drive(tmp_path / "root")
-    file = drive / "v1.0-mini" / "sample_data.json"
-    text = file.read_text()
-    file.write_text(text[: text.index('"token": "d9"')])
-
-    ledger = Ledger("")
-    with open_log(drive) as log:
-        for _ in log.read(ledger):
-            pass
-
-    assert not ledger.is_whole
-    assert any("is cut" in why for why in ledger.topic("").dropped_unknown)
-
-
-def test_table_larger_than_buffer_is_read_completely(tmp_path: Path) -> None:
-    rows = [{"token": f"t{i}", "text": "x{y" * 40} for i in range(40_000)]
-    file = tmp_path / "big.json"
-    file.write_text(json.dumps(rows, indent=0))
-    assert file.stat().st_size > 60 * MAX_ROW_CHARS
-
-    table = RowsOf(file)
-
-    assert [row["token"] for row in table] == [row["token"] for row in rows]
-    assert not table.damaged
-    assert not table.is_cut

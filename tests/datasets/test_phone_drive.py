@@ -43,13 +43,6 @@ def test_position_time_is_time_of_fix_on_wall_clock(tmp_path: Path) -> None:
     assert rows["course_rad"][0] == pytest.approx(-math.pi / 2)
 
 
-def test_speed_and_magnetic_field_have_si_units(tmp_path: Path) -> None:
-    found = tables_of(phone_drive(tmp_path / "drive"))
-
-    assert found["car/speed"][1]["speed_mps"][0] == pytest.approx(20.0 * 1609.344 / 3600.0)
-    assert found["phone/magnetometer"][1]["mag_z_t"][0] == pytest.approx(40e-6)
-
-
 def test_damaged_phone_line_is_dropped_from_each_of_its_topics(tmp_path: Path) -> None:
     drive = phone_drive(tmp_path / "drive")
     file = drive / "made_phone.csv"

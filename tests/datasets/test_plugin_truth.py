@@ -23,28 +23,6 @@ def _install(monkeypatch: pytest.MonkeyPatch, function: Callable[[Path, Path], o
     monkeypatch.setattr(truth_file, "data_sets", lambda: {NAME: data_set})
 
 
-@pytest.mark.parametrize(
-    ("error", "why"),
-    [
-        (ValueError("line 3:\nno time"), "ValueError: line 3: no time"),
-        (KeyError("t_ns"), "KeyError: 't_ns'"),
-    ],
-)
-def test_failing_plugin_function_is_named(
-    error: Exception, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def truth(log: Path, folder: Path) -> Path:
-        raise error
-
-    _install(monkeypatch, truth)
-
-    with pytest.raises(CrosscueError) as caught:
-        truth_file.write_carried(NAME, tmp_path, tmp_path / "out")
-
-    assert str(caught.value) == f"{tmp_path}: {FUNCTION} failed ({why}); correct this plug-in"
-    assert caught.value.__cause__ is error
-
-
 def test_missing_plugin_function_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _install(monkeypatch, lambda log, folder: folder)
     del vars(sys.modules["dummy_lines"])["truth"]

@@ -117,13 +117,6 @@ def test_unreadable_file_is_refused(tmp_path: Path) -> None:
         read_tum(binary, Limits(chunk_bytes=10))
 
 
-def test_rounded_quaternion_is_normalised(tmp_path: Path) -> None:
-    path = tmp_path / "a.tum"
-    path.write_text("1 0 0 0 0.0 0.0 0.7071 0.7071\n")
-
-    assert np.linalg.norm(read_tum(path).quat_wxyz) == pytest.approx(1.0, abs=1e-12)
-
-
 @given(heading=st.floats(-3.14, 3.14))
 @settings(max_examples=30, deadline=None)
 def test_planar_pose_keeps_heading(heading: float) -> None:
@@ -148,23 +141,3 @@ def test_invalid_trajectory_columns_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match=match):
         Trajectory(np.array(t_ns), xyz, quat)
-
-
-def test_written_file_is_read_by_evo_and_back(tmp_path: Path) -> None:
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        from evo.tools import file_interface
-
-    path = tmp_path / "ours.tum"
-    trajectory = random_trajectory(1, 12)
-    write_tum(path, trajectory)
-    theirs = file_interface.read_tum_trajectory_file(str(path))
-
-    np.testing.assert_allclose(theirs.positions_xyz, trajectory.xyz_m)
-    np.testing.assert_allclose(theirs.orientations_quat_wxyz, trajectory.quat_wxyz)
-    back = tmp_path / "theirs.tum"
-    file_interface.write_tum_trajectory_file(str(back), theirs)
-    np.testing.assert_allclose(read_tum(back).xyz_m, trajectory.xyz_m)
-    assert np.abs(read_tum(back).t_ns - trajectory.t_ns).max() < 1_000

@@ -129,26 +129,6 @@ def test_wrong_box_of_a_run_is_refused_with_frame_and_reason(
     assert fault in str(refused.value)
 
 
-def test_near_label_is_named(tmp_path: Path) -> None:
-    class Near(Yields):
-        labels = ("stop_sign",)
-
-    log = picture_folder(tmp_path / "log", 2, "rate_hz: 10")
-    item = ("stop_sign", 0.9, (10, 8, 15, 12))
-    run = crosscue.detect_drive(log, tmp_path / "run", detectors=[Near.build(item=item)])
-
-    notices = run.folder.drive_manifest().notices
-    (notice,) = [one for one in notices if "no cue counts" in one]
-    assert "did you mean 'stop sign'?" in notice
-
-
-class NoDetector:
-    """Class with one of a detector's three members."""
-
-    def __call__(self, frames: object) -> object:
-        """Return nothing of use."""
-
-
 def test_missing_detector_members_are_named() -> None:
     place = f"{__name__}:NoDetector"
 

@@ -11,17 +11,13 @@ import pytest
 import torch
 
 import crosscue
-from crosscue.detectors import rle
-from crosscue.detectors.base import Detections
-from crosscue.detectors.networks.mask_rcnn.checkpoint import Checkpoint, Facts, load_checkpoint
-from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, detector_of
+from crosscue.detectors.networks.mask_rcnn.checkpoint import load_checkpoint
 from crosscue.detectors.networks.mask_rcnn.network import build_network
 from crosscue.detectors.training.annotations import LabelledSet, mask_of, read_training_coco
 from crosscue.detectors.training.loop import Schedule, Training
 from crosscue.detectors.training.samples import Sampler, SampleSettings
-from crosscue.detectors.training.scores import average_precisions
 from crosscue.eval.cli import run
-from support.mask_rcnn import CPU, noise_frame, plan_of, random_checkpoint, write_bars
+from support.mask_rcnn import CPU, plan_of, write_bars
 
 WINDOW = SampleSettings(96, 64)
 MASK_HEAD = ("roi_heads.mask_head.", "roi_heads.mask_predictor.")
@@ -70,29 +66,6 @@ def test_annotation_without_mask_is_read(tmp_path: Path, absent: object) -> None
     assert one.box_px == (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
 
 
-def test_sample_marks_objects_with_a_mask(tmp_path: Path) -> None:
-    sampler = Sampler(_boxes(tmp_path, every=2), plan_of(), WINDOW, 0)
-
-    marks = np.concatenate([sampler(number).has_mask for number in range(12)])
-
-    assert marks.any()
-    assert not marks.all()
-
-
-@pytest.mark.slow
-def test_training_without_masks_keeps_the_mask_head(tmp_path: Path) -> None:
-    training, sampler = _training(_boxes(tmp_path), Schedule(16, batch=2, rate=2e-3, warm_up=4))
-    before = _mask_head(training.network)
-
-    losses = [loss for _, loss in training.steps(sampler)]
-
-    assert np.mean(losses[-4:]) < 0.85 * np.mean(losses[:3])
-    assert before
-    for network in (training.network, training.averaged):
-        after = _mask_head(network)
-        assert all(torch.equal(value, after[name]) for name, value in before.items())
-
-
 @pytest.mark.slow
 def test_mixed_data_trains_the_mask_head(tmp_path: Path) -> None:
     training, sampler = _training(_boxes(tmp_path, every=2), Schedule(2, batch=4, warm_up=1))
@@ -102,53 +75,6 @@ def test_mixed_data_trains_the_mask_head(tmp_path: Path) -> None:
 
     after = _mask_head(training.network)
     assert any(not torch.equal(value, after[name]) for name, value in before.items())
-
-
-def test_mask_precision_counts_only_objects_with_a_mask(tmp_path: Path) -> None:
-    path = write_bars(tmp_path, 2)
-    whole = read_training_coco(path, tmp_path / "images", ("car",))
-    _without_masks(path, every=2)
-    mixed = read_training_coco(path, tmp_path / "images", ("car",))
-    _without_masks(path)
-    boxes = read_training_coco(path, tmp_path / "images", ("car",))
-
-    found = []
-    for number, picture in enumerate(whole.pictures):
-        # Objects without a mask in the mixed data have wrong masks here: half of the object.
-        masks = []
-        for k, one in enumerate(picture.objects):
-            mask = mask_of(one, picture.size_px)
-            if k % 2 == 0:
-                mask[:, : int(one.box_px[0] + one.box_px[2]) // 2] = False
-            masks.append(rle.encode_mask(mask, (0, 0), picture.size_px))
-        corners = np.array([one.box_px for one in picture.objects], np.float64)
-        found.append(
-            Detections(
-                number, picture.size_px, corners, np.full(2, 0.9), ("car",) * 2, tuple(masks)
-            )
-        )
-
-    assert average_precisions(whole, found)["mask"] != 100.0
-    mixed_scores = average_precisions(mixed, found)
-    assert mixed_scores["box"] == mixed_scores["mask"] == 100.0
-    box_scores = average_precisions(boxes, found)
-    assert (box_scores["box"], box_scores["mask"], box_scores["mask50"]) == (100.0, None, None)
-
-
-def test_network_without_trained_mask_head_returns_no_masks() -> None:
-    known = random_checkpoint()
-    facts = Facts(plan=known.facts.plan, has_masks=False)
-    boxes_only = Checkpoint(facts, known.network, "boxes_only")
-    settings = MaskRcnnSettings(score=0.0, proposals=20)
-
-    (masked,) = detector_of(known, settings, CPU)([noise_frame()])
-    (bare,) = detector_of(boxes_only, settings, CPU)([noise_frame()])
-
-    assert isinstance(bare, Detections)
-    assert isinstance(masked, Detections)
-    assert len(bare) == len(masked) > 0
-    assert np.array_equal(bare.boxes_px, masked.boxes_px)
-    assert set(bare.masks) == {b""}
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from torchvision.models import get_model_weights
 from crosscue.detectors.base import DetectorChoice
 from crosscue.detectors.catalog import entries, fetch, places
 from crosscue.detectors.catalog.card import ModelCard, WeightFile
-from crosscue.detectors.catalog.class_names import COCO_80, COCO_90, cue_label
+from crosscue.detectors.catalog.class_names import cue_label
 from crosscue.detectors.registry import make
 from crosscue.eval.cli import run
 from crosscue.replay.errors import CrosscueError, UsageError, VehicleError
@@ -126,29 +125,6 @@ def test_misspelled_model_name_suggests_the_nearest() -> None:
         places.card_path("yolo-nano")
 
 
-def test_weights_are_downloaded_once(card: ModelCard, server: Served) -> None:
-    (first,) = fetch.fetch_weights("net")
-    (second,) = fetch.fetch_weights("net")
-
-    assert first.path.read_bytes() == CONTENT
-    assert second.came_from == "the cache"
-    assert len(server.gets) == 1
-    assert [path.name for path in first.path.parent.iterdir()] == ["net.onnx"]
-
-
-def test_interrupted_download_is_resumed(card: ModelCard, server: Served) -> None:
-    server.failing = 1
-    with pytest.raises(CrosscueError, match="interrupted after 524288 of 1048576 bytes"):
-        fetch.fetch_weights("net")
-    assert not entries.weights_path(card, card.files[0]).exists()
-
-    (found,) = fetch.fetch_weights("net")
-
-    assert server.gets == ["all", "bytes=524288-1048575"]
-    assert found.path.read_bytes() == CONTENT
-    assert [path.name for path in found.path.parent.iterdir()] == ["net.onnx"]
-
-
 @pytest.mark.parametrize("content", [CONTENT[:-1] + b"x", CONTENT + b"more", b"<html>404</html>"])
 def test_download_with_another_hash_is_not_kept(
     card: ModelCard, server: Served, content: bytes
@@ -167,49 +143,6 @@ def test_download_with_another_hash_is_not_kept(
         assert not entries.weights_path(card, card.files[0]).exists()
 
 
-def test_failed_download_suggests_other_sources(
-    card: ModelCard, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(fetch.MIRROR, "http://127.0.0.1:9/")
-
-    with pytest.raises(CrosscueError) as error:
-        fetch.fetch_weights("net")
-
-    assert str(error.value).startswith("http://127.0.0.1:9/net.onnx: not fetched: ")
-    assert "--from FILE" in str(error.value)
-    assert fetch.MIRROR in str(error.value)
-
-
-def test_mirror_replaces_the_original_server(
-    card: ModelCard, server: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    server.files["mirror/net.onnx"] = server.files.pop("net.onnx")
-    monkeypatch.setenv(fetch.MIRROR, f"{server.base}/mirror")
-
-    (found,) = fetch.fetch_weights("net")
-
-    assert found.path.read_bytes() == CONTENT
-
-
-def test_weights_are_copied_from_a_file_or_folder(
-    card: ModelCard, server: Served, tmp_path: Path
-) -> None:
-    file = tmp_path / "net.onnx"
-    file.write_bytes(CONTENT)
-
-    for given in (file, tmp_path):
-        (found,) = fetch.fetch_weights("net", given)
-        assert found.path.read_bytes() == CONTENT
-        shutil.rmtree(found.path.parent)
-    assert not server.gets
-
-    file.write_bytes(CONTENT[1:])
-    with pytest.raises(UsageError, match="model net requires"):
-        fetch.fetch_weights("net", file)
-    with pytest.raises(UsageError, match="No such file"):
-        fetch.fetch_weights("net", tmp_path / "gone.onnx")
-
-
 def test_file_that_is_named_must_exist_also_if_the_weights_are_cached(
     card: ModelCard, server: Served, tmp_path: Path
 ) -> None:
@@ -217,20 +150,6 @@ def test_file_that_is_named_must_exist_also_if_the_weights_are_cached(
 
     with pytest.raises(UsageError, match=r"gone\.onnx"):
         fetch.fetch_weights("net", tmp_path / "gone.onnx")
-
-
-def test_weights_are_found_in_the_data_folder(
-    card: ModelCard, server: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "data" / "weights" / "net"
-    folder.mkdir(parents=True)
-    (folder / "net.onnx").write_bytes(CONTENT)
-    monkeypatch.setenv(fetch.DATA, str(tmp_path / "data"))
-
-    (found,) = fetch.fetch_weights("net")
-
-    assert found.came_from == str(folder / "net.onnx")
-    assert not server.gets
 
 
 def test_model_list_and_show_print_every_entry(
@@ -242,14 +161,6 @@ def test_model_list_and_show_print_every_entry(
         assert name in listed
         assert run(["model", "show", name]) == 0
         assert entries.entry(name).sha256 in capsys.readouterr().out
-
-
-def test_coco_class_numbers_keep_their_gaps() -> None:
-    assert len(COCO_80) == 80
-    assert len(COCO_90) == 90
-    # Numbers from COCO's own annotation files.
-    for number, name in {3: "car", 10: "traffic light", 13: "stop sign", 90: "toothbrush"}.items():
-        assert COCO_90[number - 1] == name
 
 
 @pytest.mark.parametrize(

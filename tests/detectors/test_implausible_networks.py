@@ -114,13 +114,3 @@ def test_pixel_boxes_read_as_fractions_are_refused(tmp_path: Path) -> None:
 
     with pytest.raises(VehicleError, match=r"on noise, .* boxes are more than four times as large"):
         crosscue.check_card(card(tmp_path, model, output))
-
-
-def test_interpretation_of_shapes_is_assumed_not_certain(tmp_path: Path) -> None:
-    net = tmp_path / "net.onnx"
-    net.write_bytes(constant_model(SHAPE, {"rows": rows()}))
-
-    found = crosscue.draft_card(net, kind="end-to-end", class_names=names(tmp_path)).draft
-
-    assert found.certain == ("its input is 256 x 128",)
-    assert "end-to-end: rows of 6: box, score, class" in found.assumed

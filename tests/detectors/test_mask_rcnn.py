@@ -23,9 +23,8 @@ from torchvision.models.detection.roi_heads import paste_masks_in_image
 
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.detectors import rle, weights_file
-from crosscue.detectors.base import Detections, DetectorChoice, Frame
+from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.boxes import box_ious
-from crosscue.detectors.networks.devices import chosen_device
 from crosscue.detectors.networks.mask_rcnn.checkpoint import (
     KEY,
     Calibration,
@@ -46,13 +45,12 @@ from crosscue.detectors.networks.mask_rcnn.detector import (
     place_picture,
     raw_score,
 )
-from crosscue.detectors.networks.mask_rcnn.network import NetworkPlan, build_network, set_limits
+from crosscue.detectors.networks.mask_rcnn.network import build_network, set_limits
 from crosscue.detectors.networks.mask_rcnn.parts import Body, MaskRcnnLayers, as_input
-from crosscue.detectors.registry import make
 from crosscue.detectors.weights_file import SUM
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import CrosscueError, VehicleError
-from support.mask_rcnn import CLASSES, CPU, noise_frame, plan_of, random_checkpoint
+from support.mask_rcnn import CPU, noise_frame, plan_of, random_checkpoint
 from support.scenes import picture_at, world
 
 
@@ -112,31 +110,6 @@ class _Bare(torch.nn.Module):
         return found
 
 
-def test_detections_do_not_depend_on_the_batch() -> None:
-    frames = [noise_frame(k, t_ns=k) for k in range(3)]
-    one, again = _detector(), _detector()
-
-    together = _found(one, *frames)
-    alone = [_found(again, frame)[0] for frame in frames]
-
-    assert [found.t_ns for found in together] == [0, 1, 2]
-    assert all(_equal(a, b) for a, b in zip(together, alone, strict=True))
-
-
-def test_detections_follow_a_changing_picture_size() -> None:
-    small, large = noise_frame(1), noise_frame(1, 256, 192)
-    found = _found(_detector(batch=4), small, small, large, small)
-
-    assert [one.size_px for one in found] == [(128, 96), (128, 96), (256, 192), (128, 96)]
-    for one in found:
-        width, height = one.size_px
-        assert (one.boxes_px >= 0).all()
-        assert (one.boxes_px <= [width, height, width, height]).all()
-        assert all(
-            rle.decode_mask(mask, one.size_px).shape == (height, width) for mask in one.masks
-        )
-
-
 def test_grey_picture_equals_picture_with_equal_channels() -> None:
     frame = noise_frame()
     grey = np.asarray(cv2.cvtColor(frame.pixels, cv2.COLOR_BGR2GRAY), np.uint8)
@@ -146,23 +119,6 @@ def test_grey_picture_equals_picture_with_equal_channels() -> None:
     (other,) = _found(_detector(), replace(frame, pixels=coloured))
 
     assert _equal(one, other)
-
-
-def test_detections_of_a_reduced_picture_are_in_camera_pixels() -> None:
-    frame = noise_frame()
-    (whole,) = _found(_detector(), frame)
-    (half,) = _found(_detector(), replace(frame, size_px=(256, 192)))
-
-    np.testing.assert_allclose(half.boxes_px, 2.0 * whole.boxes_px)
-
-
-def test_cropped_picture_keeps_its_offset_and_scale() -> None:
-    plan = plan_of(256, top=0.25, bottom=0.25)
-    placed = place_picture(np.zeros((96, 128, 3), np.uint8), plan)
-
-    assert placed.pixels.shape == (96, 256, 3)
-    assert placed.corner_px == (0, 48)
-    assert placed.scale == (2.0, 2.0)
 
 
 @dataclass
@@ -237,19 +193,6 @@ def test_calibration_is_monotonic_and_invertible(
     assert 0.0 <= calibrated(one, by) <= 1.0
 
 
-def test_detections_have_calibrated_scores() -> None:
-    plain = random_checkpoint()
-    by = Calibration(slope=1.0, offset=-2.0)
-    facts = plain.facts.model_copy(update={"calibration": dict.fromkeys(CLASSES, by)})
-
-    (before,) = _found(_detector(score=0.01), noise_frame())
-    (after,) = _found(_detector(replace(plain, facts=facts), score=0.01), noise_frame())
-
-    assert len(after)
-    expected = sorted((calibrated(s, by) for s in before.scores.tolist()), reverse=True)
-    assert sorted(after.scores, reverse=True) == pytest.approx(expected[: len(after)])
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     st.integers(-20, 90),
@@ -280,30 +223,6 @@ def test_mask_in_its_box_matches_torchvision(
     narrow = cv2.erode(theirs.astype(np.uint8), kernel, borderValue=1)
     assert (np.asarray(wide)[ours] == 1).all()
     assert ours[np.asarray(narrow) == 1].all()
-
-
-def test_full_mask_fills_exactly_its_box() -> None:
-    mask = rle.decode_mask(
-        laid_in(np.ones((28, 28), np.float32), np.array([3.0, 4.0, 9.0, 8.0]), (16, 12)), (16, 12)
-    )
-
-    assert mask[4:8, 3:9].all()
-    assert mask.sum() == 24
-
-
-def test_checkpoint_survives_a_round_trip(tmp_path: Path) -> None:
-    plain = random_checkpoint()
-    facts = plain.facts.model_copy(update={"measured": {"box": 12.5}})
-    save_checkpoint(tmp_path / "one.safetensors", plain.network, facts, halve=False)
-
-    back = load_checkpoint(tmp_path / "one.safetensors")
-
-    assert back.facts == facts
-    assert all(
-        torch.equal(value, back.network.state_dict()[name])
-        for name, value in plain.network.state_dict().items()
-    )
-    assert len(back.sha256) == 64
 
 
 def _file(tmp_path: Path, facts: str | None, tensors: dict[str, Tensor] | None = None) -> Path:
@@ -454,13 +373,6 @@ def test_unknown_network_or_setting_is_reported_with_options(tmp_path: Path) -> 
         build(scor=0.5)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
-def test_unavailable_device_is_reported() -> None:
-    with pytest.raises(VehicleError, match="device cuda: not available"):
-        chosen_device("cuda", "detector road")
-    assert chosen_device("cpu", "detector road").type == "cpu"
-
-
 def test_failed_download_reports_the_cache_folder(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -477,17 +389,6 @@ def test_failed_download_reports_the_cache_folder(
         build(network="resnet50")
     assert asked["weights_only"] is True
     assert asked["check_hash"] is True
-
-
-def test_coco_checkpoint_has_class_names() -> None:
-    from torchvision.models.detection import MaskRCNN_ResNet50_FPN_Weights as Weights
-
-    plan = NetworkPlan(architecture="resnet50", classes=("x",) * 90, width_px=1333)
-    checkpoint = coco_checkpoint("resnet50", Weights.DEFAULT, build_network(plan).state_dict())
-
-    names = checkpoint.facts.plan.classes
-    assert [names[i - 1] for i in (3, 10, 13)] == ["car", "traffic light", "stop sign"]
-    assert names[11] is None
 
 
 @pytest.mark.parametrize("name", ["resnet50", "resnet50-v2"])
@@ -527,24 +428,6 @@ def test_coco_weights_yield_the_feature_levels_of_torchvision(
         largest = float(value.abs().max())
         assert largest > 0.0
         assert float((ours[level] - value).abs().max()) < 1e-3 * largest
-
-
-def test_registry_builds_mask_rcnn_and_checks_its_settings() -> None:
-    assert isinstance(
-        make(DetectorChoice("mine", "mask-rcnn", {"device": "cpu"})), MaskRcnnDetector
-    )
-    with pytest.raises(VehicleError, match="proposals"):
-        make(DetectorChoice("mine", "mask-rcnn", {"proposals": 0}))
-
-
-def test_embedded_checkpoint_is_small_and_documented() -> None:
-    facts = load_checkpoint(embedded_mask_rcnn()).facts
-
-    assert embedded_mask_rcnn().stat().st_size < 25e6
-    assert facts.plan.classes == CLASSES
-    assert set(facts.calibration) == set(CLASSES)
-    assert {"box", "mask", "box car", "mask stop sign"} <= set(facts.measured)
-    assert facts.recipe["held_out_pictures"] == 600
 
 
 @pytest.mark.slow

@@ -19,7 +19,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Checkpoint, Facts
@@ -28,7 +27,6 @@ from crosscue.detectors.networks.mask_rcnn.detector import (
     MaskRcnnDetector,
     MaskRcnnSettings,
     build,
-    checkpoint_named,
     detector_of,
     laid_in,
     place_picture,
@@ -38,7 +36,6 @@ from crosscue.detectors.networks.mask_rcnn.parts import TorchParts, as_input
 from crosscue.detectors.networks.mask_rcnn.screening import ScreenedParts
 from crosscue.replay.errors import VehicleError
 from support.mask_rcnn import CPU, noise_frame, plan_of, random_checkpoint
-from support.scenes import picture_at, world
 
 BACKENDS = ("torch", "openvino")
 SCORE = 0.4
@@ -71,16 +68,6 @@ def _found(detector: MaskRcnnDetector, frame: Frame) -> Detections:
     (found,) = detector([frame])
     assert isinstance(found, Detections)
     return found
-
-
-@cache
-def _simulated() -> tuple[Frame, ...]:
-    """Render pictures of a simulated drive with lights and cars."""
-    taken = []
-    for layout, x_m in (("E", -25.0), ("C", -15.0)):
-        rgb = picture_at(world(layout), x_m, SceneCamera()).rgb
-        taken.append(Frame(0, "", np.ascontiguousarray(rgb[:, :, ::-1]), (1280, 720)))
-    return tuple(taken)
 
 
 @cache
@@ -154,60 +141,6 @@ def test_random_weights_match_torchvision(backend: str, seed: int) -> None:
         _assert_equal(_found(detector, frame), theirs)
         found += len(theirs)
     assert found > 10
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_objectness_threshold_matches_torchvision(backend: str) -> None:
-    checkpoint = random_checkpoint(0)
-    counts = []
-    for floor in (0.0, 0.5, 1.0):
-        theirs = _found_by_torchvision(checkpoint, noise_frame(), floor)
-        ours = _found(_detector(checkpoint, backend, objectness=floor), noise_frame())
-        _assert_equal(ours, theirs)
-        counts.append(len(theirs))
-
-    assert counts[0] > counts[1] > counts[2] == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_embedded_network_matches_torchvision(backend: str) -> None:
-    checkpoint = checkpoint_named("embedded")
-    detector = _detector(checkpoint, backend)
-    found = 0
-    for frame in _simulated():
-        theirs = _found_by_torchvision(checkpoint, frame)
-        _assert_equal(_found(detector, frame), theirs)
-        found += len(theirs)
-    assert found > 10
-
-
-def test_openvino_handles_changing_picture_and_batch_sizes() -> None:
-    torch_detector = _detector(random_checkpoint(), "torch")
-    detector = _detector(random_checkpoint(), "openvino", batch=3)
-    wide, high = (128, 96), (128, 160)
-    frames = [noise_frame(k, *size) for k, size in enumerate([wide, wide, high, wide, high])]
-
-    found = detector(frames)
-
-    for frame, one in zip(frames, found, strict=True):
-        assert isinstance(one, Detections)
-        _assert_equal(one, _found(torch_detector, frame))
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_score_above_all_detections_yields_empty_result(backend: str) -> None:
-    found = _found(_detector(random_checkpoint(), backend, score=1.0), noise_frame())
-
-    assert len(found) == 0
-    assert found.boxes_px.shape == (0, 4)
-
-
-def test_identity_differs_between_backends() -> None:
-    one, other = (_detector(random_checkpoint(), backend).identity for backend in BACKENDS)
-
-    assert one != other
 
 
 @settings(max_examples=10, deadline=None)
@@ -297,11 +230,6 @@ def test_cpu_copy_matches_the_original_and_leaves_it_unchanged() -> None:
             np.testing.assert_allclose(mine.numpy(), other.numpy(), rtol=1e-3, atol=1e-4)
     after = network.state_dict()
     assert all(torch.equal(value, after[name]) for name, value in before.items())
-
-
-def test_unknown_backend_is_reported_with_the_choices() -> None:
-    with pytest.raises(VehicleError, match=r"backend: input should be 'torch' or 'openvino', got"):
-        build(backend="tensorrt")
 
 
 def test_missing_openvino_is_reported_with_its_extra(

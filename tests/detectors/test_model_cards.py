@@ -15,12 +15,9 @@ from crosscue.detectors.catalog.card import Input
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.networks.picture_input import prepared
 from crosscue.replay.errors import VehicleError
-from crosscue.testing import check_detector
 from support.data import shared
 from support.detecting import yolox_card
 from support.onnx_models import bright_box_model, constant_model
-
-CLASSES = ("sign", "car")
 
 
 def card(folder: Path, model: bytes, output: str, **more: str) -> Path:
@@ -73,16 +70,6 @@ def test_batched_detections_match_single_pictures(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found[0], found[1])
 
 
-@pytest.mark.parametrize(("decode", "width_px"), [("reduced", 128), ("full", None)])
-def test_card_sets_the_decoding_resolution(
-    tmp_path: Path, decode: str, width_px: int | None
-) -> None:
-    given = f'width_px = 128\nheight_px = 64\ndecode = "{decode}"'
-    detector = build(card=str(card(tmp_path, bright_box_model(), BRIGHT, input=given)))
-
-    assert detector.view.min_width_px == width_px
-
-
 def test_input_is_padded_and_normalised_by_the_card() -> None:
     pixels = np.random.default_rng(3).integers(0, 256, (20, 40, 3), np.uint8)
     expected_input = Input(
@@ -115,15 +102,6 @@ def test_tiles_find_objects_too_small_for_the_full_picture(tmp_path: Path) -> No
     np.testing.assert_allclose(found["tiles"].boxes_px, [[701, 251, 707, 257]], atol=1.0)
 
 
-def test_card_maps_labels(tmp_path: Path) -> None:
-    given = "width_px = 128\nheight_px = 64"
-    path = card(tmp_path, bright_box_model(), BRIGHT, input=given, labels='sign = "one way left"')
-
-    (found,) = detections_of(build(card=str(path)), frame(128, 64, (8, 8, 40, 24)))
-
-    assert found.labels == ("one way left",)
-
-
 def test_mask_has_the_size_of_the_camera_picture(tmp_path: Path) -> None:
     """The network's mask covers the left half of a box in the centre."""
     boxes = np.zeros((1, 2 + 4 + 32, 40), np.float32)
@@ -143,17 +121,6 @@ def test_mask_has_the_size_of_the_camera_picture(tmp_path: Path) -> None:
     expected_input[80:240, 160:320] = True
     np.testing.assert_array_equal(mask[:, :300], expected_input[:, :300])
     assert mask[:, 340:].sum() == 0
-
-
-def test_boxes_are_clipped_at_the_picture_and_dropped_outside(tmp_path: Path) -> None:
-    boxes = [[-8.0, -4.0, 20.0, 16.0, 0.9, 0.0], [70.0, 8.0, 90.0, 20.0, 0.8, 1.0]]
-    model = constant_model((1, 3, 32, 64), {"out": np.array([boxes], np.float32)})
-    path = card(tmp_path, model, BRIGHT)
-
-    (found,) = detections_of(build(card=str(path)), frame(640, 320, (0, 0, 1, 1)))
-
-    np.testing.assert_allclose(found.boxes_px, [[0, 0, 200, 160]])
-    check_detector(lambda: build(card=str(path)))
 
 
 @pytest.mark.parametrize(
@@ -223,11 +190,3 @@ def test_fully_convolutional_network_runs_at_the_size_of_the_card(
 
     assert large.labels.count("traffic light") > small.labels.count("traffic light")
     assert large.labels.count("car") > small.labels.count("car")
-
-
-def test_backends_agree_at_a_changed_input_size(tmp_path: Path) -> None:
-    first, second = (_yolox(tmp_path, 1280, 736, name) for name in ("onnxruntime", "openvino"))
-
-    assert first.labels == second.labels
-    np.testing.assert_allclose(first.boxes_px, second.boxes_px, atol=0.5)
-    np.testing.assert_allclose(first.scores, second.scores, atol=1e-3)

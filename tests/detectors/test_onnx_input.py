@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.networks.onnx_input import input_shape
 from crosscue.replay.errors import VehicleError
-from support.data import shared
 from support.detecting import yolox_card
 
 
@@ -60,12 +59,6 @@ def test_damaged_file_yields_an_error_or_a_valid_shape(noise: bytes, cut: int) -
         except ValueError:
             continue
         assert found is None or all(size is None or size > 0 for size in found)
-
-
-def test_input_shape_of_a_real_file_is_returned() -> None:
-    path = shared("weights", "yolox_nano", "yolox_nano.onnx")
-
-    assert input_shape(path.read_bytes()) == (1, 3, 416, 416)
 
 
 @pytest.mark.parametrize("backend", ["opencv", "onnxruntime"])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import View
-from crosscue.detectors.images import MAX_PIXELS, Encoded, decode, picture_size, reduction
+from crosscue.detectors.images import MAX_PIXELS, Encoded, decode, reduction
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
 
@@ -84,25 +84,6 @@ def test_raw_pictures_with_padded_rows_are_decoded(
     assert np.abs(pixels.astype(int) - 128).max() <= 1
 
 
-def test_rgb_and_bgr_pictures_decode_to_equal_colours() -> None:
-    rgb = Encoded("raw", memoryview(bytes([200, 10, 20]) * 4), (2, 2, 6, "rgb8"))
-    bgr = Encoded("raw", memoryview(bytes([20, 10, 200]) * 4), (2, 2, 6, "bgr8"))
-
-    assert (decode(rgb, COLOUR)[0] == decode(bgr, COLOUR)[0]).all()
-
-
-def test_exif_orientation_is_ignored() -> None:
-    jpeg = bytes(_encode(_ramp(), ".jpg").content)
-    tiff = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
-    exif = b"Exif\0\0" + tiff
-    turned = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + jpeg[2:]
-
-    pixels, size = decode(Encoded("jpeg", memoryview(turned)), COLOUR)
-
-    assert size == (64, 48)
-    assert pixels.shape == (48, 64, 3)
-
-
 def test_oversized_picture_is_refused_by_its_header() -> None:
     png = bytearray(_encode(_ramp(), ".png").content)
     png[16:24] = struct.pack(">II", 60_000, 60_000)
@@ -146,14 +127,3 @@ def test_truncated_picture_is_refused(suffix: str, fraction: float) -> None:
 
     with pytest.raises(LogFormatError):
         decode(Encoded(whole.coding, cut), COLOUR)
-
-
-@pytest.mark.parametrize("coding", ["h264", "tiff", "png"])
-def test_unsupported_picture_is_refused(coding: str) -> None:
-    with pytest.raises(LogError, match=f"{coding} picture without a size, or not decoded here"):
-        picture_size(Encoded(coding, memoryview(b"\0" * 64)))
-
-
-def test_raw_picture_shorter_than_its_size_is_refused() -> None:
-    with pytest.raises(LogFormatError, match="fewer bytes than its size needs"):
-        decode(Encoded("raw", memoryview(bytes(20)), (16, 10, 16, "mono8")), GREY)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from crosscue.detectors.training.reproducible import decides_bits, reproducible
 from crosscue.detectors.weights_file import serialised
 from support.mask_rcnn import write_bars
 from support.pictures import picture
@@ -64,14 +63,6 @@ def test_two_trainings_write_identical_files(folders: list[Path], network: str) 
     assert one == other
 
 
-def test_metadata_order_does_not_change_the_file() -> None:
-    tensors = {"b": torch.ones(3), "a": torch.zeros(2, dtype=torch.float16)}
-    metadata = {name: name for name in "zyxwvu"}
-    reversed_metadata = dict(reversed(metadata.items()))
-
-    assert serialised(tensors, metadata) == serialised(tensors, reversed_metadata)
-
-
 def test_metadata_and_weights_survive_a_round_trip(tmp_path: Path) -> None:
     from safetensors import safe_open
 
@@ -82,18 +73,3 @@ def test_metadata_and_weights_survive_a_round_trip(tmp_path: Path) -> None:
     with safe_open(path, "pt") as file:
         assert file.metadata() == metadata
         np.testing.assert_array_equal(file.get_tensor("t").numpy(), np.arange(5.0))
-
-
-def test_platform_facts_that_determine_the_bits_are_recorded() -> None:
-    found = decides_bits(torch.device("cpu"))
-
-    assert found["on.torch"] == torch.__version__.partition("+")[0]
-    assert found["on.threads"] == torch.get_num_threads()
-    assert found["on.is_reproducible"] == "bit for bit"
-
-
-def test_deterministic_setting_is_restored() -> None:
-    before = torch.are_deterministic_algorithms_enabled()
-    with reproducible(torch.device("cpu")):
-        assert torch.are_deterministic_algorithms_enabled()
-    assert torch.are_deterministic_algorithms_enabled() == before

@@ -11,17 +11,13 @@ import pytest
 import torch
 
 from crosscue.datasets.adapters.road_folder import load_folder
-from crosscue.detectors import rle
-from crosscue.detectors.base import Frame, RoadMask
-from crosscue.detectors.cues.road import road_fractions
 from crosscue.detectors.networks.road.checkpoint import RoadFacts, load_road, save_road
 from crosscue.detectors.networks.road.detector import build
-from crosscue.detectors.networks.road.network import RoadNetwork, embedded_road
+from crosscue.detectors.networks.road.network import RoadNetwork
 from crosscue.detectors.training.road import RoadSchedule, RoadTraining, road_score
 from crosscue.eval.cli import run
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import SchemaError, UsageError, VehicleError
-from crosscue.replay.vehicle.vehicle import Regions
 
 CPU = torch.device("cpu")
 
@@ -89,18 +85,6 @@ def test_state_of_another_seed_is_refused(tmp_path: Path) -> None:
         RoadTraining(RoadSchedule(seed=2), CPU).resume(tmp_path / "state")
 
 
-def test_road_checkpoint_survives_a_round_trip(tmp_path: Path) -> None:
-    network = RoadNetwork().eval()
-    save_road(tmp_path / "r.safetensors", network, RoadFacts(width_px=80, height_px=48))
-
-    again = load_road(tmp_path / "r.safetensors")
-
-    assert again.facts.width_px == 80
-    pictures = torch.rand(1, 3, 48, 80)
-    with torch.inference_mode():
-        torch.testing.assert_close(again.network(pictures), network(pictures), atol=0.02, rtol=0.02)
-
-
 def test_invalid_checkpoints_and_settings_are_refused(tmp_path: Path) -> None:
     whole = tmp_path / "r.safetensors"
     save_road(whole, RoadNetwork(), RoadFacts(width_px=80, height_px=48))
@@ -128,36 +112,6 @@ def test_invalid_checkpoints_and_settings_are_refused(tmp_path: Path) -> None:
         build(checkpoint=str(tmp_path / "none.safetensors"))
     with pytest.raises(VehicleError, match=r"probability"):
         build(probability=1.0)
-
-
-def masks(frames: list[Frame]) -> list[RoadMask]:
-    found = build(device="cpu")(frames)
-    given = [one for one in found if isinstance(one, RoadMask)]
-    assert len(given) == len(frames)
-    return given
-
-
-def test_every_picture_size_yields_a_road_mask() -> None:
-    rng = np.random.default_rng(0)
-    frames = [
-        Frame(1, "a", rng.integers(0, 255, (360, 640, 3), dtype=np.uint8), (1280, 720)),
-        Frame(2, "a", np.zeros((48, 64), np.uint8), (64, 48)),
-        Frame(3, "b", np.full((720, 1280, 3), 255, np.uint8), (1280, 720)),
-    ]
-
-    for mask, frame in zip(masks(frames), frames, strict=True):
-        assert (mask.t_ns, mask.size_px) == (frame.t_ns, frame.size_px)
-        assert rle.decode_mask(mask.mask, mask.mask_size_px).shape == mask.mask_size_px[::-1]
-        fractions = road_fractions(mask, Regions())
-        assert min(fractions.left, fractions.straight, fractions.right) >= 0.0
-
-
-def test_embedded_road_network_is_small_and_documented() -> None:
-    facts = load_road(embedded_road()).facts
-
-    assert embedded_road().stat().st_size < 2_000_000
-    assert str(facts.recipe["layouts"]).startswith("L")
-    assert float(facts.recipe["held_out_iou"]) > 0.9
 
 
 def folder(at: Path, n: int) -> Path:
@@ -254,10 +208,3 @@ def test_train_road_measures_a_network_without_training(capsys: pytest.CaptureFi
 def test_unavailable_device_is_reported() -> None:
     with pytest.raises(VehicleError, match="detector road: device cuda: not available"):
         build(device="cuda")
-
-
-def test_unwritable_output_is_reported(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert run(["train", "road", "--layouts", "L1", "-o", "/proc/nowhere/o.safetensors"]) == 1
-    assert "choose a writable folder" in capsys.readouterr().err

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 import crosscue
 from crosscue.detectors.base import Frame
-from crosscue.detectors.catalog.card import SegmentationOutput, read_card
 from crosscue.detectors.networks.model_detector import RoadModel, build
 from crosscue.eval import cli
 from crosscue.replay.errors import UsageError
@@ -53,15 +52,6 @@ def test_card_is_written_and_road_is_found(
     assert isinstance(detector, RoadModel)
     mask = detector.road_mask(Frame(0, "", np.zeros((64, 128, 3), np.uint8), (128, 64)))
     np.testing.assert_array_equal(mask.mean(axis=1), np.arange(size[1]) >= size[1] // 2)
-
-
-def test_class_numbers_are_read(tmp_path: Path) -> None:
-    numbers = scores((64, 32)).argmax(axis=1)
-    card = crosscue.draft_card(network(tmp_path, mask=numbers), classes="sky,road").path
-
-    output = read_card(card).output
-    assert isinstance(output, SegmentationOutput)
-    assert (output.classes, output.road) == (("sky", "road"), ("road",))
 
 
 def test_names_are_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import argparse
 import io
 import os
-import sys
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any, get_args
 
 import numpy as np
@@ -152,23 +150,6 @@ def test_each_architecture_is_recognised_by_its_tensors(
     assert size == wanted
 
 
-def test_nested_and_prefixed_weights_are_recognised(tmp_path: Path) -> None:
-    from crosscue.detectors.catalog.recognise_weights import recognise_weights
-
-    state = {
-        f"module.{name}": value
-        for name, value in hollow("ssdlite320_mobilenet_v3_large", 4).items()
-    }
-    torch.save({"model": state, "epoch": 7}, tmp_path / "my.pth")
-
-    _, guess = recognise_weights(tmp_path / "my.pth", None)
-
-    assert guess.reasons[:2] == (
-        "its weights are stored under 'model'",
-        "its tensor names begin with 'module.'",
-    )
-
-
 def test_coco_class_names_are_known_and_others_are_required(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -244,27 +225,6 @@ def test_unsupported_weights_are_refused_on_one_line(
     assert sorted(one.name for one in tmp_path.iterdir()) == ["my.pth"]
 
 
-def test_pickled_network_of_another_project_gets_the_one_hint_that_helps(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As yolov5n.pt: an object of the module models.yolo, whose tensors alone are of no use."""
-    project = ModuleType("models.yolo")
-    built = type("DetectionModel", (), {"__module__": project.__name__})
-    monkeypatch.setitem(sys.modules, "models", ModuleType("models"))
-    monkeypatch.setitem(sys.modules, project.__name__, project)
-    monkeypatch.setattr(project, "DetectionModel", built, raising=False)
-    path = tmp_path / "yolov5n.pt"
-    torch.save({"epoch": -1, "model": built()}, path)
-
-    with pytest.raises(crosscue.CrosscueError) as raised:
-        crosscue.draft_card(path)
-
-    message = str(raised.value)
-    assert "holds code or objects other than tensors (models.yolo.DetectionModel)" in message
-    assert message.endswith("; export the network to ONNX with the project that wrote it")
-    assert "state_dict" not in message
-
-
 def _oversized_archive() -> bytes:
     """Build an archive of zeros that declares an unpacked size above the limit."""
     content = io.BytesIO()
@@ -295,30 +255,6 @@ def test_damaged_weights_are_refused_on_one_line(
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
-
-
-def test_torchscript_archive_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "my.pt"
-    with zipfile.ZipFile(path, "w") as archive:
-        for name in ("data.pkl", "constants.pkl", "version"):
-            archive.writestr(f"my/{name}", b"\x80\x02N.")
-
-    assert run(["model", "init", str(path)]) in (1, 2)
-
-    assert "TorchScript archive carries code" in capsys.readouterr().err
-
-
-def test_crosscue_checkpoint_is_refused_because_it_needs_no_card(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from crosscue.detectors.networks.mask_rcnn.checkpoint import embedded_mask_rcnn
-
-    path = tmp_path / "own.safetensors"
-    path.write_bytes(embedded_mask_rcnn().read_bytes())
-
-    assert run(["model", "init", str(path)]) == 2
-
-    assert "it needs no card" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -354,14 +290,3 @@ def test_card_that_contradicts_its_weights_is_refused(
 
     assert message in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
-    state = hollow("ssdlite320_mobilenet_v3_large", 4)
-    state[MEAN] = torch.full((672,), torch.nan)
-    torch.save(state, tmp_path / "my.pth")
-
-    with pytest.raises(crosscue.VehicleError, match=f"{MEAN}: holds values that are not finite"):
-        crosscue.draft_card(tmp_path / "my.pth", class_names=NAMES)
-
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["my.pth"]

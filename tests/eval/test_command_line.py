@@ -8,15 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-import numpy as np
 import pytest
 
-from crosscue.eval import cli
 from crosscue.eval.command_line import Call, fill, with_options
-from crosscue.eval.terminal import print_found, watched
+from crosscue.eval.terminal import print_found
 from crosscue.replay.errors import UsageError
-from crosscue.replay.progress import emit
-from crosscue.results import Result, json_key, plain
+from crosscue.results import Result, json_key
 from crosscue.verb import HIDDEN, Option, compared, keywords
 
 
@@ -160,29 +157,6 @@ def test_errors_about_arguments_name_options(words: str, message: str) -> None:
     assert with_options(str(error.value), parser) == message
 
 
-def test_value_with_commas_is_named_with_its_option() -> None:
-    _, parser, _ = parsed("a")
-
-    assert with_options("label: 1,2, expected x,y", parser) == "--from 1,2: expected x,y"
-
-
-def test_message_of_the_work_leaves_json_on_stdout_alone(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    for has_json, quiet in ((False, False), (True, False), (False, True)):
-        with watched(argparse.Namespace(json=has_json, quiet=quiet)):
-            emit("step 1")
-
-    assert capsys.readouterr() == ("step 1\n", "step 1\n")
-
-
-def test_arrays_of_numpy_are_lists_in_json() -> None:
-    assert plain({"xy_m": np.array([1.0, 2.0]), "count": np.int64(3)}) == {
-        "xy_m": [1.0, 2.0],
-        "count": 3,
-    }
-
-
 def test_function_takes_fields_of_its_record_as_keywords() -> None:
     found = pack([Path("a")], colour="blue")
 
@@ -224,12 +198,3 @@ def test_undescribed_parameter_is_refused() -> None:
 
     with pytest.raises(TypeError, match="no description of size"):
         fill(argparse.ArgumentParser(), verb)
-
-
-@pytest.mark.parametrize("name", [n for n, where in cli.COMMANDS.items() if isinstance(where, str)])
-def test_summary_of_verb_is_that_of_its_function(name: str) -> None:
-    """The list of commands reads it from the source, without importing the module."""
-    _, parser = cli.parser_of(name)
-
-    first = str(parser.description).partition("\n")[0].removesuffix(".")
-    assert cli.summary_of(name) == first[0].lower() + first[1:]

@@ -128,14 +128,6 @@ def test_light_seen_from_first_frame_on_is_believed_as_long_as_the_car_stands(ki
     assert {**rest[-1].counts} == LIGHT
 
 
-def test_published_belief_counts_every_frame_of_a_standing_car() -> None:
-    """Equation 18 multiplies one message per frame: 0.95 twice is 0.9972."""
-    steps = believed([evidence((LIGHT, None, None, True))] * 2, Fusion(kind="source"))
-
-    found = [one.probabilities["intersection"] for one in steps]
-    assert found == pytest.approx([0.95, 0.95**2 / (0.95**2 + 0.05**2)])
-
-
 def left_while_standing(seen: Sequence[int], kind: str = "temporal") -> list[float]:
     """Return the belief in left, at two frames per second, after a light opened an approach."""
     light = [evidence((LIGHT, None, None, True), 2.0)] * 3

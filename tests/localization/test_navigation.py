@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from crosscue.localization.navigation import (
     NONE,
-    PLACES,
     Memory,
     Strategy,
     bearing_after,
@@ -61,29 +60,6 @@ def test_choice_without_options_is_refused() -> None:
 
 def _decided(memory: Memory, x: float, y: float, heading: float) -> Memory:
     return remember(memory, recognise(memory, x, y, RADIUS_M), x, y, heading, SAME_RAD)
-
-
-def test_penalty_grows_until_a_repeated_decision_changes() -> None:
-    memory, headings, bearings = empty_memory(), np.array([0.0, math.pi / 2]), np.array([0.1, 0.1])
-    taken = []
-    for visit in range(6):
-        # The estimated position differs slightly each time; the place is the same.
-        x, y = 3.0 * visit, -2.0 * visit
-        place = recognise(memory, x, y, RADIUS_M)
-        penalties = np.array([penalty(memory, place, h, SAME_RAD, EACH_RAD) for h in headings])
-        taken.append(choose_option(headings, bearings, penalties))
-        memory = _decided(memory, x, y, headings[taken[-1]])
-
-    assert taken[:3] == [0, 0, 0]
-    assert 1 in taken
-    assert memory.sizes[PLACES] == 1
-
-
-def test_distant_intersection_has_no_penalty() -> None:
-    memory = _decided(empty_memory(), 0.0, 0.0, 0.0)
-
-    assert recognise(memory, 100.0, 0.0, RADIUS_M) == NONE
-    assert penalty(memory, NONE, 0.0, SAME_RAD, EACH_RAD) == 0.0
 
 
 def test_memory_grows_beyond_its_initial_capacity() -> None:

@@ -54,12 +54,6 @@ def simulated_drive(truth: Truth, rng: np.random.Generator, sd_m: float = 0.5) -
     return KnownDrive(car, wrong_gyro(truth, rng), positions(truth, sd_m, rng), LEVER)
 
 
-def rms_m(found: KnownDrive, settings: OdometrySettings, fit: OdometryFit) -> float:
-    path = found.follow(fit.start, found.steps(settings))
-    off = (path.xy_m - found.fixes.xy_m)[FITTED:]
-    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
-
-
 @pytest.fixture(scope="module")
 def turning() -> tuple[KnownDrive, OdometryFit]:
     rng = np.random.default_rng(seed=4)
@@ -79,14 +73,6 @@ def test_turning_drive_recovers_scales_and_bias_within_four_sd(
         assert abs(shown[name].value - value) < 4.0 * shown[name].sd
         assert shown[name].sd < 0.5 * abs(value - getattr(CAR, name))
     assert fit.fix_sd_m == pytest.approx(0.5, rel=0.5)
-
-
-def test_fit_reduces_the_error_of_held_out_positions(
-    turning: tuple[KnownDrive, OdometryFit],
-) -> None:
-    found, fit = turning
-
-    assert rms_m(found, fit.settings, fit) < 0.2 * rms_m(found, CAR, fit)
 
 
 def test_nees_of_held_out_positions_is_in_its_band(
@@ -201,14 +187,3 @@ def test_start_pose_matches_and_rotates_with_the_first_positions() -> None:
     assert np.exp(1j * there.heading_rad) == pytest.approx(
         np.exp(1j * (here.heading_rad + 2.0)), abs=1e-9
     )
-
-
-def test_start_heading_of_a_stationary_car_is_unknown() -> None:
-    still = straight()
-    zero = np.zeros_like(still.xyh)
-    still = Truth(still.t_ns, zero, zero[:, 0], zero[:, 0])
-    odometry = integrate(wheels(still, CAR), CAR, gyro(still, CAR)).increments
-
-    found = start_pose(odometry, positions(still, 1.0, np.random.default_rng(0)), (0.0, 0.0))
-
-    assert found.hh == pytest.approx(np.pi**2)

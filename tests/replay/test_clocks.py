@@ -10,9 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.clocks.clock import Clock, times_of
-from crosscue.replay.clocks.order import forward_max, forward_min
-from crosscue.replay.clocks.periods import PeriodSketch
+from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.clocks.reports import ClockWatch, StampReport
 from crosscue.replay.columns import Int64s
 from support.clock_streams import SECOND_NS, START_NS, Stream, table_of, watch, watch_stream
@@ -59,76 +57,6 @@ def test_simulated_offset_and_drift_are_estimated(
     assert header.jumps == header.resets == 0
 
 
-def test_drift_error_matches_actual_error() -> None:
-    scaled = []
-    for seed in range(60):
-        line = header_report(Stream(1200, drift_ppm=80.0, wait_ns=4 * MS, seed=seed)).line
-        assert line is not None
-        assert line.drift_ppm is not None
-        assert line.drift_error_ppm is not None
-        scaled.append((line.drift_ppm - 80.0) / line.drift_error_ppm)
-
-    assert 0.6 < np.std(scaled) < 2.0
-
-
-@quick
-@given(
-    rows=st.lists(st.integers(0, 11), unique=True, max_size=4),
-    by_ms=st.lists(st.integers(60, 140) | st.integers(170, 40_000), min_size=4, max_size=4),
-    signs=st.lists(st.sampled_from([-1, 1]), min_size=4, max_size=4),
-    rows_per_block=st.sampled_from([17, 50, 700, 5000]),
-)
-def test_clock_jumps_are_counted_and_located(
-    rows: list[int], by_ms: list[int], signs: list[int], rows_per_block: int
-) -> None:
-    jumps = {100 + 140 * r: m * MS * s for r, m, s in zip(sorted(rows), by_ms, signs, strict=False)}
-    stream = Stream(1900, 50 * MS, 3 * SECOND_NS, 40.0, 2 * MS, jumps)
-
-    header = header_report(stream, rows_per_block)
-
-    log_ns = stream.log_ns()
-    assert header.jumps == len(jumps)
-    for step, (row, by_ns) in zip(header.jump_steps, jumps.items(), strict=True):
-        assert step.at_log_ns == log_ns[row]
-        assert abs(step.by_ns - by_ns) < 10 * MS
-    # A clock set back by over three periods is detected; a smaller step might be late rows.
-    assert header.resets == sum(by_ns < -160 * MS for by_ns in jumps.values())
-    assert header.line is not None
-    assert header.line.drift_ppm == pytest.approx(40.0, abs=60.0)
-
-
-def test_stalled_recorder_is_not_reported_as_jump() -> None:
-    stream = Stream(20_000, 1 * MS, wait_ns=MS // 10)
-    log_ns = stream.log_ns()
-    stalled = (log_ns > log_ns[8000]) & (log_ns < log_ns[8000] + SECOND_NS)
-    log_ns[stalled] = log_ns[8000] + SECOND_NS
-
-    header = watch(table_of("/s", log_ns, stream.header_ns())).header
-
-    assert header is not None
-    assert header.jumps == 0
-    assert header.gaps == 0
-    assert log_report(log_ns).gaps == 1
-
-
-def test_report_does_not_depend_on_block_size() -> None:
-    stream = Stream(9000, 10 * MS, 5 * MS, -30.0, MS, {4000: -SECOND_NS, 7000: 80 * MS})
-
-    assert watch_stream(stream, 9000) == watch_stream(stream, 37) == watch_stream(stream, 1)
-
-
-def test_report_is_available_before_the_end() -> None:
-    stream = Stream(9000, 10 * MS, wait_ns=MS)
-    block = table_of("/s", stream.log_ns(), stream.header_ns())
-    clock_watch = ClockWatch()
-    clock_watch.see(block.take(slice(0, 5000)))
-    half = clock_watch.reports()["/s"]
-    clock_watch.see(block.take(slice(5000, 9000)))
-
-    assert half == watch(block.take(slice(0, 5000)), 5000)
-    assert clock_watch.reports()["/s"].count == 9000
-
-
 @quick
 @given(
     gaps=st.dictionaries(st.integers(1, 1998), st.integers(600, 5000), max_size=60),
@@ -155,22 +83,6 @@ def test_gaps_beyond_the_kept_ones_are_counted() -> None:
     log = log_report(START_NS + np.cumsum(steps), 60_000)
 
     assert log.gaps == 6000 - 1
-
-
-@pytest.mark.slow
-@quick
-@given(
-    rows=st.lists(st.integers(1, 180), unique=True, max_size=20),
-    repeats=st.integers(1, 3),
-    rows_per_block=st.sampled_from([1, 100, 2000]),
-)
-def test_duplicates_are_counted_exactly(rows: list[int], repeats: int, rows_per_block: int) -> None:
-    log_ns = steady()
-    repeated = np.repeat(
-        log_ns, np.where(np.isin(np.arange(2000), [10 * r for r in rows]), 1 + repeats, 1)
-    )
-
-    assert log_report(repeated, rows_per_block).duplicates == repeats * len(rows)
 
 
 @pytest.mark.slow
@@ -223,52 +135,6 @@ def test_clock_set_back_is_counted_only_as_reset(
     assert (log.late_rows, log.gaps, log.duplicates) == (0, 0, 0)
 
 
-def test_clock_restarted_at_zero_is_reset_without_gap() -> None:
-    log_ns = np.concatenate([steady(500), np.arange(1, 501) * 10 * MS])
-
-    log = log_report(log_ns)
-
-    assert log.resets == 1
-    assert log.reset_steps[0].at_log_ns == 10 * MS
-    assert (log.gaps, log.late_rows, log.longest_step_ns) == (0, 0, 10 * MS)
-
-
-def test_gap_after_reset_is_counted() -> None:
-    after = np.arange(1, 501) * 10 * MS
-    after[300:] += SECOND_NS
-    log = log_report(np.concatenate([steady(500), after]))
-
-    assert (log.resets, log.gaps) == (1, 1)
-    assert log.longest_step_ns == SECOND_NS + 10 * MS
-
-
-def test_changing_clock_rate_increases_drift_error() -> None:
-    stream = Stream(1200, 50 * MS, wait_ns=MS)
-    bent_ns = stream.header_ns()
-    bent_ns[600:] += np.arange(600) * 10_000
-
-    straight, bent = (
-        header_report(stream).line,
-        watch(table_of("/s", stream.log_ns(), bent_ns)).header,
-    )
-
-    assert straight is not None
-    assert straight.drift_error_ppm is not None
-    assert bent is not None
-    assert bent.line is not None
-    assert bent.line.drift_error_ppm is not None
-    assert straight.drift_error_ppm < 5.0
-    assert bent.line.drift_error_ppm == pytest.approx(200.0 / 4.0, rel=0.2)
-
-
-def test_strictly_decreasing_times_yield_resets() -> None:
-    log = log_report(steady(200_000)[::-1], 50_000)
-
-    assert log.rows == 200_000
-    assert log.resets == pytest.approx(200_000 / 128, rel=0.01)
-    assert log_report(steady(20_000)[::-1], 5_000) == log_report(steady(20_000)[::-1], 777)
-
-
 @pytest.mark.parametrize(
     ("header", "unset", "why"),
     [
@@ -291,30 +157,6 @@ def test_inconsistent_header_stamp_is_not_used(header: Int64s, unset: int, why: 
     assert report.header.unset == unset
 
 
-def test_header_stamp_is_preferred_then_publish_time() -> None:
-    log_ns = steady()
-    good, bad = log_ns - 3 * MS, log_ns - 37 * SECOND_NS
-
-    assert watch(table_of("/s", log_ns, good, good)).used is Clock.HEADER
-    assert watch(table_of("/s", log_ns, bad, good)).used is Clock.PUBLISH
-    assert "header stamp is -37.0" in watch(table_of("/s", log_ns, bad, good)).why
-    assert watch(table_of("/s", log_ns, bad, log_ns)).used is Clock.LOG
-    assert watch(table_of("/s", log_ns, bad, bad)).used is Clock.LOG
-    assert watch(table_of("/s", log_ns)).why == "no other clock in the log"
-
-
-def test_unset_header_stamps_fall_back_to_log_time() -> None:
-    log_ns = steady(4)
-    header = log_ns - 7
-    header[1], header[2] = 0, -5
-    block = table_of("/s", log_ns, header)
-
-    np.testing.assert_array_equal(
-        times_of(block, Clock.HEADER), [header[0], log_ns[1], log_ns[2], header[3]]
-    )
-    np.testing.assert_array_equal(times_of(block, Clock.PUBLISH), log_ns)
-
-
 @quick
 @given(st.lists(st.integers(-(2**63), 2**63 - 1), max_size=300), st.integers(1, 200))
 def test_arbitrary_stamps_cause_no_overflow(stamps: list[int], per_block: int) -> None:
@@ -330,37 +172,6 @@ def test_arbitrary_stamps_cause_no_overflow(stamps: list[int], per_block: int) -
             assert stamp is not None
             assert stamp.rows + stamp.absurd + stamp.unset == len(stamps)
             assert stamp.longest_step_ns is None or stamp.longest_step_ns >= 0
-
-
-@quick
-@given(st.lists(st.integers(-(2**63), 2**63 - 1), min_size=1, max_size=60), st.integers(1, 70))
-def test_forward_windows_return_max_and_min(values: list[int], width: int) -> None:
-    column = np.array(values, dtype=np.int64)
-
-    assert forward_max(column, width).tolist() == [
-        max(values[i : i + width]) for i in range(len(values))
-    ]
-    assert forward_min(column, width).tolist() == [
-        min(values[i : i + width]) for i in range(len(values))
-    ]
-
-
-@quick
-@given(st.lists(st.integers(0, 2**61), min_size=1, max_size=300), st.floats(0.0, 1.0))
-def test_quantile_is_accurate_to_one_bin(steps: list[int], fraction: float) -> None:
-    sketch = PeriodSketch()
-    sketch.add(np.array(steps, dtype=np.int64), np.arange(len(steps), dtype=np.int64))
-
-    exact = sorted(steps)[int(fraction * (len(steps) - 1))]
-    assert sketch.quantile_ns(fraction) == pytest.approx(exact, rel=0.023, abs=1.0)
-
-
-def test_irregular_stream_has_no_gaps() -> None:
-    steps = np.random.default_rng(3).exponential(2 * MS, 50_000).astype(np.int64)
-    log = log_report(START_NS + np.cumsum(steps), 50_000)
-
-    assert not log.is_steady
-    assert log.gaps == 0
 
 
 def test_memory_is_independent_of_log_length() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.clocks.findings import apart, duration_text, findings, instant_text
+from crosscue.replay.clocks.findings import findings
 from crosscue.replay.clocks.reports import ClockWatch
 from crosscue.replay.columns import Block, Int64s
 from support.clock_streams import SECOND_NS, START_NS, Stream, table_of
@@ -27,27 +27,6 @@ def findings_of(*blocks: Block) -> tuple[str, ...]:
 
 def with_header(header_ns: Int64s) -> Block:
     return table_of("/camera", STREAM.log_ns(), header_ns)
-
-
-def test_healthy_log_has_no_findings() -> None:
-    other = replace(STREAM, period_ns=10 * MS, rows=6000, offset_ns=-4 * MS, drift_ppm=5.0)
-
-    assert (
-        findings_of(
-            with_header(STREAM.header_ns()), table_of("/imu", other.log_ns(), other.header_ns())
-        )
-        == ()
-    )
-
-
-def test_gaps_are_reported_with_position_of_longest() -> None:
-    log_ns = START_NS + 50 * MS * np.arange(1200, dtype=np.int64)
-    log_ns[400:] += 500 * MS
-    log_ns[800:] += 1150 * MS
-
-    assert findings_of(table_of("/camera", log_ns)) == (
-        "/camera: 2 gaps over 250 ms (5 periods), the longest 1.2 s at 40.45 s",
-    )
 
 
 @pytest.mark.parametrize(
@@ -125,56 +104,6 @@ def test_topics_without_common_clock_are_reported() -> None:
     assert "/can 0.00" in apart_all[0]
     assert "2025-11-13 02:13:20" in apart_all[0]
     assert [s.split(":")[0] for s in one_apart] == ["/can"]
-
-
-def test_single_latched_row_is_not_a_separate_clock() -> None:
-    latched = table_of("/tf_static", STREAM.log_ns()[:1] - 60 * SECOND_NS)
-
-    assert findings_of(latched, with_header(STREAM.header_ns())) == ()
-
-
-def test_old_latched_message_is_not_a_clock_offset() -> None:
-    log_ns = STREAM.log_ns()
-    latched = table_of("/map", log_ns[:1], log_ns[:1] - 900 * SECOND_NS)
-
-    assert findings_of(latched, with_header(STREAM.header_ns())) == ()
-
-
-def test_initial_queue_burst_is_not_a_jump() -> None:
-    log_ns, header_ns = STREAM.log_ns(), STREAM.header_ns()
-    log_ns[:20] = log_ns[20] - np.arange(20, 0, -1) * 10_000
-
-    reported = findings_of(table_of("/camera", log_ns, header_ns))
-
-    assert not any("jumps" in sentence for sentence in reported)
-
-
-def test_touching_spans_are_not_apart() -> None:
-    assert apart({"a": (0, 10), "b": (10, 20)}) == ()
-    assert apart({"a": (0, 10)}) == ()
-    assert apart({}) == ()
-
-
-@pytest.mark.parametrize(
-    ("ns", "text"),
-    [
-        (0, "0 ns"),
-        (999, "999 ns"),
-        (1500, "1.5 us"),
-        (20_000_000, "20 ms"),
-        (999_999_999, "1 s"),
-        (-1_234_000_000, "-1.23 s"),
-        (7_200 * SECOND_NS, "7200 s"),
-    ],
-)
-def test_duration_is_formatted_with_suitable_unit(ns: int, text: str) -> None:
-    assert duration_text(ns) == text
-
-
-def test_instant_is_formatted_as_date_only_for_unix_time() -> None:
-    assert instant_text(1_500_000_000) == "1.500 s"
-    assert instant_text(START_NS + 5 * MS) == "2025-11-13 02:13:20.005 UTC"
-    assert instant_text((1 << 62) - 1).startswith("2116-")
 
 
 @settings(max_examples=60, deadline=None)

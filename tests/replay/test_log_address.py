@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 import crosscue
-from crosscue.eval.logs.log import UnopenedLog
 from crosscue.replay.errors import LogError, UsageError, one_line, without_secrets
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
@@ -107,15 +106,6 @@ def test_every_url_of_a_long_text_loses_its_secrets() -> None:
     assert time.monotonic() - began < 2.0
 
 
-def test_other_object_of_a_store_is_opened_with_the_same_secrets() -> None:
-    pattern = LogAddress("https://user:hunter2@host/drives/*.log?sig=x")
-
-    other = pattern.at("https://host/drives/a.log")
-
-    assert other == "https://host/drives/a.log"
-    assert other.with_secrets() == "https://user:hunter2@host/drives/a.log?sig=x"
-
-
 def test_one_module_reads_the_complete_form() -> None:
     root = Path(crosscue.__file__).parent
     users = {
@@ -130,10 +120,6 @@ def test_one_module_reads_the_complete_form() -> None:
         "replay/remote/address.py",
         "replay/remote/logs.py",
     }
-
-
-def test_drive_that_is_not_open_does_not_show_its_addresses() -> None:
-    assert "hunter2" not in repr(UnopenedLog(("http://user:hunter2@host/a.log?hunter2",)))
 
 
 def test_error_of_a_store_carries_no_secret_in_any_attribute(

@@ -18,7 +18,7 @@ import pytest
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import create, locked
 from crosscue.replay.files import partial_file
-from crosscue.replay.files.partial_file import PARTIAL, PartialFile, Scratch, is_partial, sweep
+from crosscue.replay.files.partial_file import PARTIAL, Scratch, sweep
 from crosscue.replay.files.whole_file import write_text
 from support import faults, scenes
 
@@ -76,39 +76,6 @@ def test_files_of_other_programs_are_not_swept(tmp_path: Path) -> None:
     sweep(tmp_path, again=True)
 
     assert sorted(path.name for path in tmp_path.iterdir()) == before
-
-
-@pytest.mark.parametrize("name", ["ä" * 120, "x" * 255, "line\nbreak.json"])
-def test_any_valid_file_name_is_written(tmp_path: Path, name: str) -> None:
-    write_text(tmp_path / name, "whole")
-
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-def test_partial_files_are_kept_without_file_locks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    left = tmp_path / f".a.crosscue-{'0' * 16}.partial"
-    left.write_text("half")
-    monkeypatch.setattr(partial_file, "lock", lambda _: None)
-
-    write_text(tmp_path / "b.txt", "b")
-
-    assert left.exists()
-    assert (tmp_path / "b.txt").read_text() == "b"
-
-
-def test_kept_or_dropped_partial_file_is_closed(tmp_path: Path) -> None:
-    open_before = len(list(Path("/proc/self/fd").iterdir()))
-    kept, dropped = PartialFile(tmp_path / "a"), PartialFile(tmp_path / "b")
-    assert is_partial(kept.path.name)
-
-    kept.keep()
-    dropped.drop()
-    dropped.drop()
-
-    assert [path.name for path in tmp_path.iterdir()] == ["a"]
-    assert len(list(Path("/proc/self/fd").iterdir())) == open_before
 
 
 def test_temporary_folders_of_killed_processes_are_removed(

@@ -35,14 +35,6 @@ def test_results_of_other_processes_are_ordered() -> None:
     assert os.getpid() not in {process for _, process in found}
 
 
-@pytest.mark.parametrize(("items", "workers"), [([1, 2, 3], 1), ([4], 8), ([], 8)])
-def test_one_worker_or_item_runs_in_this_process(items: list[int], workers: int) -> None:
-    found = list(in_processes(slow_square, items, workers))
-
-    assert [square for square, _ in found] == [number * number for number in items]
-    assert {process for _, process in found} <= {os.getpid()}
-
-
 @pytest.mark.parametrize("workers", [1, 2])
 def test_failure_is_raised_after_earlier_results(workers: int) -> None:
     found = in_processes(fail_at_two, range(4), workers)

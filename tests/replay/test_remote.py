@@ -10,13 +10,10 @@ import pytest
 
 from crosscue.replay.errors import LogError, LogTooLargeError, OutputError, UsageError
 from crosscue.replay.files.identity import SHARE_BYTES, log_identity
-from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
-from crosscue.replay.remote.address import is_remote
-from crosscue.replay.remote.logs import Store, fetch_log, matches
+from crosscue.replay.remote.logs import Store, fetch_log
 from support.can_files import candump, random_frames
-from support.can_files import read_back as read_file
 
 
 @pytest.fixture
@@ -34,22 +31,6 @@ def _put(url: str, content: bytes) -> str:
     with import_module("fsspec").open(url, "wb") as file:
         file.write(content)
     return url
-
-
-def test_remote_log_reads_like_local_log(bucket: str, tmp_path: Path) -> None:
-    frames = random_frames(300)
-    here = tmp_path / "can.log"
-    here.write_bytes(candump(frames))
-    url = _put(f"{bucket}/drives/can.log", candump(frames))
-
-    with open_log(url) as log:
-        ledger = Ledger(url)
-        rows = sum(len(block) for block in log.read(ledger))
-        assert (log.format, log.path.name) == ("candump", "can.log")
-        assert {topic.name for topic in log.topics} == {"can1", "can2"}
-
-    assert rows == sum(map(len, read_file(here)[0].values())) == 300
-    assert ledger.is_whole
 
 
 def test_log_is_fetched_once_until_it_changes(bucket: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,20 +53,6 @@ def test_log_is_fetched_once_until_it_changes(bucket: str, monkeypatch: pytest.M
     with fetch_log(url) as fetched:
         assert fetched.path.read_bytes() == b"two"
     assert len(fetches) == 2
-
-
-def test_folder_and_companion_files_are_fetched(bucket: str) -> None:
-    for name in ("bag/metadata.yaml", "bag/part/a.db3", "v.mp4", "v.csv", "v.mp4.txt", "vv.csv"):
-        _put(f"{bucket}/{name}", name.encode())
-
-    with fetch_log(f"{bucket}/bag/") as folder, fetch_log(f"{bucket}/v.mp4") as video:
-        assert folder.path.name == "bag"
-        assert (folder.path / "part" / "a.db3").read_bytes() == b"bag/part/a.db3"
-        assert sorted(p.name for p in video.path.parent.iterdir()) == [
-            "v.csv",
-            "v.mp4",
-            "v.mp4.txt",
-        ]
 
 
 @pytest.mark.parametrize(
@@ -192,19 +159,6 @@ def test_file_url_is_read_in_place(tmp_path: Path) -> None:
 
     with open_log(path.as_uri()) as log:
         assert log.path == path
-
-
-def test_pattern_matches_urls(bucket: str) -> None:
-    for name in ("a/x.mcap", "b/x.mcap", "b/y.log"):
-        _put(f"{bucket}/{name}", b"")
-
-    assert matches(f"{bucket}/*/x.mcap") == (f"{bucket}/a/x.mcap", f"{bucket}/b/x.mcap")
-
-
-def test_only_strings_with_a_scheme_are_remote() -> None:
-    assert is_remote("s3://bucket/a.mcap")
-    assert not is_remote("folder/a.mcap")
-    assert not is_remote(Path("s3://bucket/a.mcap"))
 
 
 def test_negative_store_limit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from mcap.writer import Writer
 from crosscue.eval.cli import run as crosscue
 from crosscue.replay.base import Selection
 from crosscue.replay.columns import Block, Images, Messages, Topic
-from crosscue.replay.files.identity import SHARE_BYTES, log_identity
+from crosscue.replay.files.identity import log_identity
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
@@ -204,19 +204,6 @@ def test_remote_identity_equals_local_identity(
     assert log_identity(f"{web.base}/deep/{path.name}") != there
 
 
-@pytest.mark.parametrize("name", ["can.log", "can.blf", "can.MF4", "drive.db3", "front.mp4"])
-def test_identity_of_large_remote_log_transfers_a_fraction(
-    name: str, tmp_path: Path, web: Served
-) -> None:
-    path = tmp_path / name
-    path.write_bytes(np.random.default_rng(3).bytes(3 * SHARE_BYTES))
-    web.files[f"deep/{name}"] = path.read_bytes()
-
-    assert log_identity(f"{web.base}/deep/{name}") == log_identity(path)
-    assert web.sent <= 1.02 * SHARE_BYTES
-    assert not list((tmp_path / "store").glob("*/log"))
-
-
 @pytest.mark.slow
 def test_estimate_of_remote_window_transfers_only_the_window(
     drive: Path, tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
@@ -239,24 +226,6 @@ def test_estimate_of_remote_window_transfers_only_the_window(
     del web.files["drive.mcap"]
     assert crosscue(["estimate", str(out), "-q"]) == 4
     assert {one.name: one.read_bytes() for one in out.glob("*.parquet")} == before
-
-
-@pytest.mark.slow
-def test_estimate_of_complete_remote_log_uses_local_copy(
-    drive: Path, tmp_path: Path, web: Served
-) -> None:
-    web.files["drive.mcap"] = drive.read_bytes()
-    out = tmp_path / "out"
-    call = ["replay", f"{web.base}/drive.mcap", "-o", str(out), "-q", "--detectors", BRIGHT]
-    assert crosscue([*call, "--no-cache"]) == 0
-    before = {one.name: one.read_bytes() for one in out.glob("*.parquet")}
-    assert before
-    web.sent = 0
-
-    assert crosscue(["estimate", str(out), "-q"]) == 0
-
-    assert {one.name: one.read_bytes() for one in out.glob("*.parquet")} == before
-    assert web.sent <= 2 * FIXED_BYTES
 
 
 @pytest.mark.slow

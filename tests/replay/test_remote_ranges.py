@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from crosscue.eval.cli import run as crosscue
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block
 from crosscue.replay.errors import LogError
@@ -88,16 +87,6 @@ def test_window_of_remote_mcap_transfers_only_its_chunks(tmp_path: Path, web: Se
     assert not (tmp_path / "store").exists()
 
 
-def test_one_topic_of_remote_log_is_read(tmp_path: Path, web: Served) -> None:
-    web.files["log.mcap"] = mcap_log(tmp_path / "log.mcap").read_bytes()
-
-    with open_log(f"{web.base}/log.mcap") as log:
-        part = read_topic(log, "/speed", 1_000 * MS, 1_050 * MS)
-
-    assert len(part) == 5
-    assert part.ledger.log.startswith("http://")
-
-
 @pytest.mark.slow
 def test_window_of_remote_bag_transfers_only_its_chunks(tmp_path: Path, web: Served) -> None:
     rows = rows_of(20_000)
@@ -169,19 +158,6 @@ def test_lost_connection_is_retried_a_limited_number_of_times(tmp_path: Path, we
         web.failing = 1000
         with pytest.raises(LogError, match=r"could not be read in 3 tries .*check the conn"):
             list(log.read(Ledger("there"), Selection(None, 30_000 * MS, 31_000 * MS)))
-
-
-def test_decode_of_remote_window_transfers_only_a_part(
-    tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = mcap_log(tmp_path / "log.mcap")
-    web.files["log.mcap"] = path.read_bytes()
-    call = ["decode", f"{web.base}/log.mcap", "-o", str(tmp_path / "out"), "--topics", "/speed"]
-
-    status = crosscue([*call, "--from", "10", "--to", "12"])
-
-    assert status == 0, capsys.readouterr().err
-    assert web.sent < 0.4 * path.stat().st_size
 
 
 @pytest.mark.slow

@@ -8,25 +8,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import asammdf
 import numpy as np
 import pytest
 
 from crosscue.eval.cli import run
-from crosscue.eval.fit.log_images import log_span
-from crosscue.eval.runs.stored_images import StoredCamera, read_pictures
 from crosscue.replay.base import Selection
-from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.errors import LogError
 from crosscue.replay.formats import FORMATS
 from crosscue.replay.ledger import CHANGED, DIFFERS, Ledger
 from crosscue.replay.limits import MIB
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.losses import losses_heard
 from crosscue.replay.seal import seal as sealing
 from crosscue.replay.seal.seal import digests_of, read_seal, seal_path
 from support.accounted import read
-from support.can_files import blf, candump, random_frames
+from support.can_files import candump, random_frames
 from support.every_format import EVERY_FORMAT
 from support.pictures import picture_folder
 from support.rosbag_files import rows_of, write_bag, write_folder
@@ -116,33 +111,6 @@ def test_changed_byte_is_reported_with_its_block(
     assert f"{name}: bytes 0 to {size} differ from the seal" in capsys.readouterr().err
 
 
-def test_changed_block_is_located_to_one_mib_and_still_read(long_log: Path) -> None:
-    rows = sum(len(block) for block in read(long_log)[0])
-    # A digit of a payload: the line remains valid, and no reader can detect it.
-    at = long_log.read_bytes().index(b"#AA", 2 * MIB) + 2
-    text = bytearray(long_log.read_bytes())
-    text[at : at + 1] = b"B"
-    long_log.write_bytes(text)
-
-    blocks, ledger = read(long_log)
-
-    (drop,) = ledger.drops()
-    assert (drop.reason, drop.count) == (DIFFERS, None)
-    assert drop.detail == f"can.log: bytes {2 * MIB} to {3 * MIB}"
-    assert sum(len(block) for block in blocks) == rows
-    assert "some differ" in ledger.integrity
-
-
-def test_adjacent_changed_blocks_are_one_span(long_log: Path) -> None:
-    for at in (5, MIB + 5, 3 * MIB + 5):
-        _flip(long_log, at)
-
-    spans = [drop.detail for drop in read(long_log)[1].drops() if drop.reason == DIFFERS]
-
-    size = long_log.stat().st_size
-    assert spans == [f"can.log: bytes 0 to {2 * MIB}", f"can.log: bytes {3 * MIB} to {size}"]
-
-
 @pytest.mark.slow
 def test_commands_report_changed_block_of_sealed_log(
     long_log: Path, capsys: pytest.CaptureFixture[str]
@@ -155,37 +123,6 @@ def test_commands_report_changed_block_of_sealed_log(
     assert f"can.log: bytes {MIB} to {2 * MIB}" in " ".join(capsys.readouterr().err.split())
     assert run(["info", str(long_log)]) == 3
     assert f"can.log: bytes {MIB} to {2 * MIB}" in " ".join(capsys.readouterr().out.split())
-
-
-def test_reader_without_ledger_warns_and_command_exits_with_3(
-    long_log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    where = f"can.log: bytes {MIB} to {2 * MIB}"
-    draft = ["vehicle", "init", str(long_log), "-o", str(tmp_path / "v.toml"), "--overwrite"]
-    assert run(draft) == 0
-    _flip(long_log, long_log.read_bytes().index(b"#AA", MIB) + 2)
-
-    with losses_heard() as warned:
-        log_span(long_log)
-        log_span(long_log)
-    assert sum(where in loss for loss in warned) == 1
-    assert run(draft) == 3
-    assert where in capsys.readouterr().err
-
-
-def test_stored_pictures_are_checked_against_seal(tmp_path: Path) -> None:
-    log = picture_folder(tmp_path / "front", 12, "rate_hz: 10\n")
-    assert run(["seal", str(log)]) == 0
-    with open_log(log) as opened:
-        (topic,) = opened.topics
-    camera = StoredCamera(log, topic, Clock.LOG, Selection())
-    (log / "frame_3.png").write_bytes((log / "frame_4.png").read_bytes())
-
-    with losses_heard() as warned:
-        read_pictures(camera, lambda t_ns, picture: None)
-
-    assert warned
-    assert "frame_3.png" in "".join(warned)
 
 
 @pytest.mark.parametrize("is_cut", [True, False])
@@ -252,24 +189,6 @@ def test_info_shows_whether_log_is_sealed(
         assert f"sealed at {sealed_at} (xxh3_128" in " ".join(capsys.readouterr().out.split())
 
 
-def test_log_and_seal_can_be_renamed_together(tmp_path: Path) -> None:
-    log = _sealed(tmp_path, "rosbag1")
-    moved = log.rename(tmp_path / "other.bag")
-    seal_path(log).rename(seal_path(moved))
-
-    assert "none differs" in read(moved)[1].integrity
-    _flip(moved, moved.stat().st_size // 2)
-    assert "other.bag: bytes 0 to" in _losses_text(moved)
-
-
-def test_time_file_of_video_is_sealed(tmp_path: Path) -> None:
-    film = _sealed(tmp_path, "video")
-
-    assert set(read_seal(seal_path(film)).files) == {".", "front.txt"}
-    _flip(tmp_path / "front.txt", 30)
-    assert "front.txt" in _losses_text(film)
-
-
 @pytest.mark.parametrize("suffix", ["-wal", "-journal"])
 def test_journal_of_sqlite_log_is_sealed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], suffix: str
@@ -334,23 +253,6 @@ def test_damaged_seal_is_refused_in_one_line(
     assert run(["seal", str(log)]) == 1
 
 
-def test_damaged_seal_never_reports_a_different_log(tmp_path: Path) -> None:
-    log = _sealed(tmp_path, "candump")
-    original, original_seal = seal_path(log).read_bytes(), read_seal(seal_path(log))
-    refused = 0
-    for at in range(0, len(original) - 1, 7):
-        text = bytearray(original)
-        text[at] ^= 1
-        seal_path(log).write_bytes(text)
-        try:
-            assert read_seal(seal_path(log)) == original_seal
-        except LogError:
-            refused += 1
-
-    # Only a change of white space between tokens is harmless.
-    assert refused > 0.6 * len(original) / 7
-
-
 @pytest.mark.parametrize(
     ("argv", "status", "why"),
     [
@@ -384,27 +286,6 @@ def test_convert_does_not_overwrite_a_sealed_log(
     assert out.read_bytes() == before
 
 
-def test_log_with_longest_file_name_is_read(tmp_path: Path) -> None:
-    log = tmp_path / ("x" * 251 + ".log")
-    log.write_bytes(candump(random_frames(30)))
-
-    assert read(log)[1].is_whole
-
-
-def test_hidden_files_and_circular_links_are_not_sealed(tmp_path: Path) -> None:
-    log = picture_folder(tmp_path / "front", 3, "rate_hz: 10\n")
-    (log / ".hidden").write_bytes(b"x")
-    (log / "again").symlink_to(log)
-    assert run(["seal", str(log)]) == 0
-
-    assert set(read_seal(seal_path(log)).files) == {
-        "frame_0.png",
-        "frame_1.png",
-        "frame_2.png",
-        "timestamps.txt",
-    }
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mcap", "rosbag1"])
 def test_window_of_indexed_log_checks_only_its_blocks(tmp_path: Path, kind: str) -> None:
@@ -436,73 +317,6 @@ def test_window_of_indexed_log_checks_only_its_blocks(tmp_path: Path, kind: str)
     at = rows[10].payload[4:20]
     _flip(log, log.read_bytes().index(at)) if at in log.read_bytes() else _flip(log, 5000)
     assert losses(early) == [f"{log.name}: bytes 0 to {MIB}"]
-
-
-# Folder of the pictures of each format.
-_PICTURES = {"kitti-raw": "image_02/data", "pandaset": "camera/front_camera"}
-
-
-def _window_case(kind: str, folder: Path) -> tuple[Path, Selection, dict[str, bool]]:
-    """Return a log, a window at its beginning, and for each of two files whether it is read."""
-    if kind == "images":
-        times = "".join(f"{0.5 * i:.1f}\n" for i in range(12))
-        log = picture_folder(folder / "front", 12, times)
-        return log, Selection(end_ns=1_000_000_000), {"frame_0.png": True, "frame_9.png": False}
-    if kind in ("kitti-raw", "pandaset"):
-        log = EVERY_FORMAT[kind](folder)
-        place = _PICTURES[kind]
-        first = min(int(block.log_ns[0]) for block in read(log)[0])
-        pictures = sorted(log.glob(f"{place}/*.*g"))
-        early, late = (str(one.relative_to(log)) for one in (pictures[0], pictures[-1]))
-        window = Selection(end_ns=first + 300_000_000)
-        return log, window, {early: True, late: False}
-    if kind == "blf":
-        log = folder / "can.blf"
-        frames = random_frames(60_000, step_ns=1_000_000)
-        log.write_bytes(blf(frames, stored=True, container=60_000))
-    else:
-        log = folder / "x.mf4"
-        at_s = np.arange(400_000) * 1e-3
-        with asammdf.MDF(version="4.10") as mdf:
-            mdf.configure(write_fragment_size=1 << 18)
-            mdf.append([asammdf.Signal(at_s * 3.0, at_s, name="speed")], acq_name="drive")
-            mdf.save(log, compression=0)
-    assert log.stat().st_size > 3 * MIB
-    begin = int(read(log)[0][0].log_ns[0])
-    return log, Selection(end_ns=begin + 500_000_000), {}
-
-
-@pytest.mark.parametrize("kind", ["blf", "mf4", "images", "kitti-raw", "pandaset"])
-def test_window_checks_only_blocks_that_it_reads(tmp_path: Path, kind: str) -> None:
-    log, window, files = _window_case(kind, tmp_path)
-    assert run(["seal", str(log)]) == 0
-    total = read_seal(seal_path(log)).blocks
-
-    def losses(selection: Selection) -> tuple[int, list[str]]:
-        ledger = Ledger(str(log))
-        with open_log(log) as opened:
-            for _ in opened.read(ledger, selection):
-                pass
-        found = re.search(r"(\d+) of \d+ blocks", ledger.integrity)
-        details = [drop.detail for drop in ledger.drops() if drop.reason == DIFFERS]
-        return int(found[1]) if found else total, details
-
-    checked, none = losses(window)
-    assert 0 < checked < total
-    assert not none
-    # A byte of a payload, or one that no decoder reads: only the seal can detect it.
-    if not files:
-        at = int(log.stat().st_size * 0.6)
-        _flip(log, at)
-        assert losses(window) == (checked, [])
-        begin = at // MIB * MIB
-        assert f"{log.name}: bytes {begin} to {begin + MIB}" in losses(Selection())[1]
-        return
-    for name, is_read in files.items():
-        size = (log / name).stat().st_size
-        _flip(log / name, size - 1)
-        assert losses(window) == (checked, [f"{name}: bytes 0 to {size}"] if is_read else [])
-        _flip(log / name, size - 1)
 
 
 def test_file_of_sealed_folder_is_checked_against_folder_seal(
@@ -566,12 +380,3 @@ def test_interrupted_seal_leaves_files_unchanged(
         assert "Traceback" not in capsys.readouterr().err
     assert seal_path(long_log).read_bytes() == before
     assert sorted(path.name for path in long_log.parent.iterdir()) == names
-
-
-def test_sealing_reports_its_progress_in_bytes(long_log: Path) -> None:
-    work = sealing.Sealing(long_log)
-    done = list(work)
-
-    assert work.total == long_log.stat().st_size == done[-1]
-    assert done == sorted(done)
-    assert len(done) == read_seal(seal_path(long_log)).blocks

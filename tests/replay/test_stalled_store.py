@@ -10,13 +10,9 @@ from pathlib import Path
 import pytest
 
 from crosscue.eval.cli import run as crosscue
-from crosscue.replay.errors import LogError, UnknownFormatError
-from crosscue.replay.files.identity import log_identity
-from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.remote import ranges as remote_ranges
 from crosscue.replay.remote import waiting
-from crosscue.replay.remote.logs import fetch_log
 from support.can_files import candump, random_frames
 from support.every_format import EVERY_FORMAT
 from support.range_server import Served, serving
@@ -43,28 +39,6 @@ def test_presigned_log_is_read_like_a_local_one(
 
     assert f"{web.base}/a.log " in capsys.readouterr().out
     assert {path for path in web.requests if "log" not in path} == set()
-
-
-def test_new_signature_of_the_same_log_does_not_fetch_it_again(web: Served) -> None:
-    web.files["a.log"] = candump(random_frames(50))
-    with fetch_log(f"{web.base}/a.log{SIGNED}") as first:
-        sent = web.sent
-        with fetch_log(f"{web.base}/a.log?X-Amz-Signature=other") as second:
-            assert second.path == first.path
-
-    assert web.sent == sent > 0
-
-
-@pytest.mark.parametrize("name", ["a.xyz", "download", "bag/", "a.log.gz", "a"])
-@pytest.mark.parametrize("use", [open_log, fetch_log, log_identity])
-def test_unknown_suffix_sends_no_request(name: str, use: object, web: Served) -> None:
-    web.files[name] = b"content"
-    assert callable(use)
-
-    with pytest.raises(UnknownFormatError, match="unknown; there are: MCAP"):
-        use(f"{web.base}/{name}{SIGNED}")
-
-    assert not web.requests
 
 
 @pytest.mark.parametrize("command", ["info", "replay -o OUT", "replay --each -o OUT"])
@@ -122,25 +96,3 @@ def test_limits_are_those_that_the_page_states() -> None:
     assert f"after {waiting.NOTICE_S:g} s" in page
     assert f"after {waiting.LIMIT_S:g} s" in page
     assert remote.CHUNK_BYTES == remote_ranges.PIECE == 4 << 20
-
-
-def test_stall_of_a_call_from_python_is_a_warning(
-    web: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(waiting, "NOTICE_S", 0.2)
-    monkeypatch.setattr(waiting, "LIMIT_S", 0.4)
-    web.files["a.log"] = candump(random_frames(50))
-    web.stalling = "headers"
-
-    with (
-        pytest.warns(RuntimeWarning, match=r"no answer to a request for 0\.2 s"),
-        pytest.raises(LogError, match=r"no answer to a request for 0\.4 s"),
-    ):
-        open_log(f"{web.base}/a.log")
-
-
-def test_log_is_opened_twice_in_one_process(web: Served) -> None:
-    web.files["a.log"] = candump(random_frames(50))
-
-    with open_log(f"{web.base}/a.log") as first, open_log(f"{web.base}/a.log?new") as second:
-        assert first.path == second.path

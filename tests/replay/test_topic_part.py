@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from crosscue.replay.columns import Messages, Table
+from crosscue.replay.columns import Messages
 from crosscue.replay.errors import UsageError
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.logs.topic_part import read_topic
@@ -28,21 +28,6 @@ def two_topic_log(path: Path) -> Path:
             writer.add_message(other, i, b"%d" % i, i)
         writer.finish()  # type: ignore[no-untyped-call]
     return path
-
-
-def test_rows_of_time_range_are_read_as_columns(tmp_path: Path) -> None:
-    with open_log(two_topic_log(tmp_path / "x.mcap")) as log:
-        part = read_topic(log, "/speed", 50, 75)
-
-    values: list[float] = []
-    for block in part.blocks:
-        assert isinstance(block.rows, Table)
-        values += block.rows["x"].tolist()
-    assert values == list(range(50, 75))
-    assert len(part) == 25
-    assert part.ledger.is_whole
-    assert part.ledger.accounts["/speed"].skipped == {"outside --from/--to": 175}
-    assert part.ledger.accounts["/other"].skipped == {"topic not selected": 200}
 
 
 def test_unknown_type_is_read_as_messages(tmp_path: Path) -> None:

@@ -37,17 +37,3 @@ def test_dbc_paths_are_relative_to_vehicle_file(tmp_path: Path) -> None:
     (tmp_path / "car.toml").write_text('version = 1\n[can]\ndbc = ["bus.dbc"]\n')
 
     assert load(tmp_path / "car.toml").can.dbc == (str((tmp_path / "bus.dbc").resolve()),)
-
-
-def test_missing_vehicle_file_error_names_init_command(tmp_path: Path) -> None:
-    with pytest.raises(VehicleError, match="crosscue vehicle init"):
-        load(tmp_path / "none.toml")
-
-
-def test_misspelt_key_of_cue_suggests_correct_key() -> None:
-    with pytest.raises(VehicleError, match="no such key; did you mean precision"):
-        parse(
-            "version = 1\n[fusion.cues]\nzebra = { precison = 0.8, precision = 0.8, "
-            "supports = ['left'] }\n",
-            "v.toml",
-        )

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.replay.versions import commit, versions, versions_and_commit
+from crosscue.replay.versions import commit
 
 
 def _git(folder: Path, *words: str) -> str:
@@ -36,18 +36,3 @@ def test_commit_equals_git_head(checkout: Path) -> None:
     _git(checkout, "checkout", "--detach")
     commit.cache_clear()
     assert commit(checkout) == head
-
-
-def test_folder_without_commit_returns_none(tmp_path: Path) -> None:
-    (tmp_path / ".git").mkdir()
-    (tmp_path / ".git/HEAD").write_text("nonsense")
-
-    assert commit(tmp_path) is None
-
-
-def test_commit_is_added_to_versions_separately() -> None:
-    with_commit = versions_and_commit()
-
-    assert "crosscue_commit" not in versions()
-    assert versions().items() <= with_commit.items()
-    assert with_commit.keys() - versions().keys() <= {"crosscue_commit"}

@@ -3,13 +3,11 @@
 from collections.abc import Iterator
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.base import EVERYTHING
-from crosscue.replay.columns import Block, Topic
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.columns import Block
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.signals.extractor import SampleExtractor
 from crosscue.replay.signals.kinds import Signal
@@ -106,13 +104,6 @@ def test_rows_that_arrive_too_late_are_skipped_and_counted() -> None:
     assert sum(len(w.samples[Signal.WHEEL_SPEEDS].t_ns) for w in found) == 10
     assert ledger.topic("wheels").skipped == {"too late to be put in order": 1}
     assert ledger.topic("wheels").used == 10
-
-
-def test_two_topics_for_one_role_are_refused_and_listed() -> None:
-    other = Topic("imu2", "sensor_msgs/msg/Imu", "columns")
-
-    with pytest.raises(VehicleError, match=r"gyro, imu2; name one as topics\.imu"):
-        plan([(0, GYRO), (0, other)], Vehicle(version=1))
 
 
 def test_rows_without_required_column_are_skipped_and_counted() -> None:

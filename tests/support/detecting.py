@@ -9,95 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from crosscue.detectors.base import Detections, Found, Frame, View
+from crosscue.detectors.catalog.class_names import COCO_80
 from crosscue.detectors.settings import Settings, identity_of, settings_of
 
 from .data import shared
-
-COCO = tuple(
-    name.replace("_", " ")
-    for name in [
-        "person",
-        "bicycle",
-        "car",
-        "motorbike",
-        "aeroplane",
-        "bus",
-        "train",
-        "truck",
-        "boat",
-        "traffic_light",
-        "fire_hydrant",
-        "stop_sign",
-        "parking_meter",
-        "bench",
-        "bird",
-        "cat",
-        "dog",
-        "horse",
-        "sheep",
-        "cow",
-        "elephant",
-        "bear",
-        "zebra",
-        "giraffe",
-        "backpack",
-        "umbrella",
-        "handbag",
-        "tie",
-        "suitcase",
-        "frisbee",
-        "skis",
-        "snowboard",
-        "sports_ball",
-        "kite",
-        "baseball_bat",
-        "baseball_glove",
-        "skateboard",
-        "surfboard",
-        "tennis_racket",
-        "bottle",
-        "wine_glass",
-        "cup",
-        "fork",
-        "knife",
-        "spoon",
-        "bowl",
-        "banana",
-        "apple",
-        "sandwich",
-        "orange",
-        "broccoli",
-        "carrot",
-        "hot_dog",
-        "pizza",
-        "donut",
-        "cake",
-        "chair",
-        "sofa",
-        "pottedplant",
-        "bed",
-        "diningtable",
-        "toilet",
-        "tvmonitor",
-        "laptop",
-        "mouse",
-        "remote",
-        "keyboard",
-        "cell_phone",
-        "microwave",
-        "oven",
-        "toaster",
-        "sink",
-        "refrigerator",
-        "book",
-        "clock",
-        "vase",
-        "scissors",
-        "teddy_bear",
-        "hair_drier",
-        "toothbrush",
-    ]
-)
 
 
 class BrightSettings(Settings):
@@ -157,7 +72,7 @@ def yolox_card(folder: Path, **changes: str) -> Path:
         "weights": f'"{weights}"',
         "sha256": '"c789161ed43c8269fcd4e67c67eeeb4e80c622da2eb296a20bc6007bd18a0b7d"',
         "width_px": "416",
-        "classes": "[" + ", ".join(f'"{name}"' for name in COCO) + "]",
+        "classes": "[" + ", ".join(f'"{name}"' for name in COCO_80) + "]",
     } | changes
     text = (
         f"version = 1\nweights = {values['weights']}\nsha256 = {values['sha256']}\n"

@@ -8,7 +8,6 @@ from __future__ import annotations
 import errno
 import io
 import os
-import resource
 import signal
 import sys
 import tempfile
@@ -128,27 +127,3 @@ def failing_from(
             raise OSError(code, os.strerror(code), what)
 
     return forked(lambda: watched(folder, WRITES, then), argv)
-
-
-def with_files_up_to(size: int, argv: Sequence[str]) -> Ended:
-    """Run the command with a limit of ``size`` bytes per file, so that writes fail midway."""
-    limit = (size, resource.getrlimit(resource.RLIMIT_FSIZE)[1])
-    return forked(lambda: resource.setrlimit(resource.RLIMIT_FSIZE, limit), argv)
-
-
-def with_failing_fsync(call: int, argv: Sequence[str]) -> Ended:
-    """Run the command with an I/O error in fsync call number ``call``, starting at 0."""
-
-    def prepare() -> None:
-        real, left = os.fsync, call
-
-        def fsync(handle: int) -> None:
-            nonlocal left
-            left -= 1
-            if left == -1:
-                raise OSError(errno.EIO, os.strerror(errno.EIO))
-            real(handle)
-
-        setattr(os, "fsync", fsync)  # noqa: B010
-
-    return forked(prepare, argv)

@@ -14,7 +14,6 @@ ORIGIN = (49.0, 8.4, 110.0)
 SPEED_MPS = 10.0
 YAW_RATE_RADPS = 0.2
 FIRST = "2011-09-26 13:02:"
-FIRST_S = 1317042120
 
 
 def dates(count: int, start_ns: int = 964_389_445) -> str:

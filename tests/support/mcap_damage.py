@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
@@ -40,10 +40,6 @@ def sound_parts(compression: str, is_chunked: bool, per_chunk: int = 25) -> list
         return [*defined, *messages]
     first, *rest = [messages[i : i + per_chunk] for i in range(0, len(messages), per_chunk)]
     return [ChunkOf([*defined, *first], compression), *(ChunkOf(m, compression) for m in rest)]
-
-
-def _without_index(part: bytes | ChunkOf) -> bytes | ChunkOf:
-    return part if isinstance(part, bytes) else replace(part, is_indexed=False)
 
 
 def sound_files() -> Iterator[tuple[str, bytes]]:

@@ -124,15 +124,7 @@ def channels(blocks: Blocks, fields: Sequence[Field]) -> int:
             one.bits,
             flags,
             invalid,
-            0,
-            0,
-            0,
-            0,
-            0,
-            0,
-            0,
-            0,
-            0,
+            *[0] * 9,
         )
         following = blocks.add(b"##CN", [following, 0, name, 0, conversion, one.data, 0, 0], body)
     return following

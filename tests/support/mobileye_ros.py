@@ -12,13 +12,11 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from crosscue.replay.columns import Block, CanFrames, Floats, Int64s, Table, Topic
+from crosscue.replay.columns import Block, CanFrames, Floats, Int64s, Table
 from crosscue.replay.mobileye.bits import extract, leading_words
 from crosscue.replay.mobileye.layout import BitField, Message, layout
 from crosscue.replay.mobileye.wire import from_raw
-from support.ros_messages import messages_of as messages_of_bytes
 
 TYPES: Final[Mapping[str, str]] = {
     "/parsed_tx/obstacle_status": "ObstacleStatus",
@@ -113,23 +111,3 @@ def _in_time(blocks: list[Block]) -> Block:
     columns = {n: np.concatenate([t[n] for t in tables]) for n in tables[0].columns}
     block = Block(blocks[0].topic, log_ns, Table(columns), header_ns=log_ns - 1_000_000)
     return block.take(np.argsort(log_ns, kind="stable"))
-
-
-def as_cdr(block: Block) -> tuple[Topic, Block]:
-    """Encode the messages of a block with rosbags, and return their topic and the encoded block."""
-    rows = block.rows
-    assert isinstance(rows, Table)
-    assert block.header_ns is not None
-    name = TOPIC_TYPES[block.topic]
-    kinds = {n: "bool" if c.dtype == np.bool_ else c.dtype.name for n, c in rows.columns.items()}
-    text = "".join(["std_msgs/Header header\n", *(f"{k} {n}\n" for n, k in kinds.items())])
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    store.register(get_types_from_msg(text, name))
-    stamp, header = (store.types[n] for n in ("builtin_interfaces/msg/Time", "std_msgs/msg/Header"))
-    payloads = []
-    for k, t_ns in enumerate(block.header_ns.tolist()):
-        values = [column[k].item() for column in rows.columns.values()]
-        made = header(stamp(t_ns // 10**9, t_ns % 10**9), "mobileye")
-        payloads.append(bytes(store.serialize_cdr(store.types[name](made, *values), name)))
-    topic = Topic(block.topic, name, "cdr", text.encode(), "ros2msg")
-    return topic, Block(block.topic, block.log_ns, messages_of_bytes(payloads))

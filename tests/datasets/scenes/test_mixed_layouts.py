@@ -9,10 +9,6 @@ from crosscue.datasets.scenes.conditions import conditions_of
 from crosscue.datasets.scenes.layout import (
     CURVE_SLOPE,
     KINDS,
-    TABLE_6,
-    any_layout,
-    layout_named,
-    mixed_kind,
     mixed_layout,
 )
 from crosscue.datasets.scenes.motion import lane_y_m
@@ -29,27 +25,6 @@ def test_any_thirteen_consecutive_layouts_have_every_feature_present_and_absent(
     known = [mixed_layout(first + i).features.get(feature) for i in range(len(KINDS))]
 
     assert {True, False} <= set(known)
-
-
-def test_road_without_intersection_has_no_control_or_signs() -> None:
-    roads = [mixed_layout(seed) for seed in range(120) if not mixed_layout(seed).is_intersection]
-
-    kinds = {mixed_kind(int(road.name[1:])) for road in roads}
-    assert kinds == {"straight", "bend", "driveways", "lot", "curve"}
-    for road in roads:
-        assert (road.control, road.one_way, road.do_not_enter) == ("none", None, False)
-
-
-def test_published_and_training_layouts_are_all_intersections() -> None:
-    assert all(layout.is_intersection for layout in TABLE_6.values())
-    assert all(any_layout(seed).is_intersection for seed in range(200))
-
-
-def test_layout_names_are_reproducible_and_layouts_distinct() -> None:
-    layouts = [layout_named(f"M{seed}") for seed in range(120)]
-
-    assert layouts == [mixed_layout(seed) for seed in range(120)]
-    assert len({layout.half_width_m for layout in layouts}) == 120
 
 
 def test_curved_layout_moves_car_and_objects_with_lane() -> None:

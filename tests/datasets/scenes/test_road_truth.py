@@ -46,20 +46,3 @@ def test_road_mask_agrees_with_map(layout: str, x_m: float) -> None:
     assert seen[clear & on_road].mean() > 0.9
     assert on_road.any()
     assert not on_road.all()
-
-
-def test_objects_and_sky_are_not_road() -> None:
-    shown = picture("D", -20.0)
-    assert shown.road is not None
-
-    assert not (shown.road & (shown.owner >= 0)).any()
-    assert not shown.road[: shown.road.shape[0] // 3].any()
-    assert shown.road[-1, shown.road.shape[1] // 2]
-
-
-def test_road_option_does_not_change_pixels() -> None:
-    of = world("D")
-    plain = renderer(of).picture(when_at(of, -20.0))
-
-    assert plain.road is None
-    np.testing.assert_array_equal(plain.rgb, picture("D", -20.0).rgb)

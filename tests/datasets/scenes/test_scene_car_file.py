@@ -7,10 +7,8 @@ import pytest
 
 from crosscue.datasets.scenes.car_file import scene_vehicle_text
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
-from crosscue.datasets.simulated.drive import DriveSettings
-from crosscue.datasets.simulated.drive import vehicle_text as drive_vehicle_text
 from crosscue.detectors.ranging.height_to_range import range_of
-from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle, parse
+from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from support.scenes import picture_at, world
 
 
@@ -18,12 +16,6 @@ def vehicle(width_px: int) -> Vehicle:
     camera = SceneCamera(width_px=width_px, height_px=width_px * 9 // 16)
     text = scene_vehicle_text(camera, mounting_yaw_rad=0.1, declination_rad=0.0, heading_rad=0.5)
     return parse(text, "vehicle.toml")
-
-
-def test_both_kinds_of_simulated_drives_have_simulated_car_name() -> None:
-    plain = parse(drive_vehicle_text(DriveSettings(), "simulated_car.dbc"), "vehicle.toml")
-
-    assert vehicle(640).name == plain.name == SIMULATED_CAR
 
 
 def test_range_from_height_scales_with_picture_size() -> None:

@@ -7,60 +7,16 @@ import pytest
 from numpy.typing import NDArray
 
 from crosscue.datasets.scenes.cars import SHAPES, Look, car
-from crosscue.datasets.scenes.conditions import conditions_of
-from crosscue.datasets.scenes.layout import TABLE_6, any_layout, layout_named
 from crosscue.datasets.scenes.rendering.camera import SceneCamera, view_at
 from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M
 from crosscue.datasets.scenes.rendering.kernels import compile_kernels
 from crosscue.datasets.scenes.rendering.render import RenderedFrame, RenderedObject
-from crosscue.datasets.scenes.world import build_world
-from support.scenes import SMALL, mirrored, picture_at, renderer, when_at, world
+from support.scenes import SMALL, mirrored, picture_at, when_at, world
 
 
 def only(picture: RenderedFrame, category: str) -> RenderedObject:
     (found,) = [one for one in picture.seen if one.thing.category == category]
     return found
-
-
-def test_same_seed_yields_same_pixels() -> None:
-    plan = layout_named("D")
-    again = build_world(plan, conditions_of(plan, 1))
-
-    one, other = picture_at(world("D"), -20.0), picture_at(again, -20.0)
-
-    assert np.array_equal(one.rgb, other.rgb)
-    assert np.array_equal(one.owner, other.owner)
-
-
-def test_pixels_do_not_depend_on_the_number_of_threads() -> None:
-    import cv2
-
-    before = cv2.getNumThreads()
-    try:
-        cv2.setNumThreads(1)
-        one = picture_at(world("D"), -20.0)
-        cv2.setNumThreads(4)
-        other = picture_at(world("D"), -20.0)
-    finally:
-        cv2.setNumThreads(before)
-
-    assert np.array_equal(one.rgb, other.rgb)
-
-
-def test_picture_does_not_depend_on_previous_pictures() -> None:
-    draw = renderer(world("D"))
-    t_s = when_at(world("D"), -20.0)
-    alone = renderer(world("D")).picture(t_s, 7)
-
-    draw.picture(1.0, 3)
-
-    assert np.array_equal(draw.picture(t_s, 7).rgb, alone.rgb)
-
-
-def test_different_seed_yields_different_picture() -> None:
-    one, other = picture_at(world("D", 1), -20.0), picture_at(world("D", 1, seed=5), -20.0)
-
-    assert not np.array_equal(one.rgb, other.rgb)
 
 
 @pytest.mark.parametrize("x_m", [-45.0, -30.0, -15.0, -8.0])
@@ -120,13 +76,6 @@ def test_vegetation_hides_stop_sign_only_at_distance() -> None:
     assert only(picture_at(world("G"), -12.0, camera), "stop_sign").visible > 0.9
 
 
-def test_object_beside_camera_is_not_visible() -> None:
-    scene = world("D")
-    picture = picture_at(scene, 1.0)
-
-    assert all(one.thing.category != "stop_sign" for one in picture.seen)
-
-
 @pytest.mark.slow
 def test_dusk_is_darker_than_noon_and_glare_saturates_sky() -> None:
     noon, dusk = picture_at(world("D", 1), -30.0), picture_at(world("D", 10), -30.0)
@@ -169,23 +118,6 @@ def _side_view(kind: str, *, nose_left: bool) -> NDArray[np.bool_]:
         0,
     )
     return covered.astype(np.bool_)
-
-
-def test_seeded_layouts_differ_from_scored_layouts() -> None:
-    others = [any_layout(seed) for seed in range(60)]
-
-    assert len({one.name for one in others}) == 60
-    assert not {one.seed for one in others} & {one.seed for one in TABLE_6.values()}
-    assert {one.control for one in others} == {"stop_sign", "traffic_light", "none"}
-    assert all(one.goes_left or one.goes_right or one.goes_ahead for one in others)
-    assert any(one.do_not_enter for one in others)
-    assert any(one.one_way == "left" for one in others)
-
-
-@pytest.mark.parametrize("name", ["I", "a", "L", "L-1", "", "L99999999999"])
-def test_unknown_layouts_are_refused(name: str) -> None:
-    with pytest.raises(ValueError, match="there are: A to H"):
-        layout_named(name)
 
 
 @pytest.mark.parametrize("layout", ["D", "F", "L12"])

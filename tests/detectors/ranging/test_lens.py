@@ -44,13 +44,6 @@ def test_housing_from_behind_is_dark_before_a_coloured_wall() -> None:
     assert lens_of(red, BOX + np.array([-3.0, 0.0, 3.0, 0.0])) == "dark"
 
 
-def test_spot_too_small_or_large_for_a_lens_is_dark() -> None:
-    for across in (1, 30):
-        picture = housing(None)
-        cv2.circle(picture, (32, 36), across, BGR["red"], -1)
-        assert lens_of(picture, BOX) == "dark"
-
-
 def test_small_grey_or_outside_box_has_an_unknown_lens() -> None:
     picture = housing("red")
 

@@ -67,38 +67,6 @@ def test_near_light_narrows_the_size_of_a_far_one_of_the_same_make() -> None:
     assert shared.alone == one.alone
 
 
-def test_light_missed_for_some_frames_keeps_its_track() -> None:
-    followed = tracks()
-    for gone_m in range(20):
-        seen = [FAR] if gone_m % 5 < 2 else []
-        (track,) = take(followed, seen, float(gone_m))
-        assert track.is_seen == bool(seen)
-
-    assert track.seen == 8
-    assert track.range_m == pytest.approx(84.0 - 19.0, abs=2.0 * np.sqrt(track.var_m2))
-    assert track.height_px == pytest.approx(FOCAL_PX / 65.0, rel=0.1)
-
-
-def test_track_of_a_lost_light_is_dropped() -> None:
-    followed = tracks()
-    take(followed, [FAR], 0.0)
-
-    left = [len(take(followed, [], float(gone_m))) for gone_m in range(1, 14)]
-
-    assert left[5] == 1
-    assert left[-1] == 0
-
-
-def test_turn_of_the_car_starts_no_new_track() -> None:
-    followed = tracks()
-    for i in range(12):
-        box = box_of(FAR, 0.0, turned_rad=0.04 * i)
-        motion = CarStep(0.0, 0.0, 0.04 if i else 0.0, 0.1)
-        now = followed(motion, box[None, :], np.array([box[3] - box[1]]))
-
-    assert [one.seen for one in now] == [12]
-
-
 def test_two_boxes_of_one_object_make_one_track() -> None:
     followed = tracks()
     box = box_of(FAR, 0.0)
@@ -144,13 +112,3 @@ def test_range_without_odometry_relies_on_the_size_prior() -> None:
     assert track.seen == 20
     assert track.range_m == pytest.approx(alone_m, rel=0.1)
     assert np.sqrt(track.var_m2) == pytest.approx(size.spread * track.range_m, rel=0.2)
-
-
-def test_odometry_error_raises_the_range_variance() -> None:
-    exact, loose = tracks(), tracks()
-    for gone_m in range(30):
-        (one,) = take(exact, [FAR], float(gone_m))
-        (other,) = take(loose, [FAR], float(gone_m), CarStep(1.0, 0.1, 0.0, 0.1))
-
-    assert other.range_m == one.range_m
-    assert other.var_m2 > 1.2 * one.var_m2

@@ -5,16 +5,9 @@ import pytest
 
 from crosscue.detectors.ranging.object_tracks import SAME_MAKE, shared_size
 from crosscue.detectors.ranging.standard_sizes import (
-    HOUSINGS,
-    STOP_SIGN,
     SizePrior,
     light_size,
-    size_prior,
 )
-
-
-def test_housing_proportions_sum_to_one() -> None:
-    assert sum(one.proportion for one in HOUSINGS.values()) == pytest.approx(1.0)
 
 
 def test_aspect_distinguishes_lights_with_and_without_backplate() -> None:
@@ -32,15 +25,6 @@ def test_size_prior_covers_the_sizes_of_every_aspect(aspect: float) -> None:
 
     for height_m in (1.07, 1.32):
         assert abs(height_m - size.mean_m) < 2.0 * size.spread * size.mean_m
-
-
-def test_implausible_aspect_does_not_change_the_prior() -> None:
-    assert light_size(0.2).mean_m == pytest.approx(light_size().mean_m, rel=1e-6)
-
-
-def test_stop_sign_size_does_not_depend_on_the_aspect() -> None:
-    assert size_prior("stop_sign", 2.0) == size_prior("stop_sign") == STOP_SIGN
-    assert size_prior("traffic_light", 2.0) == light_size(2.0)
 
 
 def test_lights_of_the_same_make_narrow_a_size_by_their_variance() -> None:

@@ -45,12 +45,6 @@ def test_range_of_a_point_on_level_ground_is_exact(range_m: float) -> None:
     assert found.mean_m == pytest.approx(range_m, rel=1e-9)
 
 
-def test_range_of_an_edge_at_the_horizon_relies_on_size() -> None:
-    for bottom_px in (500.0, 540.0, 545.0):
-        assert ground_range(slope(bottom_px), 20.0, CAMERA) is None
-        assert vehicle_range(slope(bottom_px), 20.0, CAMERA, CAR) == size_range(20.0, 1500.0, CAR)
-
-
 def test_near_range_relies_on_ground_and_far_range_on_size() -> None:
     tall = SizePrior(1.65, 0.15)
     for range_m, nearer in ((8.0, "ground"), (60.0, "size")):
@@ -107,37 +101,6 @@ def test_default_range_is_used_without_a_fitted_curve(
     assert found is not None
     assert found.mean_m == pytest.approx(range_m, rel=0.02)
     assert found.sd_m == pytest.approx(sd_m, rel=0.2)
-
-
-@pytest.mark.parametrize("text", ["", FOCAL + "[ranges]\nkind = 'curve'\n"])
-def test_default_range_is_missing_without_camera_or_when_disabled(text: str) -> None:
-    assert detection_range(vehicle(text), "traffic light", BOX, 30.0, SIZE) is None
-
-
-def test_fitted_curve_disables_defaults_of_other_labels() -> None:
-    box = np.array([900.0, 500.0, 980.0, edge_px(30.0)])
-
-    assert detection_range(vehicle(FOCAL + CURVE), "car", box, 80.0, SIZE) is None
-    found = detection_range(vehicle(FOCAL), "car", box, 80.0, SIZE)
-    assert found is not None
-    assert found.mean_m == pytest.approx(31.5, rel=0.05)
-
-
-def test_range_accounts_for_the_camera_pitch() -> None:
-    level = np.array([900.0, 500.0, 980.0, edge_px(12.0)])
-    tilted = np.array([900.0, 300.0, 980.0, edge_px(12.0, pitch_rad=0.1)])
-
-    found = [
-        detection_range(vehicle(FOCAL + pitch), "bus", box, 200.0, SIZE)
-        for pitch, box in (("", level), ("pitch_rad = 0.1\n", tilted))
-    ]
-    loose = detection_range(vehicle(FOCAL + "pitch_sd_rad = 0.02\n"), "bus", level, 200.0, SIZE)
-
-    assert found[0] is not None
-    assert found[1] is not None
-    assert loose is not None
-    assert found[1].mean_m == pytest.approx(found[0].mean_m)
-    assert loose.sd_m > found[0].sd_m
 
 
 @pytest.mark.parametrize(("yaw", "roll"), [(0.1, 0.0), (0.0, 0.05), (-0.1, 0.03)])

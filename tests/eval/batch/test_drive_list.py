@@ -4,6 +4,7 @@ import re
 import uuid
 from importlib import import_module
 from pathlib import Path
+from typing import Final
 
 import pytest
 from hypothesis import given, settings
@@ -34,8 +35,57 @@ def _names(drives: tuple[DriveInput, ...]) -> list[str]:
     return [one.name[:-9] for one in drives]
 
 
-def test_several_log_arguments_are_one_drive(tmp_path: Path) -> None:
-    _touch(tmp_path, "monday.mcap", "tuesday.blf", "vehicle.toml")
+# Files and folders of simulated drives to write, arguments, and the names of the drives found.
+LAYOUTS: Final[dict[str, tuple[list[str], list[str], list[str], list[str]]]] = {
+    "one log": (["a.b.mcap"], [], ["a.b.mcap"], ["a.b"]),
+    "drive folder": ([], ["A-01"], ["A-01"], ["A-01"]),
+    "folder of drives": (
+        ["notes.txt", "runs/A-01/manifest.json", "runs/A-01/pictures/1.jpg"],
+        ["B-02", "A-01"],
+        [""],
+        ["A-01", "B-02"],
+    ),
+    "folder of bags": (["mon.bag", "tue.bag"], [], [""], ["mon", "tue"]),
+    "split bag": (["bag_0.mcap", "bag_1.mcap"], [], ["--each", ""], ["bag_0", "bag_1"]),
+    "each log": (
+        ["x/drive.mcap", "y/drive.mcap", "z/x/drive.mcap"],
+        [],
+        ["--each", "x/drive.mcap", "y/drive.mcap", "z/x/drive.mcap"],
+        ["x", "y", "x"],
+    ),
+    "data set": (
+        [f"{place}/processed_log/t" for place in ("one/40", "one/41", "two/40")],
+        [],
+        [""],
+        ["one__40", "one__41", "two__40"],
+    ),
+    "pattern of files": ([], ["A-01", "A-02", "B-01"], ["A-*/drive.mcap"], ["A-01", "A-02"]),
+    "pattern of folders": ([], ["A-01", "A-02", "B-01"], ["A-*"], ["A-01", "A-02"]),
+    "deep pattern": ([], ["A-01", "B-01"], ["**/drive.mcap"], ["A-01", "B-01"]),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_drives_of_a_layout_are_found_and_named(tmp_path: Path, layout: str) -> None:
+    files, simulated, arguments, names = LAYOUTS[layout]
+    _touch(tmp_path, *files)
+    _simulated(tmp_path, *simulated)
+    each = "--each" in arguments
+
+    found = drives_of([f"{tmp_path}/{one}" for one in arguments if one != "--each"], each=each)
+
+    assert _names(found.drives) == names
+    assert len({one.name for one in found.drives}) == len(names)
+    assert found.is_many == (len(names) > 1)
+    for drive, name in zip(found.drives, names, strict=True):
+        if name in simulated:
+            place = tmp_path / name
+            assert drive.logs == (str(place / "drive.mcap"),)
+            assert (drive.vehicle, drive.truth) == (place / "vehicle.toml", place / "truth.json")
+
+
+def test_several_log_arguments_or_parts_of_a_bag_are_one_drive(tmp_path: Path) -> None:
+    _touch(tmp_path, "monday.mcap", "tuesday.blf", "vehicle.toml", "bag/b_0.mcap", "bag/b_1.mcap")
     logs = (str(tmp_path / "monday.mcap"), str(tmp_path / "tuesday.blf"))
 
     found = drives_of(logs)
@@ -43,46 +93,7 @@ def test_several_log_arguments_are_one_drive(tmp_path: Path) -> None:
     assert not found.is_many
     assert found.drives == (DriveInput(found.drives[0].name, logs),)
     assert drives_of(logs[::-1]) == found
-
-
-def test_one_log_is_one_drive(tmp_path: Path) -> None:
-    _touch(tmp_path, "a.b.mcap")
-    log = str(tmp_path / "a.b.mcap")
-
-    assert _names(drives_of([log]).drives) == ["a.b"]
-    assert drives_of([log]).drives[0].logs == (log,)
-    assert drives_of([log], each=True).drives == drives_of([log]).drives
-    assert not drives_of([log]).is_many
-    assert drives_of([log], each=True).is_many
-
-
-def test_drive_folder_supplies_vehicle_and_truth_files(tmp_path: Path) -> None:
-    folder = _simulated(tmp_path, "A-01") / "A-01"
-
-    found = drives_of([str(folder)])
-
-    assert not found.is_many
-    (one,) = found.drives
-    assert _names(found.drives) == ["A-01"]
-    assert one.logs == (str(folder / "drive.mcap"),)
-    assert (one.vehicle, one.truth) == (folder / "vehicle.toml", folder / "truth.json")
-
-
-def test_folder_of_drives_yields_each_of_its_drives(tmp_path: Path) -> None:
-    _simulated(tmp_path, "B-02", "A-01")
-    _touch(tmp_path, "notes.txt", "runs/A-01/manifest.json", "runs/A-01/pictures/1.jpg")
-
-    found = drives_of([str(tmp_path)])
-
-    assert found.is_many
-    assert _names(found.drives) == ["A-01", "B-02"]
-    assert found.drives[0].vehicle == tmp_path / "A-01" / "vehicle.toml"
-
-
-def test_each_bag_of_a_folder_is_one_drive(tmp_path: Path) -> None:
-    _touch(tmp_path, "mon.bag", "tue.bag")
-
-    assert _names(drives_of([str(tmp_path)]).drives) == ["mon", "tue"]
+    assert drives_of([str(tmp_path / "bag")]).drives[0].logs == (str(tmp_path / "bag"),)
 
 
 def test_folder_of_mixed_formats_needs_a_vehicle_file(tmp_path: Path) -> None:
@@ -93,38 +104,6 @@ def test_folder_of_mixed_formats_needs_a_vehicle_file(tmp_path: Path) -> None:
 
     _touch(tmp_path, "vehicle.toml")
     assert len(drives_of([str(tmp_path)]).drives[0].logs) == 2
-
-
-def test_split_bag_is_one_drive_unless_each_is_set(tmp_path: Path) -> None:
-    _touch(tmp_path, "bag_0.mcap", "bag_1.mcap")
-
-    assert drives_of([str(tmp_path)]).drives[0].logs == (str(tmp_path),)
-    assert _names(drives_of([str(tmp_path)], each=True).drives) == ["bag_0", "bag_1"]
-
-
-def test_nested_data_set_folders_are_named_by_their_path(tmp_path: Path) -> None:
-    for route, segment in (("one", "40"), ("one", "41"), ("two", "40")):
-        (tmp_path / route / segment / "processed_log").mkdir(parents=True)
-
-    found = drives_of([str(tmp_path)])
-
-    assert _names(found.drives) == ["one__40", "one__41", "two__40"]
-
-
-def test_patterns_of_files_and_folders_are_expanded(tmp_path: Path) -> None:
-    _simulated(tmp_path, "A-01", "A-02", "B-01")
-
-    files = drives_of([f"{tmp_path}/A-*/drive.mcap"])
-    folders = drives_of([f"{tmp_path}/A-*"])
-    deep = drives_of([f"{tmp_path}/**/drive.mcap"])
-
-    assert files.is_many
-    assert _names(files.drives) == ["A-01", "A-02"]
-    assert [one.name for one in files.drives] == [one.name for one in folders.drives]
-    assert files.drives[0].truth == tmp_path / "A-01" / "truth.json"
-    assert _names(folders.drives) == ["A-01", "A-02"]
-    assert [one.logs for one in folders.drives] == [one.logs for one in files.drives]
-    assert len(deep.drives) == 3
 
 
 def test_list_file_names_drives_line_by_line(tmp_path: Path) -> None:
@@ -139,16 +118,6 @@ def test_list_file_names_drives_line_by_line(tmp_path: Path) -> None:
     assert _names(found.drives) == ["a_b", "c", "A-01", "A-02", "x"]
     assert found.drives[0].logs == (str(tmp_path / "a b.mcap"), str(tmp_path / "can.blf"))
     assert found.drives[4].logs == ("memory://bucket/x.mcap",)
-
-
-def test_each_makes_every_log_a_drive_of_unique_name(tmp_path: Path) -> None:
-    _touch(tmp_path, "x/drive.mcap", "y/drive.mcap", "z/x/drive.mcap")
-    logs = [str(tmp_path / place / "drive.mcap") for place in ("x", "y", "z/x")]
-
-    names = _names(drives_of(logs, each=True).drives)
-
-    assert names == ["x", "y", "x"]
-    assert len({one.name for one in drives_of(logs, each=True).drives}) == 3
 
 
 def test_remote_patterns_are_expanded(tmp_path: Path) -> None:

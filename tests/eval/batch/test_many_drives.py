@@ -1,6 +1,5 @@
 """Many drives in parallel: a failure affects only its drive, and no drive is processed twice."""
 
-import json
 import os
 import signal
 import subprocess
@@ -17,7 +16,6 @@ from crosscue.eval.batch.jobs import (
     JobOutcome,
     JobState,
     exit_status_of,
-    fingerprint_of,
     in_turn,
     is_done,
     run_many,
@@ -26,7 +24,6 @@ from crosscue.eval.batch.jobs import (
 from crosscue.eval.batch.processes import Processes
 from crosscue.replay.errors import UsageError
 from crosscue.replay.losses import losses_heard
-from crosscue.replay.progress import Progress, watching
 from support.drive_work import Letters, letters, write_jobs
 from support.trees import tree
 
@@ -105,28 +102,6 @@ def test_run_of_changed_log_or_settings_needs_overwrite(tmp_path: Path) -> None:
     assert [state_of(job) for job in changed] == [JobState.DONE, JobState.DONE]
 
 
-def test_incomplete_run_folder_is_processed_again(tmp_path: Path) -> None:
-    jobs = write_jobs(tmp_path, ["plain"])
-    run_many(jobs, letters, in_turn)
-    complete = tree(jobs[0].run)
-    (jobs[0].run / "manifest.json").unlink()
-    assert state_of(jobs[0]) is JobState.CUT_SHORT
-
-    results = run_many(jobs, letters, in_turn)
-
-    assert results[0].attempts == 1
-    assert tree(jobs[0].run) == complete
-
-
-def test_run_with_edited_manifest_is_not_done(tmp_path: Path) -> None:
-    jobs = write_jobs(tmp_path, ["plain"])
-    run_many(jobs, letters, in_turn)
-    manifest = jobs[0].run / "manifest.json"
-    manifest.write_text(json.dumps({**json.loads(manifest.read_text()), "notices": ["by hand"]}))
-
-    assert state_of(jobs[0]) is JobState.OTHER
-
-
 @pytest.mark.parametrize("torn", ["", "{", "[]", '{"format_version": 1}', '{"format_version": 9}'])
 def test_run_with_invalid_journal_entry_is_not_done(tmp_path: Path, torn: str) -> None:
     jobs = write_jobs(tmp_path, ["plain"])
@@ -134,16 +109,6 @@ def test_run_with_invalid_journal_entry_is_not_done(tmp_path: Path, torn: str) -
     (tmp_path / "runs" / ".drives" / "drive0.json").write_text(torn)
 
     assert state_of(jobs[0]) is JobState.OTHER
-
-
-def test_missing_log_fails_only_its_drive(tmp_path: Path) -> None:
-    jobs = write_jobs(tmp_path, ["plain", "gone"])
-    Path(jobs[1].logs[0]).unlink()
-
-    results = run_many(jobs, letters, in_turn)
-
-    assert results[0].error is None
-    assert "No such file" in str(results[1].error)
 
 
 @pytest.mark.slow
@@ -170,17 +135,6 @@ def test_duplicate_job_names_and_zero_workers_are_refused(tmp_path: Path) -> Non
         Processes(0)
 
 
-def test_progress_counts_earlier_done_and_failed_drives(tmp_path: Path) -> None:
-    seen: list[object] = []
-    jobs = write_jobs(tmp_path, ["plain", "damaged", "more"])
-    run_many(jobs[:1], letters, in_turn)
-
-    with watching(seen.append):
-        run_many(jobs, letters, in_turn)
-
-    assert seen[-1] == Progress("replaying, 1 failed", 2, 2, "drives")
-
-
 def test_exit_status_combines_those_of_all_drives() -> None:
     def done(status: int, error: str | None = None) -> JobOutcome[Letters]:
         return JobOutcome(Job("a", (), Path(), ""), status, error)
@@ -190,15 +144,6 @@ def test_exit_status_combines_those_of_all_drives() -> None:
     assert exit_status_of([done(0), done(4, "cut")]) == 3
     assert exit_status_of([done(4, "cut"), done(4, "cut")]) == 4
     assert exit_status_of([done(4, "cut"), done(2, "wrong")]) == 1
-
-
-def test_fingerprint_depends_on_settings_but_not_their_order() -> None:
-    one = fingerprint_of({"a": 1, "b": [2.5, None]}, "1.0")
-
-    assert one == fingerprint_of({"b": [2.5, None], "a": 1}, "1.0")
-    assert (
-        len({one, fingerprint_of({"a": 2, "b": [2.5, None]}, "1.0"), fingerprint_of({}, "")}) == 3
-    )
 
 
 RUNNER = """

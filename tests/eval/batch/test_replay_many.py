@@ -29,13 +29,6 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _tables(runs: Path) -> dict[str, bytes]:
-    return {
-        f"{file.parent.name}/{file.name}": file.read_bytes()
-        for file in sorted(runs.glob("*/*.parquet"))
-    }
-
-
 def test_one_failing_drive_does_not_stop_the_rest(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -59,17 +52,6 @@ def test_one_failing_drive_does_not_stop_the_rest(
     (only,) = json.loads(capsys.readouterr().out)["drives"]
     assert only["name"][:-9] == "broken"
     assert "not an MCAP file" in Path(only["run"], "failure.log").read_text()
-
-
-def test_two_workers_write_the_tables_of_one(drives: Path, tmp_path: Path) -> None:
-    pattern = str(drives / "*day" / "drive.mcap")
-    for workers in ("1", "2"):
-        out = str(tmp_path / workers)
-        arguments = ["replay", pattern, "-o", out, "--workers", workers, "--to", "4", "-q"]
-        assert run(arguments) == 0
-
-    assert len(_tables(tmp_path / "1")) >= 6
-    assert _tables(tmp_path / "1") == _tables(tmp_path / "2")
 
 
 def test_merged_shards_equal_one_batch(
@@ -109,14 +91,6 @@ def test_workers_for_a_single_drive_are_refused(
     assert run(["replay", log, "-o", str(tmp_path / "run"), "--workers", "2"]) == 2
 
     assert "add --each" in capsys.readouterr().err
-
-
-def test_drive_folder_supplies_its_vehicle_file(drives: Path, tmp_path: Path) -> None:
-    assert run(["replay", str(drives / "monday"), "-o", str(tmp_path / "run"), "-q"]) == 0
-
-    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
-    assert manifest["settings"]["can"]["dbc"]
-    assert manifest["pose"]["rows"] > 1000
 
 
 def test_replay_drives_function_matches_the_command(

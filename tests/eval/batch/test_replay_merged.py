@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import uuid
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -54,40 +50,3 @@ def test_invalid_vehicle_file_fails_only_its_drive_and_edited_dbc_is_detected(
     assert run([*argv, "-q"]) == 1
     reported = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
     assert "other logs, settings or versions" in reported["monday"]["error"]
-
-
-def test_remote_log_is_replayed_and_estimated_without_local_copy(
-    drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = tmp_path / "store"
-    monkeypatch.setenv("CROSSCUE_STORE", str(store))
-    bucket = f"bucket-{uuid.uuid4().hex}"
-    system = import_module("fsspec").filesystem("memory")
-    system.pipe(f"/{bucket}/drive.mcap", (drives / "monday" / "drive.mcap").read_bytes())
-    url, vehicle = f"memory://{bucket}/drive.mcap", drives / "monday" / "vehicle.toml"
-    run_path = tmp_path / "run"
-
-    assert run(["replay", url, "--vehicle", str(vehicle), "-o", str(run_path), "-q"]) == 0
-    before = (run_path / "pose.parquet").read_bytes()
-    (recorded,) = open_run(run_path).drive_manifest().logs
-    assert recorded.path == url
-    # A log that is read by ranges leaves no local copy that an estimate could use.
-    assert not store.exists()
-    assert run(["estimate", str(run_path), "-q"]) == 0
-
-    assert (run_path / "pose.parquet").read_bytes() == before
-    assert run(["info", url, "--json"]) == 0
-    system.rm(f"/{bucket}", recursive=True)
-
-
-def test_replaced_log_is_detected_despite_its_modification_time(
-    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, run_path = drives / "monday" / "drive.mcap", tmp_path / "run"
-    assert run(["replay", str(drives / "monday"), "-o", str(run_path), "-q"]) == 0
-    shutil.copy(drives / "tuesday" / "drive.mcap", log)
-    os.utime(log, (1_000_000_000, 1_000_000_000))
-
-    assert run(["estimate", str(run_path)]) == 4
-
-    assert "has changed since" in capsys.readouterr().err

@@ -20,14 +20,6 @@ def test_every_drive_is_in_exactly_one_shard(identities: set[str], count: int) -
         assert sum(shard.holds(identity) for shard in shards) == 1
 
 
-def test_shard_sizes_are_about_equal() -> None:
-    identities = [f"{number:08x}" for number in range(4000)]
-    sizes = [sum(map(Shard(number, 8).holds, identities)) for number in range(1, 9)]
-
-    # A binomial of 4000 and 1/8 has a standard deviation of 21.
-    assert max(abs(size - 500) for size in sizes) < 4 * 21
-
-
 def slurm_array(number: int, first: int, last: int, step: int, count: int) -> dict[str, str]:
     values = {"ID": number, "MIN": first, "MAX": last, "STEP": step, "COUNT": count}
     return {f"SLURM_ARRAY_TASK_{name}": str(value) for name, value in values.items()}

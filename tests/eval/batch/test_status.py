@@ -96,24 +96,6 @@ def test_drive_of_a_dead_worker_is_stale(
     assert run(["status", str(folder), "-q"]) == 3
 
 
-def test_pace_and_time_left_follow_from_recently_ended_drives(
-    batch: list[Job], tmp_path: Path
-) -> None:
-    folder, now_s = tmp_path / "runs", time.time()
-    write_plan(folder, ["waiting"], "2/2")
-    for plan in (folder / ".drives" / "plans").iterdir():
-        os.utime(plan, (now_s - 10_000.0, now_s - 10_000.0))
-    write_entry(folder / "later", {"inputs": None, "worker": signature()})
-
-    every = pace_of(drives_of_folder(folder), folder)
-    os.utime(entry_path(batch[0].run), (now_s - 5000.0, now_s - 5000.0))
-    recent = pace_of(drives_of_folder(folder), folder)
-
-    # One drive is running and one is waiting; the rate is that of the last hour.
-    assert (every.per_hour, every.left_s) == pytest.approx((4.0, 2 * 900.0))
-    assert (recent.per_hour, recent.left_s) == pytest.approx((3.0, 2 * 1200.0))
-
-
 def test_stale_drive_of_another_machine_is_processed_again(tmp_path: Path) -> None:
     (job,) = write_jobs(tmp_path, ["plain"])
     dead = "4711 another-machine boot 99"
@@ -133,20 +115,6 @@ def test_stale_drive_of_another_machine_is_processed_again(tmp_path: Path) -> No
     assert states(tmp_path / "runs") == {"drive0": "running"}
     assert error_of_abandoned_drive(1.0e9) is None
     assert states(tmp_path / "runs") == {"drive0": "done"}
-
-
-def test_damaged_entry_and_lock_do_not_block_a_drive_permanently(tmp_path: Path) -> None:
-    (job,) = write_jobs(tmp_path, ["plain"])
-    job.run.mkdir(parents=True)
-    write_entry(job.run, {"inputs": None, "worker": "damaged"})
-    job.run.joinpath(LOCK).write_bytes(b"\xff\xfe")
-
-    (early,) = run_many([job], letters, in_turn)
-    os.utime(entry_path(job.run), (1.0e9, 1.0e9))
-    (late,) = run_many([job], letters, in_turn)
-
-    assert "process damaged is writing it" in str(early.error)
-    assert late.error is None
 
 
 def test_drives_without_a_run_are_merged_as_failures_in_any_order(

@@ -1,17 +1,16 @@
 """Tables of the runs below a folder."""
 
-import json
 from pathlib import Path
 
 import pytest
 
 import crosscue
-from crosscue.eval.batch.merge import gathered, merge_runs
+from crosscue.eval.batch.merge import merge_runs
 from crosscue.eval.runs.account import Account, Line
 from crosscue.eval.runs.folder import MANIFEST, TIMINGS, RunFolder, create, write_timings
 from crosscue.eval.runs.manifest import Timings
-from crosscue.replay.errors import UnreadableRunError, UsageError
-from support.catalog_runs import add_run, approach_row, runs_below, scene
+from crosscue.replay.errors import UsageError
+from support.catalog_runs import add_run, runs_below
 
 
 @pytest.fixture(scope="module")
@@ -34,30 +33,6 @@ def test_each_run_is_one_row(runs: Path) -> None:
     assert found.left_out == {}
 
 
-def test_run_row_matches_its_manifest(runs: Path) -> None:
-    manifest = RunFolder(runs / "a/monday").drive_manifest()
-
-    [row] = crosscue.catalog(runs).query("from runs where run = 'a/monday'").to_pylist()
-
-    assert json.loads(row["settings"]) == manifest.settings.model_dump(mode="json")
-    assert row["rows_in"] == sum(one.entered for _, _, one in manifest.account.lines())
-    assert row["crosscue"] == manifest.versions["crosscue"]
-    assert row["logs"] == ["monday.mcap"]
-    assert "belief.parquet" in row["tables"]
-
-
-def test_settings_hash_equals_that_of_a_merged_run(runs: Path, tmp_path: Path) -> None:
-    gathered_runs, failures = gathered([runs / "a"])
-    merged = merge_runs(gathered_runs, create(tmp_path / "all", overwrite=False), failures)
-    manifest = merged.run.manifest()
-
-    rows = crosscue.catalog(runs / "a").query("select name, settings_sha256 from runs")
-
-    assert {row["name"]: row["settings_sha256"] for row in rows.to_pylist()} == {
-        one.name: one.settings_sha256 for one in getattr(manifest, "drives", ())
-    }
-
-
 def test_query_combines_the_tables_of_all_runs(runs: Path) -> None:
     found = crosscue.catalog(runs)
 
@@ -68,36 +43,6 @@ def test_query_combines_the_tables_of_all_runs(runs: Path) -> None:
         }
         counted = found.query(f'select run, count(*) as n from "{table}" group by run').to_pylist()
         assert {row["run"]: row["n"] for row in counted} == parts
-
-
-def test_empty_tables_have_the_columns_of_the_schema(runs: Path) -> None:
-    found = crosscue.catalog(runs)
-
-    for table in ("pose", "scores", "curves", "cue_frames", "dropped", "left_out"):
-        result = found.query(f"select * from {table}")
-        listed = found.schema().filter(_is(table)).column("column").to_pylist()
-        assert result.num_rows == 0
-        assert result.column_names == listed
-
-
-def _is(table: str) -> object:
-    import pyarrow.compute as pc
-
-    return pc.field("table") == table
-
-
-def test_approaches_of_all_runs_are_listed(tmp_path: Path) -> None:
-    add_run(tmp_path / "one", "one", scene=scene(approach_row(1, 12.5), approach_row(2, None)))
-    add_run(tmp_path / "two", "two", scene=None)
-
-    rows = crosscue.catalog(tmp_path).query(
-        "select run, approach, detected_range_m, probabilities['left'] as p from approaches"
-    )
-
-    assert rows.to_pylist() == [
-        {"run": "one", "approach": 1, "detected_range_m": 12.5, "p": 0.97},
-        {"run": "one", "approach": 2, "detected_range_m": None, "p": 0.97},
-    ]
 
 
 def test_dropped_rows_are_counted_by_reason(tmp_path: Path) -> None:
@@ -210,13 +155,6 @@ def test_damaged_table_is_left_out_but_its_run_is_kept(tmp_path: Path) -> None:
     assert len(found.select("true")) == 3
 
 
-def test_folder_without_runs_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UnreadableRunError, match="neither a run folder nor a folder of runs"):
-        crosscue.catalog(tmp_path)
-    with pytest.raises(UnreadableRunError, match="not a folder; expected a folder of runs"):
-        crosscue.catalog(tmp_path / "gone")
-
-
 def test_table_with_damaged_data_pages_is_left_out(tmp_path: Path) -> None:
     for name in ("good", "torn"):
         add_run(tmp_path / name, name)
@@ -241,12 +179,3 @@ def test_notice_reports_drives_with_several_settings(runs: Path) -> None:
         "settings_sha256 tells them apart"
     )
     assert crosscue.catalog(runs / "a").notices == ()
-
-
-def test_table_unreadable_in_every_run_is_empty(tmp_path: Path) -> None:
-    add_run(tmp_path / "one", "one").file("frames.parquet").write_bytes(b"PAR1")
-
-    found = crosscue.catalog(tmp_path)
-
-    assert found.query("from frames").column_names == ["run"]
-    assert "frames.parquet: damaged" in found.left_out["one"]

@@ -1,7 +1,6 @@
 """The index of a catalog: it saves reading and does not change the content."""
 
 import errno
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
@@ -70,20 +69,6 @@ def test_only_changed_and_new_runs_are_read_again(runs: Path, manifests_read: li
     assert counted.to_pylist() == [{"n": 6}]
 
 
-def test_deleted_run_leaves_the_catalog(runs: Path, manifests_read: list[str]) -> None:
-    crosscue.catalog(runs)
-    manifests_read.clear()
-    for file in (runs / "b/monday").iterdir():
-        file.unlink()
-    (runs / "b/monday").rmdir()
-
-    found = crosscue.catalog(runs)
-
-    assert manifests_read == []
-    assert len(found.runs) == 3
-    assert found.query("select count(*) as n from approaches").to_pylist() == [{"n": 3}]
-
-
 def fail(job: Job) -> NoReturn:
     raise UnreadableRunError(f"{job.logs[0]}: no log; check the path")
 
@@ -131,16 +116,6 @@ def test_commands_and_catalog_find_runs_to_the_same_depth(runs: Path) -> None:
     assert deep / "6/deeper" not in found_by_catalog
 
 
-def test_unreadable_run_is_not_read_again(runs: Path, manifests_read: list[str]) -> None:
-    (runs / "a/monday/manifest.json").write_text("{}")
-    first = crosscue.catalog(runs).left_out
-    manifests_read.clear()
-
-    assert crosscue.catalog(runs).left_out == first
-    assert first.keys() == {"a/monday"}
-    assert manifests_read == []
-
-
 @pytest.mark.parametrize(
     "damage",
     [
@@ -178,20 +153,6 @@ def test_index_of_another_layout_is_rebuilt(
     assert len(manifests_read) == 4
 
 
-def test_index_of_read_only_folder_is_written_to_the_cache(
-    runs: Path, manifests_read: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(os, "access", lambda path, mode: False)
-    first = crosscue.catalog(runs).query(ALL)
-    manifests_read.clear()
-
-    assert crosscue.catalog(runs).query(ALL).equals(first)
-    assert manifests_read == []
-    assert not (runs / NAME).exists()
-    assert len(list((tmp_path / "cache/crosscue/catalogs").iterdir())) == 1
-
-
 def test_catalog_on_a_full_disk_works_without_index(
     runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,9 +167,3 @@ def test_catalog_on_a_full_disk_works_without_index(
     assert "the disk is full" in found.notices[0]
     assert found.left_out == {}
     assert [path.name for path in runs.iterdir() if path.is_file()] == []
-
-
-def test_single_run_gets_no_index(runs: Path) -> None:
-    crosscue.catalog(runs / "a/monday")
-
-    assert not (runs / "a/monday" / NAME).exists()

@@ -6,7 +6,6 @@ import pytest
 
 import crosscue
 from crosscue.eval import cli
-from crosscue.eval.runs.folder import RunFolder
 from support.catalog_runs import add_run, approach_row, change, scene
 from support.scoring import truth_folder
 
@@ -35,34 +34,3 @@ def test_scored_approach_has_conditions_and_results(runs: Path) -> None:
     assert scored[:6] == ["scored", 7, 0, "A", "stop_sign", ["rain"]]
     assert scored[7:] == [30.0, 20.0]
     assert extra[:3] == ["scored", 9, None]
-
-
-def test_conditions_select_runs(runs: Path) -> None:
-    found = crosscue.catalog(runs)
-
-    assert found.select("'rain' in conditions") == (runs / "scored",)
-    assert found.select("not is_scored") == (runs / "plain",)
-
-
-def test_scores_equal_the_by_drive_table(runs: Path) -> None:
-    table = RunFolder(runs / "scored/score").table("by_drive").to_pylist()
-    rows = crosscue.catalog(runs).query("select metric, value from scores order by metric")
-
-    got = {row["metric"]: row["value"] for row in rows.to_pylist()}
-    assert got["cues.stop_sign.precision"] == pytest.approx(1.0)
-    for one in table:
-        if one["kind"] == "sum":
-            assert got[one["metric"]] == one["total"]
-        elif one["rows"] == 0:
-            assert got[one["metric"]] is None
-        elif one["kind"] == "rms":
-            assert got[one["metric"]] ** 2 * one["rows"] == pytest.approx(one["total"])
-
-
-def test_query_yields_distance_of_first_detected_sign(runs: Path) -> None:
-    rows = crosscue.catalog(runs).query(
-        "select run, max(distance_m) as first_m from cue_frames "
-        "where cue = 'stop_sign' and count > 0 group by run"
-    )
-
-    assert rows.to_pylist() == [{"run": "scored", "first_m": 30.0}]

@@ -61,31 +61,6 @@ def _pair(tmp_path: Path, *, scored: bool = True, drives: int = 1) -> tuple[Path
     return tmp_path / "scores-a", tmp_path / "scores-b"
 
 
-def test_run_compared_with_itself_is_not_worse(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    good, _ = _pair(tmp_path)
-
-    assert cli.run(["compare", str(good), str(good)]) == 0
-    assert "nothing is worse" in capsys.readouterr().out
-
-
-def test_single_drive_lists_differences_but_decides_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    good, worse = _pair(tmp_path)
-
-    assert cli.run(["compare", str(good), str(worse)]) == 0
-    text = capsys.readouterr().out
-    assert "setting    settings.fusion.established: 0.9 -> 0.3" in text
-    assert "table      cues: other values (90 and 90 rows)" in text
-    assert "count: 7 rows differ, by up to 1" in text
-    # 35 of 37 positives are right instead of 30 of 30.
-    assert "undecided  cues.stop_sign.precision: 1 -> 0.945946" in text
-    assert "-0.0541 (too few drives) over 1 drive\n" in text
-    assert "below 6 drives every metric is undecided" in text
-
-
 @pytest.mark.slow
 def test_difference_in_every_drive_is_decided(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -142,16 +117,6 @@ def test_metrics_of_unpaired_drives_are_not_compared(tmp_path: Path) -> None:
 def test_invalid_tolerance_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match=r"expected 0\.01"):
         read_tolerance(text)
-
-
-def test_runs_without_scores_are_compared_by_their_tables(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    good, worse = _pair(tmp_path, scored=False)
-
-    assert cli.run(["compare", str(good), str(worse)]) == 1
-    assert "judged by tables alone" in capsys.readouterr().out
-    assert compare_runs(open_run(good), open_run(good)).worse == ()
 
 
 def test_tables_of_different_rows_or_columns_report_the_difference(tmp_path: Path) -> None:

@@ -1,24 +1,19 @@
 """``crosscue decode``: every stream as a Parquet file, every frame accounted for."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
-import pytest
 
-from crosscue.eval import cli
 from crosscue.eval.catalog.decoded_logs import decode_tables, table_file
-from crosscue.eval.runs.folder import RunFolder, create
+from crosscue.eval.runs.folder import create
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Messages, Table, Topic
 from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.vehicle.vehicle import Mobileye, Vehicle
-from support.data import shared
-from support.gap_drive import BEGIN, ROW, Clock, write_drive
 from support.memory_log import MemoryLog, wheel_block
 
 EYE = Topic("eye", "crosscue/CanFrames", "columns")
@@ -75,33 +70,6 @@ def test_unsupported_topics_are_counted_as_skipped(tmp_path: Path) -> None:
     assert topics["eye"].used == 0
 
 
-@pytest.mark.parametrize("by_s", [-7.0, 0.0, 30.0])
-def test_decoded_tables_record_segment_and_log_time(
-    tmp_path: Path, by_s: float, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=by_s))
-    out = tmp_path / "out"
-    car = str(tmp_path / "car.toml")
-
-    status = cli.run(["decode", str(log), "--vehicle", car, "-o", str(out), "--json"])
-
-    reported = json.loads(capsys.readouterr().out)
-    assert status == (3 if by_s else 0)
-    assert len(reported["time"]["segments"]) == (2 if by_s else 1)
-    speed = pq.read_table(out / "can_WHEEL_SPEEDS.parquet")
-    recorded = Clock(set_at_s=6.0, by_s=by_s).recorded(np.arange(140) * ROW + BEGIN)[1]
-    assert speed["log_t_ns"].to_pylist() == recorded.tolist()
-    assert np.all(np.diff(speed["t_ns"].to_numpy()) > 0)
-    assert speed["segment"].to_pylist() == [0] * 60 + [1 if by_s else 0] * 80
-    skipped = RunFolder(out).table("skipped").to_pylist()
-    for name, topic in reported["account"]["reading"][0]["topics"].items():
-        counts = [topic["used"], *topic["skipped"].values(), *topic["dropped"].values()]
-        assert topic["in"] == sum(counts)
-        rows = [row["count"] for row in skipped if row["topic"] == name]
-        assert sum(rows) == topic["in"] - topic["used"]
-    assert any(row["reason"] == "pictures are not tables" for row in skipped)
-
-
 def test_file_names_of_topics_are_unique_and_stay_in_the_folder() -> None:
     taken: set[str] = set()
     for topic in (
@@ -122,20 +90,3 @@ def test_file_names_of_topics_are_unique_and_stay_in_the_folder() -> None:
         assert not name.startswith(".")
         assert len(name) < 120
         taken.add(name.lower())
-
-
-def test_recorded_ford_bus_decodes_to_plausible_wheel_speeds(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = shared("can", "ford_fusion_2017")
-    log = next(folder.glob("*.candump"))
-    car = tmp_path / "car.toml"
-    dbc = folder / "ford_lincoln_base_pt.dbc"
-    car.write_text(f'version = 1\n[can]\ndbc = ["{dbc}"]\n')
-
-    assert cli.run(["decode", str(log), "--vehicle", str(car), "-o", str(tmp_path / "out")]) == 0
-
-    assert "id not in the database" in capsys.readouterr().out
-    speed = pq.read_table(tmp_path / "out" / "can0_WheelSpeed.parquet")
-    # 28 to 76 km/h, as recorded, on tyres of about 0.33 m.
-    assert 8.0 < np.mean(speed["WhlRl_W_Meas"].to_numpy()) * 0.33 < 22.0

@@ -1,6 +1,5 @@
 """A metric over versions, on the page and in the command's output."""
 
-import json
 import math
 import os
 import re
@@ -87,30 +86,6 @@ def test_page_plots_each_metric_and_marks_its_changes(
     argv = ["history", str(fleet), "--by", "model", "-o", str(page), "--overwrite", "-q"]
     assert cli.run(argv) == 0
     assert page.read_bytes() == first
-
-
-def test_points_have_intervals_and_drive_counts(fleet: Path) -> None:
-    found = crosscue.history(fleet, by="model", metrics=["*.recall"])
-
-    assert found.versions == MODELS
-    assert found.drives == (8, 8, 8, 7)
-    (one,) = found.metrics
-    assert [change.at for change in one.changes] == [2]
-    assert one.changes[0].by == pytest.approx(-0.15, abs=0.02)
-    assert not one.is_better(one.changes[0])
-    for point in one.points:
-        assert point.low < point.value < point.high
-    assert one.points[3].drives == 7
-
-
-def test_single_version_has_no_changes(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["history", str(fleet), "--by", "version", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-
-    assert len(found["versions"]) == 1
-    assert all(not one["changes"] for one in found["metrics"])
-    # Four runs of each drive: the latest one represents it.
-    assert found["left_out"]["replaced by a later run of the same drive"] == 31 - found["drives"][0]
 
 
 @pytest.mark.parametrize(

@@ -122,14 +122,6 @@ def test_unpaired_drives_and_unscored_runs_are_reported(tmp_path: Path, fleet: P
     assert found.is_passed
 
 
-def test_two_runs_of_one_drive_in_a_set_are_refused(tmp_path: Path, fleet: Path) -> None:
-    before = sorted((fleet / "before").iterdir())
-    twice = scored_runs(tmp_path / "twice", [5])
-
-    with pytest.raises(crosscue.UsageError, match="are runs of one drive; narrow the query"):
-        compare_many([*before, *twice], before)
-
-
 @pytest.mark.parametrize(
     ("words", "status", "message"),
     [

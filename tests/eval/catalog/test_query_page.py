@@ -52,10 +52,6 @@ def catalog(tmp_path_factory: pytest.TempPathFactory) -> crosscue.Catalog:
     return crosscue.catalog(runs)
 
 
-def test_page_has_ten_queries() -> None:
-    assert len(PAGE_QUERIES) == 10
-
-
 @pytest.mark.parametrize("sql", PAGE_QUERIES, ids=range(1, len(PAGE_QUERIES) + 1))
 def test_query_of_the_page_returns_rows(catalog: crosscue.Catalog, sql: str) -> None:
     assert catalog.query(sql).num_rows > 0

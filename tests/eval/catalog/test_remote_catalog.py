@@ -14,7 +14,6 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 import crosscue
-from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.errors import UnreadableRunError, UsageError
 from support.catalog_runs import add_run, runs_below
 
@@ -97,10 +96,6 @@ def test_remote_catalog_equals_local_catalog(folder: Path, url: str, sql: str) -
     assert crosscue.catalog(url).query(sql).equals(crosscue.catalog(folder).query(sql))
 
 
-def test_file_url_names_a_local_folder(folder: Path) -> None:
-    assert crosscue.catalog(f"file://{folder}").runs == crosscue.catalog(folder).runs
-
-
 def test_queries_fetch_only_required_columns_and_row_groups(url: str) -> None:
     size = len(CountedStore.store["/fleet/a/monday/pose.parquet"].getvalue())
     found = crosscue.catalog(url)
@@ -117,30 +112,6 @@ def test_queries_fetch_only_required_columns_and_row_groups(url: str) -> None:
     assert footer < one_group < footer + size / 41
     assert one_group < one_column < footer + size / 5
     assert fetched("select avg(approaches) from runs") == 0
-
-
-def test_second_opening_fetches_only_changed_runs(url: str, folder: Path) -> None:
-    crosscue.catalog(url)
-    CountedStore.fetched.clear()
-    crosscue.catalog(url)
-    assert CountedStore.fetched == []
-
-    manifest = RunFolder(folder / "a/monday").file("manifest.json").read_text()
-    address = "/fleet/b/monday/manifest.json"
-    before = CountedStore.store[address].getvalue()
-    CountedStore().pipe_file(address, manifest.replace('"name": "car"', '"name": "bus"').encode())
-    try:
-        assert crosscue.catalog(url).query("from runs where vehicle = 'bus'").num_rows == 1
-    finally:
-        CountedStore().pipe_file(address, before)
-
-
-def test_nothing_is_written_to_the_store(url: str) -> None:
-    before = {*CountedStore.store}
-
-    crosscue.catalog(url).query("from belief")
-
-    assert {*CountedStore.store} == before
 
 
 def test_selection_of_remote_runs_is_refused(url: str) -> None:

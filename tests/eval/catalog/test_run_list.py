@@ -33,17 +33,6 @@ def test_folder_names_its_runs_but_not_their_merged_run(runs: Path) -> None:
     assert runs_of([str(runs)]) == (runs / "a", runs / "b", runs / "deep" / "c")
 
 
-def test_run_folder_names_itself_even_if_merged(runs: Path) -> None:
-    assert runs_of([str(runs / "b"), str(runs / "merged")]) == (runs / "b", runs / "merged")
-
-
-def test_incomplete_run_is_listed(runs: Path) -> None:
-    (runs / "b" / "manifest.json").unlink()
-    (runs / "b" / "pose.parquet").touch()
-
-    assert runs / "b" in runs_of([str(runs)])
-
-
 def test_run_named_twice_is_refused(runs: Path) -> None:
     with pytest.raises(CrosscueError, match="named twice"):
         runs_of([str(runs / "b"), str(runs)])
@@ -75,7 +64,3 @@ def test_invalid_run_arguments_are_refused_in_one_line(
         runs_of([argument.format(runs)])
 
     assert "\n" not in str(caught.value)
-
-
-def test_missing_run_folder_is_kept_in_the_list(tmp_path: Path) -> None:
-    assert runs_of([str(tmp_path / "gone")]) == (tmp_path / "gone",)

@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 from crosscue.eval.cli import run
 from crosscue.eval.logs.summary import lines_of
 from crosscue.replay.base import EVERYTHING, Selection
-from crosscue.replay.columns import DATA, Block, CanFrames, Messages, Topic
+from crosscue.replay.columns import DATA, Block, CanFrames, Topic
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.logs.log_summary import common_span, quick_summary, summarise_log
+from crosscue.replay.logs.log_summary import common_span, summarise_log
 from crosscue.replay.safe_text import table, terminal_cells, visible, wrapped
 from crosscue.results import plain
 from support.clock_streams import SECOND_NS, START_NS, Stream, table_of
@@ -109,17 +109,6 @@ def text_of(log: BlockLog, width: int = 80) -> str:
     return "\n".join(lines_of(summarise_log(log), width))
 
 
-def test_summary_of_complete_log_lists_topics_and_no_findings() -> None:
-    text = text_of(example_log())
-
-    assert re.search(r"^/imu +sensor_msgs/msg/Imu +inertial unit +300 +20$", text, re.M)
-    assert re.search(r"^/imu +header stamp +50 ms +0 +50 ms", text, re.M)
-    assert re.search(r"^/imu +300 +300 +300 +0 +0$", text, re.M)
-    assert "every chunk's CRC verified" in text
-    assert "findings" not in text
-    assert "losses" not in text
-
-
 def test_can_identifiers_are_counted_by_frame_format_and_frequency() -> None:
     summary = summarise_log(example_log())
     bus = next(t for t in summary.topics if t.name == "can0")
@@ -143,53 +132,6 @@ def test_losses_are_reported_by_topic_reason_and_place() -> None:
     assert "- an unknown number of unknown topics: file is cut (at byte 9)" in text
     assert "- at least 0 rows of unknown topics dropped: file is cut" in text
     assert re.search(r"^\(topic not known\) .*>= 0$", text, re.M)
-
-
-@pytest.mark.parametrize("dropped", [0, 1, 40])
-def test_rows_of_the_account_add_up(dropped: int) -> None:
-    summary = summarise_log(example_log(dropped=dropped))
-
-    for topic in summary.topics:
-        assert topic.found == topic.used + sum(topic.skipped.values())
-        if topic.declared is not None:
-            assert topic.declared == topic.found + sum(topic.dropped.values())
-
-
-def test_undecodable_topic_is_skipped_with_reason_and_rate() -> None:
-    n = 40
-    zeros = np.zeros(n, dtype=np.int64)
-    rows = Messages(np.zeros(4, dtype=np.uint8), zeros, zeros + 4)
-    block = Block("/odd", START_NS + 100 * MS * np.arange(n, dtype=np.int64), rows)
-    log = BlockLog((block,), (Topic("/odd", "odd_msgs/msg/Odd", "bson"),))
-
-    summary = summarise_log(log)
-
-    (topic,) = summary.topics
-    assert topic.skipped == {"no decoder for encoding 'bson'": n}
-    assert topic.used == 0
-    assert topic.rate_hz == pytest.approx(10.0)
-    assert "/odd: none of its 40 rows can be used: no decoder for encoding 'bson'" in (
-        summary.findings
-    )
-
-
-def test_two_can_buses_are_reported_as_ambiguous() -> None:
-    log = example_log()
-    two = replace(log, topics=(*log.topics, column_topic("can1", "crosscue/CanFrames")))
-
-    assert "2 topics could be the CAN bus (can0, can1): select one of them in the vehicle file" in (
-        summarise_log(two).findings
-    )
-
-
-def test_topics_without_common_clock_are_reported() -> None:
-    stream = Stream(300, 50 * MS)
-    log = BlockLog(
-        (table_of("/a", stream.log_ns()), table_of("/b", stream.log_ns() - START_NS)),
-        (column_topic("/a"), column_topic("/b")),
-    )
-
-    assert any(f.startswith("no two share a clock") for f in summarise_log(log).findings)
 
 
 def test_combined_logs_report_their_common_time() -> None:
@@ -219,25 +161,6 @@ def test_combined_logs_report_their_common_time() -> None:
     assert common_span([]).start_ns is None
 
 
-def test_empty_log_is_reported_as_empty() -> None:
-    text = text_of(BlockLog((), (column_topic("/imu"),)))
-
-    assert "- it contains no rows" in text
-    assert "no rows" in text
-
-
-def test_quick_summary_reads_no_messages() -> None:
-    class Unreadable(BlockLog):
-        def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-            raise AssertionError("the body was read")
-
-    log = example_log()
-    text = "\n".join(lines_of(quick_summary(Unreadable(log.blocks, log.topics)), 80))
-
-    assert re.search(r"^/imu +sensor_msgs/msg/Imu +inertial unit +300$", text, re.M)
-    assert "not one row" not in text
-
-
 def test_hostile_names_are_escaped_in_text_and_json() -> None:
     stream = Stream(40, 50 * MS)
     log = BlockLog(
@@ -257,18 +180,6 @@ def test_hostile_names_are_escaped_in_text_and_json() -> None:
     assert "\\\\x1b[31m" in text
 
 
-def test_json_summary_is_strict_and_sorted() -> None:
-    text = strict_json(plain(summarise_log(example_log())))
-
-    tree = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
-    assert list(tree) == sorted(tree)
-    imu = next(t for t in tree["topics"] if t["name"] == "/imu")
-    assert imu["clocks"]["used"] == "header stamp"
-    assert imu["clocks"]["header"]["line"]["rows"] == 300
-    assert imu["clocks"]["log"]["line"] is None
-    assert imu["clocks"]["publish"] is None
-
-
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.text(max_size=90), st.text(max_size=60)), max_size=4),
@@ -283,18 +194,6 @@ def test_tables_and_sentences_fit_the_terminal_width(
     for line in [*cut, *(part for r in rows for part in wrapped(r[0], width).split("\n"))]:
         assert terminal_cells(line) <= width
         assert "\x1b" not in line
-
-
-def test_summary_of_typical_log_fits_eighty_columns() -> None:
-    long = "/vehicle/sensors/front_left/camera_driver/image_rect_color/compressed"
-    stream = Stream(300, 50 * MS, wait_ns=MS)
-    log = BlockLog(
-        (table_of(long, stream.log_ns(), stream.header_ns()),),
-        (column_topic(long, "sensor_msgs/msg/CompressedImage"),),
-        dropped=12,
-    )
-
-    assert max(terminal_cells(line) for line in text_of(log, 80).split("\n")) <= 80
 
 
 @pytest.mark.parametrize(
@@ -312,21 +211,6 @@ def test_visible_text_keeps_letters_and_escapes_the_rest(raw: str, safe: str) ->
     assert visible(raw) == safe
 
 
-def test_info_of_recorded_minute_reports_its_losses(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    segment = next(shared("comma2k19", "Example_1").glob("*/*"))
-    monkeypatch.setenv("COLUMNS", "80")
-
-    status = run(["info", str(segment)])
-
-    out = capsys.readouterr().out
-    assert status == 3
-    assert re.search(r"^can/0 +crosscue/CanFrames +CAN bus +53800 ", out, re.M)
-    assert "64 of 592 rows dropped: array file is cut" in out
-    assert max(terminal_cells(line) for line in out.split("\n")) <= 80
-
-
 def test_info_of_two_logs_as_json_combines_them(capsys: pytest.CaptureFixture[str]) -> None:
     segment = next(shared("comma2k19", "Example_1").glob("*/*"))
 
@@ -337,13 +221,6 @@ def test_info_of_two_logs_as_json_combines_them(capsys: pytest.CaptureFixture[st
     assert [log["format"] for log in tree["logs"]] == ["comma2k19", "comma2k19"]
     assert tree["together"]["findings"] == []
     assert tree["together"]["start_ns"] == tree["logs"][0]["start_ns"]
-
-
-def test_info_of_folder_without_log_exits_4(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    assert run(["info", str(tmp_path)]) == 4
-    assert "a folder without a known log in it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import os
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -20,7 +19,7 @@ from crosscue.datasets.scenes.drive import write_scene
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval import cli
-from crosscue.eval.runs.folder import RunFolder, create, locked, open_run
+from crosscue.eval.runs.folder import create, locked, open_run
 from crosscue.replay.errors import RunError
 from support import faults, scenes
 from support.trees import tree
@@ -123,30 +122,6 @@ def test_run_killed_anywhere_restarts_to_equal_bytes(drive: Drive, tmp_path: Pat
         assert tree(run) == drive.complete
 
 
-def test_run_killed_while_replacing_another_is_complete_or_marked(
-    drive: Drive, tmp_path: Path
-) -> None:
-    run = drive.folder / tmp_path.name
-    argv = drive.replay(run, "--overwrite")
-    shutil.copytree(drive.folder / "complete", run)
-    text = run.joinpath("manifest.json").read_text()
-    run.joinpath("manifest.json").write_text(text.replace("crosscue simulated car", "earlier"))
-    count = len(faults.operations(run, faults.CHANGES, argv))
-
-    for operation in _sampled_points(3, count, seed=2):
-        shutil.rmtree(run)
-        shutil.copytree(drive.folder / "complete", run)
-        run.joinpath("manifest.json").write_text(text.replace("simulated car", "earlier car"))
-        assert faults.killed_before(run, operation, argv).status == -signal.SIGKILL
-        manifest = run / "manifest.json"
-        if manifest.exists() and "earlier car" in manifest.read_text():
-            assert {name for name in tree(run) if not name.startswith(".")} == set(drive.complete)
-        else:
-            _check_complete_or_marked(run, drive.complete)
-        assert cli.run([*argv, "-q"]) == 0
-        assert tree(run) == drive.complete
-
-
 def test_killed_estimate_is_complete_or_marked(drive: Drive, tmp_path: Path) -> None:
     run, other = tmp_path / "run", tmp_path / "other.toml"
     shutil.copytree(drive.folder / "complete", run)
@@ -182,24 +157,6 @@ def test_failed_write_anywhere_leaves_no_partial_files(
         _check_clean(run, drive)
 
 
-def test_failed_fsync_is_reported(drive: Drive, tmp_path: Path) -> None:
-    for call in (0, 3, 9):
-        ended = faults.with_failing_fsync(call, drive.replay(tmp_path / f"run{call}"))
-        _check_message(ended)
-        assert "Input/output error" in ended.said
-        _check_clean(tmp_path / f"run{call}", drive)
-
-
-def test_file_size_limit_is_reported(drive: Drive, tmp_path: Path) -> None:
-    # The length of timings.json varies by a few bytes.
-    sizes = sorted(p.stat().st_size for p in (drive.folder / "complete").glob("*.parquet"))
-
-    for size in (0, 100, sizes[len(sizes) // 2], sizes[-1] - 1):
-        ended = faults.with_files_up_to(size, drive.replay(tmp_path / f"run{size}"))
-        _check_message(ended)
-        _check_clean(tmp_path / f"run{size}", drive)
-
-
 def _check_clean(run: Path, drive: Drive) -> None:
     if run.exists():
         assert not [p.name for p in run.iterdir() if p.suffix == ".partial" or p.name == ".lock"]
@@ -225,52 +182,6 @@ def test_locked_run_is_refused_and_names_the_process(drive: Drive, tmp_path: Pat
     assert cli.run(drive.replay(run, "--overwrite", "-q")) == 0
 
 
-def test_lock_is_exclusive_among_many_processes(tmp_path: Path) -> None:
-    run = create(tmp_path / "run", overwrite=False)
-    children = []
-    for _ in range(4):
-        child = os.fork()
-        if child == 0:
-            os._exit(_lock_in_turn(run.path, 20))
-        children.append(child)
-
-    statuses = {os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children}
-
-    assert statuses == {0}
-
-
-def _lock_in_turn(path: Path, turns: int) -> int:
-    """Return 0 if the lock was exclusive, else 1; leave locks of killed processes between turns."""
-    run, inside = create(path, overwrite=True), path.parent / "inside"
-    while turns:
-        try:
-            with locked(run):
-                try:
-                    os.close(os.open(inside, os.O_CREAT | os.O_EXCL))
-                except FileExistsError:
-                    return 1
-                time.sleep(0.0005)
-                inside.unlink()
-        except RunError:
-            continue
-        turns -= 1
-        if turns % 4 == 0:
-            _leave_lock_of_killed_process(run)
-    return 0
-
-
-def _leave_lock_of_killed_process(run: RunFolder) -> None:
-    """Lock the run in a process that is killed at once; do nothing while another holds it."""
-    child = os.fork()
-    if child == 0:
-        lock = locked(run)
-        try:
-            lock.__enter__()
-        finally:
-            os.kill(os.getpid(), signal.SIGKILL)
-    os.waitpid(child, 0)
-
-
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become nobody")
 def test_missing_permissions_are_reported(drive: Drive, tmp_path: Path) -> None:
     def as_nobody() -> None:
@@ -292,26 +203,6 @@ def test_missing_permissions_are_reported(drive: Drive, tmp_path: Path) -> None:
     assert log.status == 4
     assert "no permission to read it" in log.said
     assert tree(drive.folder / "complete") == drive.complete
-
-
-def test_time_zone_locale_and_hash_seed_do_not_change_output(drive: Drive) -> None:
-    variants = (
-        {"TZ": "America/Los_Angeles", "LC_ALL": "C", "PYTHONHASHSEED": "1", "COLUMNS": "20"},
-        {"TZ": "Asia/Kolkata", "LC_ALL": "tr_TR.UTF-8", "PYTHONHASHSEED": "2", "HOME": "/nowhere"},
-    )
-    code = "import sys; from crosscue.eval.cli import main; main(sys.argv[1:])"
-    commands = [
-        subprocess.Popen(
-            [sys.executable, "-c", code, *drive.replay(drive.folder / f"zone{i}", "-q")],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **variant},
-            stderr=subprocess.PIPE,
-        )
-        for i, variant in enumerate(variants)
-    ]
-    stderr = [command.communicate(timeout=60)[1] for command in commands]
-
-    assert stderr == [b"", b""]
-    assert [tree(drive.folder / f"zone{i}") == drive.complete for i in (0, 1)] == [True, True]
 
 
 def test_replay_opens_no_socket(drive: Drive, tmp_path: Path) -> None:

@@ -72,38 +72,6 @@ def _write_export(folder: Path, kind: str, metadata: Mapping[str, str]) -> Path:
     return path
 
 
-def test_rt_detr_with_selected_boxes_is_recognised_by_its_head(tmp_path: Path) -> None:
-    """Ultralytics 8.4 writes rows as in an end-to-end export, but in fractions."""
-    metadata = {**ULTRALYTICS, "head": "RTDETRDecoder", "task": "detect"}
-
-    assert run(["model", "init", str(_write_export(tmp_path, "end-to-end", metadata))]) == 0
-
-    output = read_card(tmp_path / "my.toml").output
-    assert isinstance(output, DetrOutput)
-    assert output.is_selected
-    rows = np.array([[[0.5, 0.5, 0.25, 0.5, 0.8, 2.0]]])
-    found = output.candidates({"output0": rows}, (128, 64))
-    np.testing.assert_allclose(found.boxes_px, [[48.0, 16.0, 80.0, 48.0]])
-    assert (found.scores[0], found.classes[0]) == (0.8, 2)
-
-
-@pytest.mark.parametrize(
-    ("row", "kind"),
-    [((30.0, 10.0, 50.0, 40.0, 0.8, 2.0), "end-to-end"), ((0.5, 0.5, 0.3, 0.4, 0.8, 2.0), "detr")],
-)
-def test_layout_without_metadata_is_recognised_by_box_size(
-    tmp_path: Path, row: tuple[float, ...], kind: str
-) -> None:
-    rows = np.tile(np.array(row, np.float32), (1, 300, 1))
-    rows[0, :, 4] = np.linspace(0.0, 0.8, 300)
-    path = tmp_path / "my.onnx"
-    path.write_bytes(constant_model((1, 3, 64, 128), {"output0": rows}))
-
-    crosscue.draft_card(path, class_names=["person", "car", "stop sign"])
-
-    assert read_card(tmp_path / "my.toml").output.kind == kind
-
-
 METADATA = "task: detect\nimgsz:\n- 64\n- 128\nnames:\n  0: person\n  1: car\n  2: stop sign\n"
 
 
@@ -180,24 +148,6 @@ def test_torchvision_export_with_unnamed_outputs_is_recognised(tmp_path: Path) -
     assert (output.boxes, output.labels, output.scores) == ("1042", "1043", "1044")
 
 
-def test_torchvision_export_of_dynamic_size_gets_default_input_size(tmp_path: Path) -> None:
-    model = onnx.load_model_from_string(
-        constant_model(
-            (3, 64, 128),
-            {"boxes": _zeros(0, 4), "labels": np.ones(0, np.int64), "scores": _zeros(0)},
-        )
-    )
-    for axis in (1, 2):
-        model.graph.input[0].type.tensor_type.shape.dim[axis].dim_param = "open"
-    path = tmp_path / "my.onnx"
-    path.write_bytes(model.SerializeToString())
-
-    crosscue.draft_card(path, class_names=["person"])
-
-    given = read_card(tmp_path / "my.toml").input
-    assert (given.width_px, given.height_px, given.fit) == (1333, 800, "letterbox")
-
-
 @pytest.mark.parametrize(
     ("names", "columns", "activation", "is_normalised"),
     [
@@ -222,26 +172,6 @@ def test_detr_variants_are_distinguished(
     assert (card.input.mean != (0.0, 0.0, 0.0)) == is_normalised
     number = card.output.classes.index("stop sign") + card.output.first_class
     assert number == (11 if columns == 80 else 13)
-
-
-def test_decoded_yolox_export_gets_bgr_input_without_scaling(tmp_path: Path) -> None:
-    """Tell YOLOX, with one row per cell, from networks with three anchors per cell."""
-    for rows, colour, scale in ((168, "bgr", 1.0), (504, "rgb", 1 / 255)):
-        path = tmp_path / "my.onnx"
-        path.write_bytes(constant_model((1, 3, 64, 128), {"output": _zeros(1, rows, 85)}))
-
-        crosscue.draft_card(path, kind="yolov5", overwrite=True)
-
-        given = read_card(tmp_path / "my.toml").input
-        assert (given.colour, given.scale) == (colour, (scale,) * 3)
-
-
-@pytest.mark.parametrize(("kind", "number"), [("end-to-end", 11), ("torchvision", 12)])
-def test_coco_class_numbers_depend_on_the_layout(tmp_path: Path, kind: str, number: int) -> None:
-    """YOLO numbers 80 classes without gaps; torchvision and TensorFlow keep COCO's numbers."""
-    crosscue.draft_card(_write_export(tmp_path, kind, {}), kind=kind)
-
-    assert read_card(tmp_path / "my.toml").output.classes.index("stop sign") == number
 
 
 def test_network_with_size_input_receives_the_picture_size(tmp_path: Path) -> None:
@@ -361,24 +291,6 @@ def test_assumptions_are_reported_and_written_to_the_card(
     assert "assumed    logits become scores by the logistic function" in message
     text = (tmp_path / "my.toml").read_text(encoding="utf-8")
     assert "# Assumed, please check: logits become scores" in text
-
-
-def test_dynamic_output_sizes_are_found_by_running_the_network(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    model = onnx.load_model_from_string(bright_box_model())
-    model.graph.output[0].type.tensor_type.shape.dim[2].dim_param = "columns"
-    path = tmp_path / "my.onnx"
-    path.write_bytes(model.SerializeToString())
-    names = tmp_path / "names.txt"
-    names.write_text("bright\n", encoding="utf-8")
-
-    args = ["--class-names", str(names), "--size", "96x64"]
-    assert run(["model", "init", str(path), *args]) == 0
-
-    assert "my.toml: end-to-end" in capsys.readouterr().out
-    card = read_card(tmp_path / "my.toml")
-    assert (card.input.width_px, card.input.height_px) == (96, 64)
 
 
 def test_ambiguous_layouts_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

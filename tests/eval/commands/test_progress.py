@@ -65,36 +65,6 @@ def test_line_shows_amount_rate_and_time_left(
         assert "3,000 of 6,000 rows" in shown_text(line, terminal)
 
 
-@pytest.mark.parametrize("total", [None, 0, 5])
-def test_unknown_or_exceeded_total_is_not_shown(
-    monkeypatch: pytest.MonkeyPatch, total: int | None
-) -> None:
-    terminal = replaced_stderr(monkeypatch)
-    with ProgressLine("reading", is_shown=True) as line:
-        line.at(Done(10, total, "rows"))
-        text = shown_text(line, terminal)
-
-    assert "10 rows" in text
-    assert "left" not in text
-
-
-def test_names_are_shown_without_markup_and_escapes(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = replaced_stderr(monkeypatch)
-    with ProgressLine("sealing [red]a\x1b[2Jb.bag", is_shown=True) as line:
-        line.at(Done(1, 2, "MB"))
-        text = shown_text(line, terminal)
-
-    assert "sealing [red]a\\x1b[2Jb.bag" in text
-
-
-def test_hidden_line_writes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = replaced_stderr(monkeypatch)
-    with ProgressLine("reading", is_shown=False) as line:
-        line.at(Done(1, 2, "rows"))
-
-    assert terminal.getvalue() == ""
-
-
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("progress")

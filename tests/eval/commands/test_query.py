@@ -156,19 +156,6 @@ def test_query_cannot_access_files_or_change_data(
     assert (tree(runs), sorted(tmp_path.iterdir())) == before
 
 
-def test_database_settings_are_locked(runs: Path) -> None:
-    settings = crosscue.catalog(runs).query(
-        "select name, value from duckdb_settings() where name in "
-        "('enable_external_access', 'lock_configuration', 'autoload_known_extensions')"
-    )
-
-    assert dict(zip(*settings.to_pydict().values(), strict=True)) == {
-        "enable_external_access": "false",
-        "lock_configuration": "true",
-        "autoload_known_extensions": "false",
-    }
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="limits memory with /proc and RLIMIT_AS")
 @pytest.mark.parametrize("caller", ["cli.run(['query', {runs!r}, {sql!r}])", "catalog({runs!r})"])
 def test_result_that_exceeds_memory_is_refused_in_one_line(runs: Path, caller: str) -> None:

@@ -11,12 +11,9 @@ import pytest
 
 import crosscue
 from crosscue.datasets.real import annotate_pandaset, recordings
-from crosscue.datasets.truth.truth import read_truth as load_truth
 from crosscue.detectors.catalog import fetch as weights
 from crosscue.detectors.catalog import places
 from crosscue.eval.cli import run
-from crosscue.eval.drives import demo as real_demo
-from crosscue.replay.vehicle.vehicle import load as load_vehicle
 from support.data import shared
 from support.range_server import serving
 from support.stand_in import StandIn, stand_in
@@ -76,23 +73,6 @@ def test_local_data_folder_needs_no_download(
     assert not stand_in_drive.server.gets
 
 
-def test_interrupted_download_is_resumed(
-    stand_in_drive: StandIn, capsys: pytest.CaptureFixture[str]
-) -> None:
-    stand_in_drive.server.failing = 1
-    assert run(["demo", "--real"]) == 1
-    first = capsys.readouterr().err
-    assert "needed: recording pandaset_002: " in first
-    assert "interrupted after" in first
-    assert first.count("\n") == 1
-    assert not Path("demo-real").exists()
-
-    crosscue.fetch_drive()
-
-    assert stand_in_drive.server.gets[1].startswith("bytes=")
-    assert not list(recordings.recording_folder(stand_in_drive.known).rglob("*.part"))
-
-
 @pytest.mark.parametrize("name", [PICTURE, "net.onnx"])
 def test_file_of_wrong_checksum_is_not_kept(stand_in_drive: StandIn, name: str) -> None:
     stand_in_drive.server.files[name] = stand_in_drive.server.files[name][:-1] + b"\0"
@@ -103,48 +83,6 @@ def test_file_of_wrong_checksum_is_not_kept(stand_in_drive: StandIn, name: str) 
     below = (recordings.recording_folder(stand_in_drive.known), places.model_folder())
     names = [path.name for folder in below for path in folder.rglob("*")]
     assert Path(name).name not in names
-
-
-def test_changed_cached_file_is_fetched_again(stand_in_drive: StandIn) -> None:
-    drive = crosscue.fetch_drive()
-    picture = drive.log / PICTURE.removeprefix("drive/")
-    original = picture.read_bytes()
-    picture.write_bytes(original[:-1] + b"\0")
-
-    crosscue.fetch_drive()
-
-    assert picture.read_bytes() == original
-
-
-def test_missing_network_error_names_all_requirements(
-    stand_in_drive: StandIn, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv(recordings.MIRROR, "http://127.0.0.1:9")
-
-    assert run(["demo", "--real"]) == 1
-
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
-    for part in (
-        "pandaset_002: 11 files",
-        "CC BY 4.0",
-        "yolox-nano",
-        "--data FOLDER",
-        weights.DATA,
-    ):
-        assert part in message
-    assert not Path("demo-real").exists()
-
-
-def test_configured_mirror_is_used(
-    stand_in_drive: StandIn, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in [name for name in stand_in_drive.server.files if name.startswith("drive/")]:
-        moved = name.replace("drive/", "mirror/pandaset_002/")
-        stand_in_drive.server.files[moved] = stand_in_drive.server.files.pop(name)
-    monkeypatch.setenv(recordings.MIRROR, f"{stand_in_drive.server.base}/mirror")
-
-    assert crosscue.fetch_drive().log.is_dir()
 
 
 def test_folder_without_the_recording_is_refused(stand_in_drive: StandIn, tmp_path: Path) -> None:
@@ -175,18 +113,6 @@ def test_options_of_the_other_demo_are_refused(
 def test_source_for_simulated_demo_is_refused() -> None:
     with pytest.raises(crosscue.UsageError, match="add real=True"):
         crosscue.demo(source="folder")
-
-
-def test_files_of_the_real_demo_are_consistent() -> None:
-    known = recordings.recording(real_demo.REAL)
-    vehicle, truth = load_vehicle(known.vehicle), load_truth(known.truth)
-
-    assert len(known.files) == 83
-    assert len({file.name for file in known.files}) == 83
-    assert [section.kind for section in vehicle.detectors.values()] == [real_demo.MODEL]
-    assert [one.control for one in truth.approaches] == ["traffic_light"]
-    assert truth.ranges is not None
-    assert (known.truth.parent / truth.ranges).is_file()
 
 
 def test_stored_truth_equals_output_of_annotation_script(tmp_path: Path) -> None:

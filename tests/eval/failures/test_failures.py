@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from collections.abc import Mapping
@@ -14,12 +13,10 @@ import pytest
 import crosscue
 from crosscue.eval import cli
 from crosscue.eval.failures.approach_level import flips_without_truth
-from crosscue.eval.failures.frame_level import wrong_ranges
-from crosscue.eval.failures.order import cause_groups, diverse, ranked
+from crosscue.eval.failures.order import diverse
 from crosscue.eval.failures.record import Failure, distance_bin, read_failures, write_failures
 from crosscue.eval.scoring.columns import BeliefRows
-from crosscue.eval.scoring.scene.ranges import RangeJudged
-from crosscue.replay.errors import AnnotationError, UnreadableRunError, UsageError
+from crosscue.replay.errors import AnnotationError, UsageError
 from support.scene_run import scene_run
 from support.scoring import at, truth_folder
 
@@ -92,27 +89,6 @@ def test_overconfident_range_is_a_failure(tmp_path: Path) -> None:
     assert wrong.severity == pytest.approx(25.0 / (2.0 * math.log(2.0)))
 
 
-@pytest.mark.parametrize(
-    ("error_m", "cause"),
-    [(0.9, "too far"), (-0.9, "too near"), (0.7, "interval too narrow"), (0.19, None)],
-)
-def test_range_failure_is_blamed_on_range_or_interval(error_m: float, cause: str | None) -> None:
-    rows = {"t_ns": np.array([at(3)]), "approach": np.array([7]), "true_m": np.array([8.0])}
-    judged = RangeJudged(
-        "drive",
-        "start",
-        **rows,
-        error_m=np.array([error_m]),
-        var_m2=np.array([0.01]),
-        left_out={},
-        controls={},
-    )
-
-    found = [one.cause for one in wrong_ranges([judged], {}, "run")]
-
-    assert found == ([] if cause is None else [cause])
-
-
 def test_run_without_truth_reports_only_flipped_beliefs(
     drive: tuple[Path, Path],
 ) -> None:
@@ -150,22 +126,6 @@ def test_decided_belief_is_flipped_where_it_crosses_one_half() -> None:
     assert flip.cause == "no cue speaks against it"
 
 
-def test_flip_severity_is_equal_in_both_directions() -> None:
-    (yes,) = _flips(_belief(left=[0.5, 0.95, 0.2]))
-    (no,) = _flips(_belief(left=[0.5, 0.05, 0.8]))
-
-    assert yes.severity == pytest.approx(no.severity)
-
-
-@pytest.mark.parametrize(
-    "values",
-    [[0.5, 0.95, 0.99], [0.5, 0.85, 0.1], [0.02, 0.02, 0.6, 0.95], [0.5, 0.95, 0.55]],
-    ids=["unchanged", "undecided", "prior", "weakened"],
-)
-def test_undecided_or_unchanged_belief_is_not_a_flip(values: list[float]) -> None:
-    assert not _flips(_belief(left=values))
-
-
 def test_flip_names_the_contradicting_cue() -> None:
     belief = _belief(intersection=[0.5, 0.95, 0.4], left=[0.5, 0.95, 0.1])
     (left,) = [
@@ -174,16 +134,6 @@ def test_flip_names_the_contradicting_cue() -> None:
 
     assert left.cause == "a cue speaks against it"
     assert "one way right in 1 frames" in left.reported
-
-
-def test_ranking_is_independent_of_input_order() -> None:
-    failures = [
-        failure(s, run=run, t_ns=t) for s, run, t in itertools.product([1, 2], "ab", [1, 2])
-    ]
-
-    assert ranked(failures) == ranked(failures[::-1])
-    assert diverse(failures, 3) == diverse(failures[::-1], 3)
-    assert [one.severity for one in ranked(failures)] == sorted([1, 2] * 4, reverse=True)
 
 
 def test_diverse_selection_alternates_between_causes_and_runs() -> None:
@@ -198,15 +148,6 @@ def test_diverse_selection_alternates_between_causes_and_runs() -> None:
     assert first_three[:2] == first_two
     assert {one.run for one in first_three if one.cause == "not detected"} == {"a", "b"}
     assert sorted(diverse(everything, 99), key=repr) == sorted(everything, key=repr)
-
-
-def test_cause_groups_count_each_failure_once() -> None:
-    groups = cause_groups([failure(), failure(3.0, run="b"), failure(kind="late")])
-
-    assert [(g.kind, g.failures, g.runs, g.severity) for g in groups] == [
-        ("missed", 2, 2, 3.0),
-        ("late", 1, 1, 1.0),
-    ]
 
 
 @pytest.mark.parametrize("ending", ["parquet", "json"])
@@ -229,17 +170,6 @@ def test_damaged_failure_table_is_refused_by_name(tmp_path: Path) -> None:
         (tmp_path / name).write_text(text)
         with pytest.raises(AnnotationError, match=name):
             read_failures(tmp_path / name)
-
-
-def test_unreadable_run_does_not_hide_the_others(drive: tuple[Path, Path], tmp_path: Path) -> None:
-    broken = tmp_path / "broken"
-    broken.mkdir()
-    (broken / "manifest.json").write_text("{")
-
-    found = crosscue.failures([drive[0], broken], truth=drive[1])
-    assert (found.runs, list(found.failed), found.found) == (2, [broken], len(found))
-    with pytest.raises(UnreadableRunError, match="broken"):
-        crosscue.failures(broken)
 
 
 def test_result_is_available_as_table_text_and_dict(

@@ -108,14 +108,6 @@ def test_corrected_boxes_are_imported_and_used_for_training_and_fitting(
     assert [sum(int(one[n]) for one in counts if one) for n in (1, 2)] == [len(original)] * 2
 
 
-def test_imported_picture_without_cue_records_its_absence(exported: Path, tmp_path: Path) -> None:
-    found = crosscue.import_truth(exported, tmp_path / "labelled", export=exported.parent)
-    assert isinstance(found, crosscue.ImportedLabels)
-
-    (drive,) = found.drives.values()
-    assert drive.cues["stop_sign"] == 0
-
-
 def test_missing_pictures_are_counted_and_unknown_or_duplicate_ones_refused(
     exported: Path, tmp_path: Path
 ) -> None:

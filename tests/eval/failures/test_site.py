@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import re
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 
 import crosscue
-from crosscue.eval.failures.record import Failure, read_failures, write_failures
-from crosscue.eval.failures.site import FACETS, PER_PAGE, site_entries, write_lists
+from crosscue.eval.failures.record import read_failures, write_failures
 from crosscue.replay.errors import EmptyResultError, OutputError, UsageError
 from support.scene_run import scene_run
 from support.scoring import truth_folder
@@ -56,83 +53,10 @@ def test_all_links_resolve_and_each_failure_has_page_and_picture(
     assert small == large
 
 
-def test_failure_page_shows_belief_and_view_command(
-    site_of_run: tuple[Path, crosscue.Site],
-) -> None:
-    folder, _ = site_of_run
-    page = (folder / "site" / "f" / "00001.html").read_text()
-
-    assert "<svg" in page
-    at = re.search(r"crosscue view (\S+) --at ([0-9.]+)<", page)
-    assert at is not None
-    assert Path(at[1]) == folder / "run"
-    assert crosscue.save_recording(at[1], folder / "at.rrd", at=at[2], only=("belief",)).exists()
-
-
 def test_names_are_escaped_in_pages(site_of_run: tuple[Path, crosscue.Site]) -> None:
     folder, _ = site_of_run
     for page in (folder / "site").rglob("*.html"):
         assert "<img src=x" not in page.read_text()
-
-
-def failure(number: int, **changes: object) -> Failure:
-    usual: dict[str, object] = {
-        "run": f"runs/{number % 7}",
-        "kind": "missed",
-        "level": "frames",
-        "what": f"cue_{number % 5}",
-        "cause": "</script><b>",
-        "reported": "",
-        "t_ns": number,
-        "at_s": 0.1 * number,
-        "start_ns": number,
-        "end_ns": number,
-        "frames": 1,
-        "approach": None,
-        "intersection": "",
-        "conditions": ("rain", "dusk")[: number % 3],
-        "distance_m": float(number % 100),
-        "severity": 1000.0 - number,
-    }
-    return Failure(**(usual | changes))  # type: ignore[arg-type]
-
-
-def test_pages_without_script_list_all_failures_by_each_facet(tmp_path: Path) -> None:
-    entries = site_entries([failure(number) for number in range(2 * PER_PAGE + 1)])
-    write_lists(tmp_path, entries, frozenset())
-
-    def listed(pages: list[Path]) -> list[str]:
-        return sorted(
-            path.name for page in pages for path in Links(page).found if path.parent.name == "f"
-        )
-
-    expected = sorted(one.page for one in entries)
-    assert listed([tmp_path / "index.html", *tmp_path.glob("page-*.html")]) == expected
-    for facet in FACETS:
-        pages = list((tmp_path / "by").glob(f"{facet}-*.html"))
-        assert set(listed(pages)) == set(expected)
-        # A failure with two conditions is in the lists of both.
-        assert facet == "condition" or listed(pages) == expected
-        assert all(Links(page).scripts == 0 for page in pages)
-
-
-def test_embedded_json_cannot_close_its_script_element(tmp_path: Path) -> None:
-    write_lists(tmp_path, site_entries([failure(1)]), frozenset())
-    page = (tmp_path / "index.html").read_text()
-
-    rows = json.loads(page.partition('id="rows">')[2].partition("</script>")[0])
-    assert rows[0][2] == "</script><b>"
-    assert page.count("</script>") == 2
-
-
-def test_same_runs_yield_equal_sites(site_of_run: tuple[Path, crosscue.Site]) -> None:
-    folder, _ = site_of_run
-    truth = folder / "truth"
-    crosscue.browse(folder / "run", folder / "again", truth=truth)
-
-    files = [p.relative_to(folder / "site") for p in (folder / "site").rglob("*") if p.is_file()]
-    for path in files:
-        assert (folder / "site" / path).read_bytes() == (folder / "again" / path).read_bytes()
 
 
 def test_site_of_failure_table_has_only_its_failures(

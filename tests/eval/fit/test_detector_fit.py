@@ -12,15 +12,13 @@ import pytest
 
 import crosscue
 from crosscue.detectors.catalog.card import read_card
-from crosscue.detectors.catalog.class_scores import Isotonic, Platt
-from crosscue.detectors.networks.mask_rcnn.detector import SOURCE_SCORES
+from crosscue.detectors.catalog.class_scores import Isotonic
 from crosscue.detectors.training.platt import fit_isotonic, fit_platt
 from crosscue.eval.fit.detector.threshold import (
     TRIED,
     bounded_threshold,
     fewest_detections,
     lower_bound,
-    round_between,
 )
 from crosscue.eval.scoring.boxes.reliability import class_calibration
 from crosscue.replay.errors import SchemaError, UsageError
@@ -72,12 +70,6 @@ def test_threshold_keeps_equal_scores_together_and_needs_enough_detections() -> 
     assert bounded_threshold(scores[:few], is_right[:few], 0.95, 0.95) is None
 
 
-def test_threshold_is_rounded_between_neighbouring_scores() -> None:
-    assert round_between(0.612, 0.6349) == 0.62
-    low, high = 0.123456, 0.123458
-    assert low <= round_between(low, high) < high
-
-
 @pytest.mark.parametrize("fit", [fit_platt, fit_isotonic])
 def test_calibrated_scores_are_probabilities_in_the_same_order(fit) -> None:  # type: ignore[no-untyped-def]
     rng = np.random.default_rng(2)
@@ -95,30 +87,9 @@ def test_calibrated_scores_are_probabilities_in_the_same_order(fit) -> None:  # 
     assert (np.diff(after[order]) > 0.0).all()
 
 
-def test_platt_of_unit_slope_is_the_identity() -> None:
-    scores = np.linspace(0.05, 0.95, 10)
-    np.testing.assert_allclose(
-        Platt(kind="platt", slope=1.0, offset=0.0).probabilities(scores), scores
-    )
-
-
 def test_decreasing_isotonic_points_are_refused() -> None:
     with pytest.raises(ValueError, match="increasing numbers"):
         Isotonic(kind="isotonic", scores=(0.2, 0.4), fractions=(0.6, 0.5))
-
-
-def test_published_thresholds_apply_only_to_their_network() -> None:
-    vehicle = crosscue.Vehicle(version=1)
-    assert (vehicle.cues.stop_sign_score, vehicle.cars.score) == (None, None)
-    assert SOURCE_SCORES == {"stop sign": 0.9, "traffic light": 0.9, "car": 0.95}
-    boxes = np.tile([[1.0, 1.0, 9.0, 9.0]], (2, 1))
-    found = crosscue.Detections(
-        0, (64, 48), boxes, np.array([0.92, 0.96]), ("car", "car"), (b"", b"")
-    )
-    assert found.with_min_scores(SOURCE_SCORES).are_sure(None).tolist() == [False, True]
-    # The scores of another network differ in meaning: without a calibration, one half.
-    assert found.are_sure(None).tolist() == [True, True]
-    assert found.with_min_scores(SOURCE_SCORES).are_sure(0.5).tolist() == [True, True]
 
 
 PICTURES = 700
@@ -198,20 +169,6 @@ def test_calibrated_scores_are_not_fitted_again(drive: Path) -> None:
         detect_with_card(drive, "net_fitted")
     with pytest.raises(UsageError, match="calibrated already"):
         crosscue.fit_detector(run, drive / "labels")
-
-
-def test_class_with_few_labels_is_not_fitted(drive: Path, tmp_path: Path) -> None:
-    for number in range(30):
-        text = (drive / "labels" / f"frame_{number}.txt").read_text()
-        (tmp_path / f"frame_{number}.txt").write_text(text)
-    (tmp_path / "classes.txt").write_text("traffic light\n")
-    output = drive / "net_few.toml"
-
-    found = crosscue.fit_detector(drive / "run", tmp_path, output)
-
-    assert not found.has_threshold
-    assert "20 needed: not fitted" in repr(found)
-    assert not output.exists()
 
 
 def test_held_out_calibration_is_reported_without_threshold(drive: Path) -> None:

@@ -17,11 +17,10 @@ from crosscue.datasets.geodesy import (
 from crosscue.datasets.truth.truth import read_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.eval.fit.first_pose import with_start, with_start_of
-from crosscue.eval.fit.gnss_truth import _between_positions, write_gnss_truth
+from crosscue.eval.fit.gnss_truth import write_gnss_truth
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.smoother import score_smoother
-from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Floats, Table, Topic
 from crosscue.replay.errors import UsageError, VehicleError
@@ -81,18 +80,6 @@ def test_gnss_determines_first_position_and_heading() -> None:
     assert start.source == "first seconds of GNSS (/gnss)"
 
 
-@pytest.mark.parametrize(
-    "vehicle",
-    [
-        Vehicle(version=1, start=Start(heading_rad=0.3)),
-        Vehicle(version=1, gnss=Gnss(use="truth")),
-        Vehicle(version=1, gnss=Gnss(use="off")),
-    ],
-)
-def test_start_settings_of_the_vehicle_file_are_kept(vehicle: Vehicle) -> None:
-    assert with_start([straight_drive()], vehicle, EVERYTHING) == vehicle
-
-
 def test_estimate_keeps_the_first_pose_of_a_run_unless_the_vehicle_file_has_one() -> None:
     own, bare = Vehicle(version=1, start=Start(heading_rad=0.3)), Vehicle(version=1)
     run = with_start([straight_drive()], bare, EVERYTHING)
@@ -100,20 +87,6 @@ def test_estimate_keeps_the_first_pose_of_a_run_unless_the_vehicle_file_has_one(
     assert with_start_of(run, bare).start == run.start
     assert with_start_of(run, own) == own
     assert with_start_of(own, bare) == bare
-
-
-def test_stationary_car_gets_no_heading_from_gnss() -> None:
-    assert with_start([straight_drive(0.0)], Vehicle(version=1), EVERYTHING) == Vehicle(version=1)
-
-
-def test_run_started_by_gnss_is_scored_in_its_own_map(tmp_path: Path) -> None:
-    vehicle = with_start([straight_drive()], Vehicle(version=1), EVERYTHING)
-    run = replayed(tmp_path / "run", vehicle)
-    truth = write_gnss_truth([straight_drive()], Vehicle(version=1), EVERYTHING, tmp_path / "truth")
-    found = score_pose(run, truth)
-
-    assert found.ape["none"].translation_m.max < 0.1
-    assert found.ape["none"].rotation_deg.max < 0.1
 
 
 def test_gnss_truth_records_accuracy_antenna_and_origin(tmp_path: Path) -> None:
@@ -129,17 +102,6 @@ def test_gnss_truth_records_accuracy_antenna_and_origin(tmp_path: Path) -> None:
     assert truth.origin is not None
     assert truth.origin.latitude_deg == pytest.approx(PLACE[0])
     np.testing.assert_allclose(heading_rad(track), HEADING_RAD, atol=1e-4)
-
-
-def test_course_between_positions_is_tangent_to_the_path() -> None:
-    angle = 0.05 * np.arange(40) - 2.5
-    xyz_m = np.column_stack([30 + 20 * np.cos(angle), 20 * np.sin(angle) - 10, np.zeros(40)])
-    t_ns = np.arange(40, dtype=np.int64) * (SECOND // 2)
-
-    course = _between_positions(t_ns, xyz_m, min_speed_mps=1.0)
-
-    np.testing.assert_allclose(course[2:-2], angle[2:-2] + math.pi / 2, atol=1e-9)
-    assert np.isnan(_between_positions(t_ns, xyz_m, min_speed_mps=3.0)).all()
 
 
 def test_truth_file_determines_first_pose_in_its_map(tmp_path: Path) -> None:
@@ -192,18 +154,6 @@ def test_fused_gnss_positions_bound_the_drift_of_odometry(tmp_path: Path) -> Non
 
     assert errors_m["start"] > 5.0
     assert errors_m["fuse"] < 1.0
-
-
-def test_every_gnss_position_is_accounted_for(tmp_path: Path) -> None:
-    vehicle = with_start([straight_drive()], LONG_WHEELS, EVERYTHING, gnss="fuse")
-    run = replayed(tmp_path / "run", vehicle)
-    line = run.drive_manifest().account.estimating["positions"]
-
-    assert line.entered == 30
-    assert line.entered == line.used + sum(line.skipped.values())
-    table = run.table("measurements")
-    kinds = table["kind"].cast("string").to_pylist()
-    assert kinds.count("position") == line.used > 20
 
 
 def test_smoother_uses_gnss_positions_of_the_filter(tmp_path: Path) -> None:

@@ -44,38 +44,6 @@ def test_threshold_is_the_lowest_that_meets_the_required_rate(required: float) -
     assert fitted.fitted_found.of + fitted.held_out_found.of == 400
 
 
-def test_mean_false_match_rate_equals_the_required_rate() -> None:
-    """Over 40 simulated fits, the mean true rate at the threshold equals the required rate."""
-    true_rates = [
-        np.exp(-fit_landmarks(simulated_pairs(seed), 0.02).min_score / 5.0) for seed in range(40)
-    ]
-
-    assert np.mean(true_rates) == pytest.approx(0.02, rel=0.1)
-
-
-def test_false_match_interval_contains_the_true_rate() -> None:
-    inside = 0
-    for seed in range(60):
-        fitted = fit_landmarks(simulated_pairs(seed), 0.01)
-        true = float(np.exp(-fitted.min_score / 5.0))
-        inside += fitted.held_out_false.low <= true <= fitted.held_out_false.high
-
-    assert inside >= 52
-
-
-def test_pairs_of_a_query_stay_in_one_half() -> None:
-    pairs = ScoredPairs(
-        np.array([1.0, 50.0, 2.0, 60.0]),
-        np.array([False, True, False, True]),
-        np.array([0, 0, 1, 1]),
-    )
-    fitted = fit_landmarks(pairs, 0.0)
-
-    assert fitted.fitted_false.of == fitted.held_out_false.of == 1
-    assert fitted.fitted_found.of == fitted.held_out_found.of == 1
-    assert not fitted.is_shown
-
-
 def test_too_few_pairs_and_invalid_arguments_are_refused() -> None:
     one = ScoredPairs(np.array([1.0]), np.array([False]), np.array([0]))
     with pytest.raises(ValueError, match="two-place pairs of at least two queries"):

@@ -106,12 +106,6 @@ def test_truth_of_another_drive_is_refused(tmp_path: Path) -> None:
         annotated_run(run, write_empty_truth(tmp_path / "truth", end_ns=2_000_000_000))
 
 
-def test_empty_run_has_no_approaches(tmp_path: Path) -> None:
-    found = annotated_run(write_run(tmp_path / "run", []), write_empty_truth(tmp_path / "truth"))
-
-    assert not found.approaches
-
-
 def test_runs_with_different_graphs_are_refused(
     tmp_path: Path, drives: tuple[list[Path], list[Path]]
 ) -> None:
@@ -164,12 +158,3 @@ def test_section_is_printed_without_output_option(
     for interval in ("wilson", "by_places"):
         low, high = rate["there"][interval]
         assert low < rate["there"]["rate"] < high
-
-
-def test_each_run_needs_a_truth_file(
-    drives: tuple[list[Path], list[Path]], capsys: pytest.CaptureFixture[str]
-) -> None:
-    runs, truths = drives
-
-    assert crosscue(["fit", "messages", *map(str, runs), "--truth", str(truths[0])]) == 2
-    assert "16 runs, 1 truth files; give one" in capsys.readouterr().err

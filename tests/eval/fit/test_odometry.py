@@ -10,7 +10,7 @@ import crosscue
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval.fit.odometry import FittedOdometry
-from crosscue.eval.fit.vehicle_output import check_output, write_fit
+from crosscue.eval.fit.vehicle_output import check_output
 from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -67,13 +67,6 @@ def test_log_without_positions_is_refused(files: DriveFiles, tmp_path: Path) -> 
     with pytest.raises(EmptyResultError, match=r"no positions to fit to: .*--truth"):
         crosscue.fit_odometry(files.log, files.vehicle, tmp_path / "out.toml")
     assert not (tmp_path / "out.toml").exists()
-
-
-def test_fit_without_vehicle_file_writes_a_new_one(tmp_path: Path) -> None:
-    path = write_fit(None, tmp_path / "out.toml", lambda text: text + "lost_above_m = 50.0\n")
-
-    assert path is not None
-    assert crosscue.load_vehicle(path).lost_above_m == 50.0
 
 
 def test_settings_in_memory_cannot_be_written_to_a_vehicle_file(tmp_path: Path) -> None:

@@ -49,15 +49,6 @@ def test_drive_is_divided_at_the_intersection(drives: Drives) -> None:
     assert not any(one.features["intersection"] for one in after)
 
 
-def test_drive_without_intersection_has_no_features(drives: Drives) -> None:
-    (one,) = annotated_drives(
-        open_run(drives[0][2]), read_scored_truth(drives[1][2], "c"), Vehicle(version=1)
-    )
-
-    assert one.features == {"intersection": False, "left": False, "right": False}
-    assert np.isnan(one.start_m).all()
-
-
 def test_command_writes_a_section_for_the_vehicle_file(
     drives: Drives, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -12,7 +12,6 @@ import pytest
 
 import crosscue
 from crosscue.eval import cli
-from crosscue.replay import errors
 
 ROOT: Final = Path(__file__).parents[3]
 HEAVY: Final = ("torch", "rerun", "ray", "matplotlib", "numba", "pyarrow", "numpy", "pydantic")
@@ -55,19 +54,3 @@ def test_reference_pages_list_exactly_the_public_names() -> None:
     ]
 
     assert sorted(listed) == sorted(crosscue.__all__)
-
-
-def test_every_error_is_public() -> None:
-    """All errors are exported, so the page of errors lists all of them."""
-    raised = {
-        name
-        for name, one in vars(errors).items()
-        if isinstance(one, type) and issubclass(one, Exception | Warning)
-    }
-
-    assert raised <= {*crosscue.__all__}
-
-
-def test_unknown_public_name_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="nonsense"):
-        getattr(crosscue, "nonsense")  # noqa: B009

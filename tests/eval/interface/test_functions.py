@@ -20,37 +20,12 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_drive(tmp_path_factory.mktemp("drive"), Clock(), seconds=4)
 
 
-def test_part_of_a_log_is_converted(drive: Path, tmp_path: Path) -> None:
-    events: list[object] = []
-    with crosscue.open(drive) as log, watching(events.append):
-        found = crosscue.convert(log.part(1.0, 2.0), tmp_path / "part.mcap")
-
-    assert found.is_whole
-    with crosscue.open(found.path) as part:
-        assert found.written.total() == sum(topic.declared or 0 for topic in part.topics.values())
-    assert repr(found).startswith("topic ")
-    assert repr(found).endswith(", read back")
-    assert found.as_dict()["bytes"] == found.path.stat().st_size
-    last = events[-1]
-    assert isinstance(last, Progress)
-    assert last.total is not None
-    assert last.done <= last.total
-
-
 def test_conversion_of_several_logs_is_refused(drive: Path, tmp_path: Path) -> None:
     with (
         crosscue.open(drive, drive) as log,
         pytest.raises(crosscue.UsageError, match="expected one log, found 2"),
     ):
         crosscue.convert(log, tmp_path / "both.mcap")
-
-
-def test_decode_reports_all_tables_that_it_writes(drive: Path, tmp_path: Path) -> None:
-    found = crosscue.decode(drive, tmp_path / "tables", drive.parent / "car.toml")
-
-    assert found.path == tmp_path / "tables"
-    assert {*found.rows} == {one.name for one in found.path.glob("*.parquet")} - {"skipped.parquet"}
-    assert all(f"{name} " in repr(found) for name in found.rows)
 
 
 def test_seal_check_finds_changed_log(drive: Path, tmp_path: Path) -> None:
@@ -72,13 +47,6 @@ def test_seal_check_finds_changed_log(drive: Path, tmp_path: Path) -> None:
     assert repr(checked[1]) == (
         f"{logs[1]}: b.mcap: bytes 0 to {min(1 << 20, len(content))} differ from the seal"
     )
-
-
-def test_seal_refuses_url_before_sealing_any_log(drive: Path) -> None:
-    with pytest.raises(crosscue.UsageError, match="a URL cannot be sealed"):
-        crosscue.seal(drive, "https://host/drive.mcap")
-
-    assert not drive.with_name("drive.mcap.seal").exists()
 
 
 def test_vehicle_draft_is_written_once_as_printed(drive: Path, tmp_path: Path) -> None:
@@ -126,22 +94,6 @@ def test_vehicle_draft_uses_intrinsics_of_calibration_message(tmp_path: Path) ->
 
     assert drafted.focal_px == pytest.approx(known.focal_px)
     assert drafted.center_px == pytest.approx(known.center_px)
-
-
-def test_vehicle_draft_excludes_request_signals(drive: Path, tmp_path: Path) -> None:
-    dbc = tmp_path / "car.dbc"
-    text = (drive.parent / "simulated_car.dbc").read_text()
-    dbc.write_text(text.replace("SG_ REAR_LEFT ", "SG_ REAR_LEFT_CMD "))
-
-    assert "_CMD" in dbc.read_text()
-    assert "_CMD" not in crosscue.draft_vehicle(drive, [dbc]).text
-
-
-def test_truth_is_checked_against_its_log(drive: Path) -> None:
-    found = crosscue.check_truth(drive.parent / "truth.json", drive)
-
-    assert found.approaches == found.as_dict()["approaches"]
-    assert repr(found).startswith("fits  ")
 
 
 def test_log_without_truth_is_refused_and_schemas_are_available(

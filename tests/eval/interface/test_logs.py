@@ -13,9 +13,6 @@ import pytest
 import crosscue
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
-from crosscue.eval import cli
-from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.manifest import DecodeManifest
 from support.every_format import EVERY_FORMAT
 
 
@@ -55,22 +52,6 @@ def test_each_format_yields_tables_or_frames(name: str, tmp_path: Path) -> None:
     assert rows or warned
 
 
-def test_topic_table_equals_output_of_decode(drive: DriveFiles, tmp_path: Path) -> None:
-    assert cli.run(["decode", str(drive.log), "-o", str(tmp_path / "out"), "-q"]) == 0
-    decoded = RunFolder(tmp_path / "out")
-
-    with crosscue.open(drive.log) as log:
-        name = next(n for n in log.topics if n != "/can" and "mage" not in log[n].type_name)
-        table = log[name].table()
-
-    manifest = decoded.manifest()
-    assert isinstance(manifest, DecodeManifest)
-    written = decoded.table(manifest.tables[name].removesuffix(".parquet"))
-    # Tables of decode begin with the drive's time and segment.
-    written = written.drop_columns(["t_ns", "segment"])
-    assert table.replace_schema_metadata() == written.replace_schema_metadata()
-
-
 def test_time_spans_are_half_open_and_intersect(drive: DriveFiles) -> None:
     with crosscue.open(drive.log) as log:
         name = next(n for n in log.topics if n != "/can")
@@ -106,13 +87,6 @@ def test_signals_are_tables_by_message_with_units(drive: DriveFiles) -> None:
             signals[name + "x"]
 
 
-def test_payload_length_equals_length_column(tmp_path: Path) -> None:
-    with crosscue.open(EVERY_FORMAT["candump"](tmp_path)) as log:
-        for topic in log.topics.values():
-            table = topic.table()
-            assert [len(one) for one in table["data"].to_pylist()] == table["length"].to_pylist()
-
-
 def test_losses_raise_warning_and_are_recorded_in_table_metadata(
     tmp_path: Path, drive: DriveFiles
 ) -> None:
@@ -127,26 +101,6 @@ def test_losses_raise_warning_and_are_recorded_in_table_metadata(
     assert reported["used"] == len(table)
     lost = (reported, reported["unattributed"])
     assert any(one["dropped"] or one["dropped_unknown"] for one in lost)
-
-
-def test_account_of_complete_topic_adds_up(drive: DriveFiles) -> None:
-    with crosscue.open(drive.log) as log:
-        table = log["/can"].table(end_s=1)
-
-    reported = json.loads(table.schema.metadata[b"crosscue"])[str(drive.log)]
-    assert reported["used"] == len(table)
-    assert reported["found"] == reported["used"] + sum(reported["skipped"].values())
-    assert not reported["dropped"]
-
-
-def test_tables_of_several_logs_are_concatenated(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-    first, second = (EVERY_FORMAT["candump"](tmp_path / name) for name in ("a", "b"))
-
-    with crosscue.open(first, second) as both, crosscue.open(first) as one:
-        name = next(iter(one.topics))
-        assert len(both[name].table()) == 2 * len(one[name].table())
 
 
 def test_pictures_are_frames_and_have_no_table(tmp_path: Path) -> None:

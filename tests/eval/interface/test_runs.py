@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pyarrow as pa
 import pytest
 
 import crosscue
 from crosscue.datasets.simulated.log_files import DriveFiles
-from crosscue.eval import cli
 
 
 @pytest.fixture(scope="module")
@@ -45,25 +42,6 @@ def test_manifest_is_printed_with_one_field_per_line(run: crosscue.Run) -> None:
     assert head == "EstimateManifest"
     assert [line.split()[0] for line in lines] == [*type(run.manifest).model_fields]
     assert max(map(len, lines)) < 130
-
-
-def test_replay_function_writes_the_tables_of_the_command(
-    drive: DriveFiles, run: crosscue.Run, tmp_path: Path
-) -> None:
-    argv = ["replay", str(drive.log), "--vehicle", str(drive.vehicle), "-o", str(tmp_path / "r")]
-    assert cli.run([*argv, "-q"]) == 0
-
-    for table in run.tables:
-        name = f"{table}.parquet"
-        assert (tmp_path / "r" / name).read_bytes() == (run.path / name).read_bytes()
-
-
-def test_part_of_a_drive_is_replayed(drive: DriveFiles, tmp_path: Path) -> None:
-    with crosscue.open(drive.log) as log:
-        run = crosscue.replay_drive(log.part(end_s=5), tmp_path / "run", drive.vehicle)
-
-    t_ns = run.pose["t_ns"].to_numpy()
-    assert 3e9 < t_ns[-1] - t_ns[0] < 5e9
 
 
 def test_run_is_scored_and_printed(drive: DriveFiles, run: crosscue.Run) -> None:
@@ -105,32 +83,7 @@ def test_recording_of_unsupported_file_type_is_refused(run: crosscue.Run) -> Non
         crosscue.save_recording(run, run.path / "drive.mp4")
 
 
-def test_folder_without_run_is_a_run_error(tmp_path: Path) -> None:
-    with pytest.raises(crosscue.RunError):
-        crosscue.open_run(tmp_path)
-
-
-@pytest.mark.parametrize("wrong", [{"width_px": 100}, {"layout": "Z"}, {"rate_hz": 11}])
-def test_invalid_simulation_settings_are_refused(wrong: dict[str, int], tmp_path: Path) -> None:
-    with pytest.raises(crosscue.UsageError):
-        crosscue.simulate_approach(tmp_path / "d", **wrong)  # type: ignore[arg-type]
-    assert not (tmp_path / "d").exists()
-
-
 def test_known_sign_is_drawn_and_unknown_sign_refused() -> None:
     assert crosscue.draw_sign("one way left", 48).ndim == 2
     with pytest.raises(crosscue.UsageError, match="one way left"):
         crosscue.draw_sign("one way up", 48)
-
-
-def test_log_summary_equals_output_of_info(
-    drive: DriveFiles, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run(["info", str(drive.log)]) == 0
-    printed = capsys.readouterr().out
-
-    with crosscue.open(drive.log) as log:
-        summary = crosscue.info(log)
-
-    assert repr(summary) == printed.rstrip("\n") + "\n" * repr(summary).endswith("\n")
-    assert summary.is_whole

@@ -14,7 +14,6 @@ from crosscue.eval.runs.folder import open_run
 from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR
 from support.data import shared
-from support.detecting import yolox_card
 from support.pictures import picture_folder
 
 BRIGHT = "support.detecting:build"
@@ -85,18 +84,6 @@ def _folder(tmp_path: Path, count: int = 5) -> Path:
     return folder
 
 
-def test_custom_detector_writes_detections_table(tmp_path: Path) -> None:
-    log, out = _folder(tmp_path), tmp_path / "run"
-
-    status = run(["detect", str(log), "-o", str(out), "--detectors", BRIGHT, "--no-cache", "-q"])
-
-    assert status == 0
-    found = open_run(out).table("detections")
-    assert found["x0"].to_pylist() == [8.0, 9.0, 10.0, 11.0, 12.0]
-    assert set(found["height_px"].to_pylist()) == {10.0}
-    assert set(found["label"].to_pylist()) == {"bright"}
-
-
 @pytest.mark.parametrize(
     ("counted", "message"),
     [
@@ -140,21 +127,6 @@ def test_detector_of_installed_package_is_selected_by_entry_point_name(
 
     assert run(["detect", log, "--detectors", "owm", "--overwrite", *args]) == 2
     assert "detector 'owm': no such name; did you mean own?" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("exists", [False, True])
-@pytest.mark.parametrize("command", ["detect", "replay"])
-def test_command_runs_after_its_misspelt_detector_is_corrected(
-    command: str, exists: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, output = str(_folder(tmp_path)), tmp_path / "run"
-    if exists:
-        output.mkdir()
-
-    line = [command, log, "-o", str(output), "--no-cache", "-q", "--detectors"]
-    assert run([*line, "signss"]) == 2
-    assert output.exists() == exists
-    assert run([*line, "signs"]) == 0, capsys.readouterr().err
 
 
 def test_second_run_reads_cache_and_writes_same_detections(
@@ -241,15 +213,6 @@ def test_intrinsics_for_another_image_size_are_refused(
         assert not out.exists()
 
 
-def test_unusual_intrinsics_are_accepted_with_stated_image_size(tmp_path: Path) -> None:
-    log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
-    camera = "focal_px = 600.0\ncenter_px = [44.0, 24.0]\nsize_px = [64, 48]"
-    vehicle.write_text(f"version = 1\n[camera]\n{camera}\n")
-    command = ["detect", str(log), "--vehicle", str(vehicle), "-o", str(out), "--no-cache", "-q"]
-
-    assert run([*command, "--detectors", BRIGHT]) == 0
-
-
 def test_estimate_with_intrinsics_for_another_size_leaves_run_unchanged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -301,63 +264,6 @@ def test_invalid_detector_is_reported_in_one_line(
     reported = capsys.readouterr().err
     assert message in reported
     assert reported.count("\n") == 1
-
-
-def test_unknown_detector_setting_is_refused_with_suggestion(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    vehicle = tmp_path / "v.toml"
-    vehicle.write_text(
-        f'version = 1\n[detectors.b]\nkind = "{BRIGHT}"\nsettings = {{ treshold = 3 }}\n'
-    )
-    args = ["-o", str(tmp_path / "run"), "--vehicle", str(vehicle), "--no-cache"]
-
-    assert run(["detect", str(_folder(tmp_path)), *args]) == 2
-
-    assert "treshold: no such setting; did you mean threshold?" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"sha256": '"' + "0" * 64 + '"'}, "the card's sha256 is 0000"),
-        (
-            {"classes": '["car"]'},
-            "expected (1, 3549, 6) for 1 classes at 416 x 416",
-        ),
-        ({"width_px": "320"}, "the network does not run on input 320 x 416"),
-        ({"weights": '"gone.onnx"'}, "put the weights next to the card"),
-    ],
-)
-def test_card_not_matching_weights_is_reported_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, str], message: str
-) -> None:
-    card = yolox_card(tmp_path, **changes)
-    args = ["-o", str(tmp_path / "run"), "--detectors", str(card), "--no-cache"]
-
-    assert run(["detect", str(_folder(tmp_path)), *args]) == 2
-
-    reported = capsys.readouterr().err
-    assert message in reported
-    assert reported.count("\n") == 1
-
-
-def test_yolox_detects_cars_and_lights_of_real_approach(tmp_path: Path) -> None:
-    source = shared("sequences", "us_signalized_intersection_dashcam")
-    log = tmp_path / "us"
-    log.mkdir()
-    for path in sorted(source.glob("*.jpg"))[-24::6]:
-        shutil.copy(path, log / path.name)
-    (log / "timestamps.txt").write_text("rate_hz: 15\n")
-    args = ["--detectors", str(yolox_card(tmp_path)), "--no-cache", "--draw", "1", "-q"]
-
-    assert run(["detect", str(log), "-o", str(tmp_path / "run"), *args]) == 0
-
-    found = open_run(tmp_path / "run").table("detections")
-    labels = found["label"].to_pylist()
-    assert labels.count("car") >= 8
-    assert labels.count("traffic light") >= 4
-    assert len(list((tmp_path / "run" / "pictures").glob("*.jpg"))) == 1
 
 
 @pytest.mark.parametrize("name", sorted(ROAD_CARDS))

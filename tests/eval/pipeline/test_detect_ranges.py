@@ -62,30 +62,6 @@ def test_fit_ranges_prints_valid_vehicle_file_section(
     assert curve.residual_sd_m == pytest.approx(0.5, rel=0.05)
 
 
-def test_table_without_required_columns_is_reported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    table = tmp_path / "pairs.csv"
-    table.write_text("a,b\n1,2\n")
-
-    assert run(["fit", "ranges", str(table), "--cue", "stop_sign"]) == 4
-
-    assert "expected the columns height_px and range_m" in capsys.readouterr().err
-
-
-def test_missing_or_binary_table_is_reported_with_path_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "wild.csv").write_bytes(b"\xff\xd8\xff")
-
-    for name, message in (("none.csv", "No such file"), ("wild.csv", "is not text")):
-        path = tmp_path / name
-        assert run(["fit", "ranges", str(path), "--cue", "stop_sign"]) == 4
-        reported = capsys.readouterr().err
-        assert f"{path}: {message}" in reported
-        assert reported.count(name) == 1
-
-
 HEIGHTS = {"stop_sign": 750.0, "traffic_light": 1000.0}
 
 
@@ -197,14 +173,3 @@ def test_missing_or_malformed_truth_is_reported(tmp_path: Path) -> None:
         pairs_of_truth(complete, "stop_sign")
     with pytest.raises(UnreadableRunError, match=r"detections.parquet: not there"):
         pairs_of_run(tmp_path, complete, "stop_sign", 0.9)
-
-
-def test_unequal_numbers_of_runs_and_drives_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    here = str(drive(tmp_path / "a"))
-
-    assert run(["fit", "ranges", "--cue", "stop_sign", "--truth", here, here, "--runs", here]) == 2
-    assert "1 runs for 2 drives" in capsys.readouterr().err
-    assert run(["fit", "ranges", "--cue", "stop_sign"]) == 2
-    assert "--truth: expected drives, or else a TABLE" in capsys.readouterr().err

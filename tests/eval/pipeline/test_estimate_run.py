@@ -14,7 +14,6 @@ from crosscue.datasets.scenes.drive import write_scene
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval.cli import run
-from crosscue.eval.runs.folder import RunFolder, open_run
 from support.oracle import Oracle
 
 pytestmark = pytest.mark.slow
@@ -70,43 +69,6 @@ def _tables(run_path: Path) -> dict[str, bytes]:
 def _manifest(run_path: Path) -> dict[str, Any]:
     found: dict[str, Any] = json.loads((run_path / "manifest.json").read_text())
     return found
-
-
-def test_intersection_probability_is_high_at_end_of_approach(drive: Path) -> None:
-    folder = open_run(drive / "run")
-
-    belief = folder.table("belief")
-    assert belief["intersection"].to_pylist()[-1] > 0.9
-    assert set(belief["approach"].to_pylist()) == {1}
-    ranges = folder.table("range")
-    assert set(ranges["reference"].to_pylist()) == {"start"}
-    assert all(v > 0 for v in ranges["var_m2"].to_pylist())
-
-
-def test_cues_table_has_row_for_each_frame_and_evaluated_cue(drive: Path) -> None:
-    folder = open_run(drive / "run")
-
-    frames = folder.table("frames").num_rows
-    by_cue: dict[str, int] = {}
-    for cue in folder.table("cues")["cue"].to_pylist():
-        by_cue[cue] = by_cue.get(cue, 0) + 1
-    assert by_cue["stop_sign"] == by_cue["one_way_left"] == frames
-    assert by_cue["parked_left"] == frames - 1
-    assert "road_left" not in by_cue
-
-
-def test_manifest_accounts_for_messages_of_every_topic(drive: Path) -> None:
-    manifest = _manifest(drive / "run")
-
-    topics = manifest["account"]["reading"][0]["topics"]
-    for account in topics.values():
-        gone = sum(account["skipped"].values()) + sum(account["dropped"].values())
-        assert account["used"] + gone == account["in"] == account["declared"]
-    camera = topics["/camera/image/compressed"]
-    assert camera["used"] == camera["in"] == manifest["scene"]["frames"]
-    assert topics["/can/car"]["used"] > 0
-    assert manifest["detect"]["camera"] == "/camera/image/compressed"
-    assert manifest["scene"]["frames"] == manifest["detect"]["counts"]["frames"]
 
 
 def test_rejected_candidates_are_explained_in_manifest_and_summary(
@@ -211,65 +173,6 @@ def test_resumed_run_writes_same_bytes_as_uninterrupted_run(
     _replay(drive, tmp_path / "run", "--resume")
 
     assert _tables(tmp_path / "run") == _tables(drive / "run")
-
-
-def test_estimate_refuses_missing_or_changed_log(
-    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    copy = tmp_path / "drive"
-    shutil.copytree(drive, copy)
-    assert run(["estimate", str(copy / "run"), "-q"]) == 0
-    with (copy / "drive.mcap").open("ab") as file:
-        file.write(b"more")
-
-    assert run(["estimate", str(copy / "run")]) == 4
-    assert "has changed since" in capsys.readouterr().err
-    (copy / "drive.mcap").unlink()
-    assert run(["estimate", str(copy / "run")]) == 4
-    assert "is gone; name its folder with --logs DIR" in capsys.readouterr().err
-
-
-def test_replay_without_detectors_succeeds_and_reports_it(
-    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, vehicle = str(drive / "drive.mcap"), str(drive / "vehicle.toml")
-    out = str(tmp_path / "run")
-    assert run(["replay", log, "--vehicle", vehicle, "--detectors", "none", "-o", out]) == 0
-
-    assert "no detector ran on the camera" in capsys.readouterr().out
-    assert not RunFolder(tmp_path / "run").file("belief.parquet").exists()
-
-
-def test_custom_cue_and_feature_are_configured_in_vehicle_file(drive: Path, tmp_path: Path) -> None:
-    shutil.copytree(drive / "run", tmp_path / "run")
-    shutil.copy(drive / "simulated_car.dbc", tmp_path)
-    (tmp_path / "v.toml").write_text(
-        (drive / "vehicle.toml").read_text()
-        + "\n[cues.own.any_car]\nlabels = ['car']\nscore = 0.5\n"
-        + "\n[fusion.features]\nbusy = {}\n"
-        + "\n[fusion.cues]\nany_car = { precision = 0.8, supports = ['busy'] }\n"
-    )
-
-    assert (
-        run(
-            [
-                "estimate",
-                str(tmp_path / "run"),
-                "-q",
-                "--logs",
-                str(drive),
-                "--vehicle",
-                str(tmp_path / "v.toml"),
-            ]
-        )
-        == 0
-    )
-
-    folder = open_run(tmp_path / "run")
-    counts = [row["count"] for row in folder.table("cues").to_pylist() if row["cue"] == "any_car"]
-    assert len(counts) == folder.table("frames").num_rows
-    assert max(counts) > 0
-    assert folder.table("belief")["busy"].to_pylist()[-1] > 0.9
 
 
 def test_custom_cue_with_existing_name_is_refused(

@@ -21,14 +21,13 @@ from crosscue.detectors.images import Encoded
 from crosscue.eval import cli
 from crosscue.eval.pipeline.landmarks import LandmarkStage, landmark_stage
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.scoring.pose.measured import read_measured
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.localization.landmarks.images import grey_of
 from crosscue.localization.landmarks.update import best_candidate
 from crosscue.replay.columns import Block, Bytes, Floats, Images, Messages
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.vehicle.vehicle import Vehicle, load
+from crosscue.replay.vehicle.vehicle import Vehicle
 from support.data import shared
 from support.landmark_files import database_of, encoded, seen_from, wall
 from support.manifests import estimate_manifest
@@ -136,44 +135,6 @@ def test_landmarks_correct_a_drifting_pose(
     assert np.median(errors_m(town, found)[late]) < 2.0
     axis = found.table("pose")["major_axis_m"].to_numpy()
     assert axis[-1] < 0.7 * without.table("pose")["major_axis_m"].to_numpy()[-1]
-
-
-def test_pose_rows_name_landmarks_and_manifest_counts_every_frame(
-    town: Town, found: RunFolder
-) -> None:
-    manifest = estimate_manifest(found)
-    counts = manifest.counts.landmarks
-    named = [name for name in found.table("pose")["landmark"].to_pylist() if name is not None]
-
-    assert len(named) == counts["accepted"]
-    assert all(name.startswith("survey/") for name in named)
-    [camera] = [log.topics["camera"] for log in manifest.account.reading if "camera" in log.topics]
-    assert counts["frames"] == camera.used == len(list(town.camera.glob("*.png")))
-    with LandmarkDatabase(town.database) as database:
-        assert manifest.landmarks is not None
-        assert manifest.landmarks.landmarks == len(database)
-    times = found.table("pose")["t_ns"].to_numpy()
-    assert (np.diff(times) > 0).all()
-
-
-def test_repeated_landmark_replay_writes_same_bytes(
-    town: Town, found: RunFolder, tmp_path: Path
-) -> None:
-    again = replay(town, tmp_path / "again", "--landmarks", str(town.database))
-
-    for name in ("pose.parquet", "measurements.parquet"):
-        assert again.file(name).read_bytes() == found.file(name).read_bytes()
-
-
-def test_empty_landmark_database_leaves_pose_unchanged(
-    town: Town, without: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    empty = database_of(tmp_path / "none.sqlite", np.empty((0, 2)))
-    with_none = replay(town, tmp_path / "with", "--landmarks", str(empty)).table("pose")
-
-    np.testing.assert_allclose(with_none["x_m"], without.table("pose")["x_m"], rtol=0, atol=1e-6)
-    assert with_none["landmark"].null_count == len(with_none)
-    assert "0 landmarks used, 0 rejected by the gate" in capsys.readouterr().out
 
 
 def test_landmarks_without_camera_are_refused(
@@ -392,12 +353,6 @@ def test_real_frames_match_nearest_landmarks_of_kitti_turn(tmp_path: Path) -> No
     assert max(offsets_m) < 4.5
 
 
-def test_vehicle_file_accepts_landmarks_section(tmp_path: Path) -> None:
-    path = tmp_path / "car.toml"
-    path.write_text("version = 1\n[landmarks]\nmin_score = 33\nmatcher = 'orb'\n")
-    assert load(path).landmarks.min_score == 33.0
-
-
 def test_score_compares_filter_with_batch_smoother(
     town: Town, found: RunFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -413,55 +368,3 @@ def test_score_compares_filter_with_batch_smoother(
     assert json.loads((found.path / "score" / "smoother.json").read_text()) == smoother
     assert cli.run(command) == 0
     assert "filter against batch smoother" in capsys.readouterr().out
-
-
-def test_measurements_table_holds_those_used_by_filter(found: RunFolder) -> None:
-    counts = estimate_manifest(found).counts
-    kinds = found.table("measurements")["kind"].to_pylist()
-
-    assert kinds.count("start") == 1
-    assert kinds.count("odometry") == counts.odometry["intervals"]
-    assert kinds.count("heading") == counts.track["headings_accepted"] > 0
-    assert kinds.count("landmark") == counts.landmarks["accepted"] > 0
-    read = read_measured(found)
-    table = found.table("pose")
-    ends = np.isin(read.increments.stop_ns, table["t_ns"].to_numpy())
-    assert ends.mean() > 0.99
-
-
-def test_custom_matcher_writes_and_queries_database(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    for shade in (50, 150):
-        (folder / f"{shade}.png").write_bytes(encoded(np.full((40, 40), shade, np.uint8)))
-    (folder / "at.csv").write_text("image,x_m,y_m,sd_m\n50.png,0,0,1\n150.png,9,0,1\n")
-    own = ["--matcher", "support.landmark_files:shade"]
-    database, picture = str(tmp_path / "lm.sqlite"), tmp_path / "dark.png"
-    picture.write_bytes(encoded(np.full((60, 60), 60, np.uint8)))
-    add = ["landmarks", "add", database, "--images", str(folder)]
-    assert cli.run([*add, "--coordinates", str(folder / "at.csv"), *own, "-q"]) == 0
-    assert cli.run(["landmarks", "match", database, str(picture), *own, "--json"]) == 0
-
-    best = json.loads(capsys.readouterr().out)["best"]
-    assert [(one["name"], one["score"]) for one in best] == [
-        ("photos/50.png", 90.0),
-        ("photos/150.png", 10.0),
-    ]
-    status, text = _refusal(capsys, "landmarks", "match", database, str(picture))
-    assert (status, "matcher 'shade', not 'orb'" in text) == (2, True)
-
-
-def test_decompression_bomb_is_refused_in_one_line(
-    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    jpeg = bytearray(encoded(wall(1, 64, 64), ".jpg"))
-    frame = jpeg.index(b"\xff\xc0")
-    jpeg[frame + 5 : frame + 9] = b"\xfd\xe8\xfd\xe8"
-    (tmp_path / "bomb.jpg").write_bytes(jpeg)
-    capsys.readouterr()
-
-    match = ["landmarks", "match", str(town.database), str(tmp_path / "bomb.jpg")]
-    status, text = _refusal(capsys, *match)
-    assert (status, "65000 x 65000 pixels: more than" in text) == (4, True)

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.cues.candidates import NO_CURVE
-from crosscue.eval.pipeline.scene.motion_ranges import ONE_GROUP, ONLY_AWAY, MotionRanges
+from crosscue.eval.pipeline.scene.motion_ranges import MotionRanges
 from crosscue.eval.pipeline.scene.sign_ranges import SignRanges
-from crosscue.eval.pipeline.scene.usable import CUT, source_of
+from crosscue.eval.pipeline.scene.usable import CUT
 from crosscue.fusion.approaches import Approaches
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.factor_graph import graph_of
@@ -20,7 +19,6 @@ SIZE = (1920, 1080)
 AHEAD = FrameEvidence(0, 1.0, 0.0, (), {})
 CAMERA = "[camera]\nfocal_px = 1500.0\nx_m = 1.5\n"
 SETBACK_M = Ranges().light_setback_m
-CURVE = "[ranges.traffic_light]\nparameters = [1800.0]\nresidual_sd_m = 4.0\n"
 # Label, range from the camera at the start, metres to the right, height.
 Thing = tuple[str, float, float, float]
 NEAR: Thing = ("traffic light", 57.0, -5.0, 1.3)
@@ -75,60 +73,6 @@ def test_far_lights_mark_end_and_groups_are_not_averaged() -> None:
     assert rows[0] == ()
 
 
-def test_light_facing_away_never_marks_end() -> None:
-    behind: Thing = ("traffic light", 95.0, -9.0, 1.3)
-    ranges = MotionRanges(vehicle())
-
-    rows = drive(ranges, [NEAR, FAR, behind], 45, ("red", "red", "dark"))
-
-    end, start = rows[-1]
-    assert end.reference is Reference.END
-    assert end.range_m == pytest.approx(84.0 - 44.0 + 1.5 - SETBACK_M, rel=0.04)
-    assert start.range_m == pytest.approx(57.0 - 44.0 + 1.5, rel=0.04)
-    far_m = [one.range_m - 1.5 + 44.0 for one in ranges.objects]
-    assert far_m == pytest.approx([57.0, 84.0, 95.0], rel=0.04)
-    assert [str(one.facing) for one in ranges.objects] == ["ego", "ego", "away"]
-    assert [one.reference for one in ranges.objects] == [Reference.START, Reference.END, None]
-
-
-def test_excluded_cue_yields_no_range() -> None:
-    ranges = MotionRanges(vehicle())
-    drive(ranges, [NEAR, FAR], 30)
-    seen = found([NEAR, FAR], 30.0)
-    spans = [seen.boxes_px[:, 3] - seen.boxes_px[:, 1]]
-
-    assert ranges(AHEAD, 0.1, [seen], spans, frozenset({"stop_sign"}))
-    assert ranges(AHEAD, 0.1, [seen], spans, frozenset({"traffic_light"})) == ()
-
-
-def test_lights_facing_away_alone_mark_start_and_are_counted() -> None:
-    ranges = MotionRanges(vehicle())
-
-    rows = drive(ranges, [NEAR], 40, ("dark",))
-
-    assert [one.reference for one in rows[-1]] == [Reference.START]
-    assert ranges.counts[ONLY_AWAY] >= 25
-
-
-def test_single_group_of_lights_marks_end_and_is_counted() -> None:
-    ranges = MotionRanges(vehicle())
-
-    rows = drive(ranges, [FAR], 40, ("green",))
-
-    assert [one.reference for one in rows[-1]] == [Reference.END]
-    assert ranges.counts[ONE_GROUP] == sum(bool(row) for row in rows)
-
-
-def test_new_larger_light_does_not_replace_tracked_light() -> None:
-    ranges = MotionRanges(vehicle())
-    drive(ranges, [FAR], 30)
-    seen = found([NEAR, FAR], 30.0)
-
-    (one,) = ranges(AHEAD, 0.1, [seen], [seen.boxes_px[:, 3] - seen.boxes_px[:, 1]])
-
-    assert one.range_m == pytest.approx(84.0 - 30.0 + 1.5 - SETBACK_M, rel=0.06)
-
-
 def test_nearest_stop_sign_marks_start() -> None:
     near: Thing = ("stop sign", 40.0, 4.0, 0.75)
     far: Thing = ("stop sign", 65.0, -4.0, 0.75)
@@ -137,34 +81,6 @@ def test_nearest_stop_sign_marks_start() -> None:
 
     assert last.reference is Reference.START
     assert last.range_m == pytest.approx(40.0 - 29.0 + 1.5, rel=0.04)
-
-
-@pytest.mark.parametrize(
-    ("text", "source"),
-    [
-        (CAMERA, "motion"),
-        (CAMERA + CURVE, "curve"),
-        (CURVE, "curve"),
-        ("", None),
-        (CAMERA + "[ranges]\nkind = 'curve'\n", None),
-        (CAMERA + "[ranges]\nkind = 'motion'\n" + CURVE, "motion"),
-    ],
-)
-def test_settings_select_one_source_of_ranges(text: str, source: str | None) -> None:
-    car = vehicle(text)
-    ranges = MotionRanges(car)
-    rows = drive(ranges, [FAR], 5)
-    seen = found([FAR], 0.0)
-
-    by_curve = SignRanges(car)
-    made = by_curve([seen], [seen.boxes_px[:, 3] - seen.boxes_px[:, 1]])
-
-    assert source_of(car, "traffic_light") == source
-    assert bool(rows[-1]) == (source == "motion")
-    assert bool(made) == (source == "curve")
-    assert bool(ranges.counts) == (source == "motion")
-    skipped = {NO_CURVE: 1} if source is None else {}
-    assert by_curve.by_cue["traffic_light"].skipped == skipped
 
 
 def test_boxes_cut_by_image_edge_yield_no_range_and_are_counted() -> None:

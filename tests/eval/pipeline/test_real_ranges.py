@@ -65,14 +65,3 @@ def test_range_decreases_and_interval_contains_truth(drive: RunFolder, reference
     assert (np.abs(range_m - true_m) < 1.96 * sd_m).all()
     assert (np.abs(range_m / true_m - 1.0) < 0.1).all()
     assert sd_m[-1] < 0.7 * sd_m[0]
-
-
-@pytest.mark.slow
-def test_far_group_faces_ego_vehicle_and_near_group_faces_away(drive: RunFolder) -> None:
-    rows = drive.table("ranged_objects").to_pylist()
-    marks = {
-        reference: {row["facing"] for row in rows if row["reference"] == reference}
-        for reference in ("end", "start")
-    }
-
-    assert marks == {"end": {"ego"}, "start": {"away"}}

@@ -17,10 +17,8 @@ from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.pose_track import start_belief
 from crosscue.replay.base import EVERYTHING
-from crosscue.replay.columns import Block, Int64s
-from crosscue.replay.time.stamp_watch import StampWatch
+from crosscue.replay.columns import Block
 from crosscue.replay.vehicle.pose import Start
-from crosscue.replay.vehicle.time import Time
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
 
@@ -128,38 +126,6 @@ def test_distance_around_any_clock_jump_is_sum_of_halves(
     assert jumped.travelled_m == pytest.approx(sum(alone), abs=1e-9)
 
 
-def test_pause_is_reported_as_gap_with_its_length(tmp_path: Path) -> None:
-    blocks = _drive()
-    paused = _part(blocks, last=BEGIN + 5 * SECOND) + _part(blocks, first=BEGIN + 9 * SECOND)
-
-    outcome = _replay(tmp_path / "run", paused)
-
-    assert [one.gap_ns for one in outcome.segments[1:]] == [4 * SECOND + ROW]
-    assert "1 gap without odometry, 4.1 s in all" in outcome.notices[0]
-    assert set(outcome.run.table("pose")["segment"].to_pylist()) == {0, 1}
-    reported = outcome.run.drive_manifest().timeline.segments
-    assert [one.cause for one in reported] == ["start", "odometry silent"]
-
-
-def test_pause_below_silence_limit_changes_nothing(tmp_path: Path) -> None:
-    blocks = _drive()
-    paused = _part(blocks, last=BEGIN + 5 * SECOND) + _part(
-        blocks, first=BEGIN + 5 * SECOND + 9 * ROW
-    )
-    vehicle = Vehicle(version=1, start=Start(heading_rad=0.0), time=Time(max_silence_s=1e6))
-
-    strict, lax = (
-        _replay(tmp_path / name, paused, one) for name, one in (("a", None), ("b", vehicle))
-    )
-
-    assert strict.exit_status == 0
-    assert len(strict.segments) == 1
-    for name in ("pose", "measurements"):
-        assert strict.run.file(f"{name}.parquet").read_bytes() == (
-            lax.run.file(f"{name}.parquet").read_bytes()
-        )
-
-
 @pytest.mark.parametrize("by_s", [1000, -900])
 def test_single_stray_stamp_is_skipped_and_reported(tmp_path: Path, by_s: int) -> None:
     blocks = _drive(rows_a_block=50)
@@ -176,37 +142,6 @@ def test_single_stray_stamp_is_skipped_and_reported(tmp_path: Path, by_s: int) -
     assert outcome.travelled_m == without.travelled_m
     assert outcome.ledgers[0].topic("wheels").skipped == {"stray time stamp": 1}
     assert any("is far" in sentence for sentence in outcome.ledgers[0].notices)
-
-
-def test_late_rows_are_not_taken_for_clock_set_back() -> None:
-    stamps = np.arange(1000) * ROW
-    stamps[[500, 501, 502]] -= 4 * SECOND
-    watch = StampWatch()
-    for part in np.array_split(stamps, 9):
-        watch.add(part)
-    watch.finish()
-
-    assert not watch.set_backs
-    assert watch.strays == [(500, 503)]
-
-
-@pytest.mark.parametrize("pieces", [1, 3, 100, 700])
-def test_stamp_watch_result_does_not_depend_on_block_size(pieces: int) -> None:
-    stamps: Int64s = np.arange(700) * ROW
-    stamps[300:] -= 20 * SECOND
-    stamps[450] += 5000 * SECOND
-    stamps[600:] += 100 * SECOND
-    watch = StampWatch()
-    for part in np.array_split(stamps, pieces):
-        watch.add(part)
-    watch.finish()
-
-    assert [one.row for one in watch.set_backs] == [300]
-    assert watch.strays == [(450, 451)]
-    assert [(era.first_ns, era.last_ns) for era in watch.eras] == [
-        (0, 299 * ROW),
-        (100 * ROW, 699 * ROW + 80 * SECOND),
-    ]
 
 
 def _belief(speed_mps: float) -> PoseBelief:
@@ -241,12 +176,3 @@ def test_clock_set_back_by_few_rows_adds_no_distance(tmp_path: Path, by_ms: int)
 
     # Wheel speeds of 5.9 m/s that overlap for up to 0.3 s cannot all be assigned.
     assert straight - 3.0 < set_back.travelled_m <= straight
-
-
-def test_longer_gap_increases_covariance() -> None:
-    spread = [
-        float(np.trace(cross_gap(_belief(15.0), round(s * 1e9), GapSettings()).belief.cov))
-        for s in np.linspace(0.0, 60.0, 121)
-    ]
-
-    assert np.all(np.diff(spread) > 0)

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from crosscue.eval import cli
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import RunFolder
-from support.gap_drive import BEGIN, ROW, SECOND, Clock, distance_m, replay, write_drive
-from support.trees import tree
+from support.gap_drive import ROW, SECOND, Clock, distance_m, replay, write_drive
 
 LABELLED: Final = ("frames", "detections", "road", "cues", "range", "belief", "pose", "skipped")
 NEVER_S: Final = 1e6
@@ -120,14 +119,6 @@ def test_short_gap_keeps_approach_and_range(tmp_path: Path, pause_s: float) -> N
     assert after[0]["range_m"] == pytest.approx(left_m, abs=1.0)
 
 
-def test_long_gap_starts_new_approach(tmp_path: Path) -> None:
-    outcome = replay(tmp_path, write_drive(tmp_path, Clock(pause_s=(4.0, 9.2))))
-
-    assert outcome.scene is not None
-    assert outcome.scene.counts["approaches opened"] == 2
-    assert outcome.scene.counts["approaches closed: a gap in time"] == 1
-
-
 @pytest.mark.parametrize("line", ["max_silence_s = 9.0", "restart_after_s = 2.0"])
 def test_estimate_refuses_settings_that_split_frames_differently(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str
@@ -145,39 +136,6 @@ def test_estimate_refuses_settings_that_split_frames_differently(
     assert "run crosscue replay again" in message
     assert run.file("manifest.json").read_bytes() == before
     assert cli.run(["estimate", str(run.path), "--vehicle", str(tmp_path / "car.toml")]) == 3
-
-
-def _detected_without_odometry(folder: Path, clock: Clock) -> Path:
-    """Run ``detect`` with a vehicle file whose wheel speed signals are not on the bus."""
-    log = write_drive(folder, clock)
-    wrong = folder / "wrong.toml"
-    wrong.write_text((folder / "car.toml").read_text().replace('"WHEEL_SPEEDS.', '"WHEELS.'))
-    argv = ["detect", str(log), "--vehicle", str(wrong), "-o", str(folder / "run"), "--no-cache"]
-    assert cli.run(argv) == 0
-    return folder / "run"
-
-
-def test_estimate_refuses_frames_segmented_without_odometry(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = _detected_without_odometry(tmp_path, Clock(pause_s=(5.0, 8.0)))
-    before = tree(run)
-    capsys.readouterr()
-
-    assert cli.run(["estimate", str(run), "--vehicle", str(tmp_path / "car.toml")]) == 2
-
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
-    first_ns = BEGIN + 80 * ROW
-    assert f"its frame at {first_ns} ns is in segment 0, the odometry then in 1" in message
-    assert "run crosscue replay again" in message
-    assert tree(run) == before
-
-
-def test_estimate_accepts_frames_of_drive_without_gaps(tmp_path: Path) -> None:
-    run = _detected_without_odometry(tmp_path, Clock())
-
-    assert cli.run(["estimate", str(run), "--vehicle", str(tmp_path / "car.toml")]) == 0
 
 
 @pytest.mark.parametrize("by_s", [3.0, -3.0])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
@@ -15,7 +14,6 @@ from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.replay import Detecting, replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
-from crosscue.eval.scoring.pose.smoother import score_smoother
 from crosscue.localization.landmarks.database import (
     LandmarkDatabase,
     LandmarkPosition,
@@ -83,21 +81,6 @@ def test_clock_set_back_in_camera_log_leaves_odometry_unchanged(tmp_path: Path) 
     assert frames["segment"].to_pylist() == [0] * 60 + [1] * 80
 
 
-def test_clock_jump_in_wheel_log_is_gap_without_distance(tmp_path: Path) -> None:
-    straight = _two_logs(tmp_path, Clock(), Clock(), "straight")
-
-    shifted = _two_logs(tmp_path, Clock(set_at_s=6.0, by_s=3.0), Clock(), "whole")
-
-    assert (shifted.exit_status, len(shifted.segments)) == (3, 2)
-    assert shifted.segments[1].gap_ns == 3 * SECOND + ROW
-    assert shifted.travelled_m == pytest.approx(straight.travelled_m - STEP_M, abs=1e-6)
-    frames = shifted.run.table("frames")
-    assert frames["t_ns"].equals(frames["log_t_ns"])
-    assert frames["t_ns"].to_pylist() == straight.run.table("frames")["t_ns"].to_pylist()
-    # The odometry's second half begins at 9 s; pictures up to a second earlier belong to it.
-    assert frames["segment"].to_pylist() == [0] * 80 + [1] * 60
-
-
 def _replayed_part(folder: Path, log: Path, run: str, *part: str) -> tuple[int, RunFolder]:
     argv = ["replay", str(log), "--vehicle", str(folder / "car.toml"), "-o", str(folder / run)]
     return cli.run([*argv, "--no-cache", *part]), RunFolder(folder / run)
@@ -122,75 +105,6 @@ def test_selected_part_of_log_has_only_its_gaps(
     numbers = run.table("frames")["segment"].to_pylist()
     assert [numbers.count(n) for n in sorted(set(numbers))] == rows
     assert _column(run, "pose", "travelled_m")[-1] == pytest.approx(way_m, abs=0.01)
-
-
-def test_repeated_time_range_is_read_twice(tmp_path: Path) -> None:
-    log = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=-3.0))
-
-    # Times are relative to the log's first message; 3 s to 6 s occur twice.
-    ended, run = _replayed_part(tmp_path, log, "run", "--from", "4", "--to", "5")
-
-    assert ended == 3
-    frames = run.table("frames")
-    seconds = [(t_ns - BEGIN) / SECOND for t_ns in frames["log_t_ns"].to_pylist()]
-    once = [4 + tenth / 10 for tenth in range(10)]
-    assert seconds == pytest.approx([*once, *once])
-    assert frames["segment"].to_pylist() == [0] * 10 + [1] * 10
-    assert _column(run, "pose", "travelled_m")[-1] == pytest.approx(18 * STEP_M, abs=0.01)
-
-
-def test_detect_records_segments_in_tables(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, out = write_drive(tmp_path, Clock(pause_s=(5.0, 8.0))), tmp_path / "run"
-    argv = ["detect", str(log), "--vehicle", str(tmp_path / "car.toml"), "-o", str(out)]
-
-    assert cli.run([*argv, "--no-cache"]) == 3
-
-    assert "1 gap without odometry, 3.1 s in all" in capsys.readouterr().out
-    for name in ("frames", "detections", "cues"):
-        table = RunFolder(out).table(name)
-        is_after = table["log_t_ns"].to_numpy() >= BEGIN + 8 * SECOND
-        assert table["segment"].to_pylist() == is_after.astype(int).tolist()
-        assert 0 < is_after.sum() < len(is_after)
-
-
-def test_merge_keeps_segments_of_each_drive(tmp_path: Path) -> None:
-    runs = []
-    for name, clock in (("gap", Clock(pause_s=(5.0, 8.0))), ("whole", Clock())):
-        log = write_drive(tmp_path, clock, name=f"{name}.mcap")
-        runs.append(replayed(tmp_path, log, f"runs/{name}"))
-
-    assert cli.run(["merge", str(tmp_path / "runs"), "-o", str(tmp_path / "merged")]) == 0
-
-    for name in ("frames", "cues", "range", "belief", "pose"):
-        merged = RunFolder(tmp_path / "merged").table(name).to_pylist()
-        for run in runs:
-            mine = [row for row in merged if row["drive"].startswith(run.path.name)]
-            assert [{key: row[key] for key in row if key != "drive"} for row in mine] == (
-                run.table(name).to_pylist()
-            )
-    assert {row["segment"] for row in merged} == {0, 1}
-
-
-def test_compare_reports_segment_column_as_changed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    jumped = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=3.0))
-    gap = replayed(tmp_path, jumped, "gap").path
-    without_gap = replayed(
-        tmp_path, write_drive(tmp_path, Clock(), name="whole.mcap"), "whole"
-    ).path
-    capsys.readouterr()
-
-    changed = []
-    for before, status in ((gap, 0), (without_gap, 1)):
-        assert cli.run(["compare", str(before), str(gap), "--json"]) == status
-        tables = json.loads(capsys.readouterr().out)["tables"]
-        changed.append({one["name"]: sorted(one["columns"]) for one in tables})
-
-    assert changed[0] == {}
-    assert {"log_t_ns", "segment", "t_ns"} <= set(changed[1]["frames"])
 
 
 def _with_landmarks(folder: Path, clock: Clock) -> Outcome:
@@ -237,34 +151,3 @@ def test_landmarks_correct_pose_after_long_gap(marked: Outcome, tmp_path: Path) 
     assert _column(marked.run, "pose", "travelled_m")[-1] == pytest.approx(
         _column(without, "pose", "travelled_m")[-1], abs=1e-6
     )
-
-
-def test_pose_covariance_grows_by_possible_motion_in_gap(tmp_path: Path) -> None:
-    run = replayed(tmp_path, write_drive(tmp_path, Clock(pause_s=(4.0, 7.0))))
-    last, first = (
-        int(np.flatnonzero(_column(run, "pose", "segment") == n)[-1 + n]) for n in (0, 1)
-    )
-    pose = {name: _column(run, "pose", name)[[last, first]] for name in ("t_ns", "travelled_m")}
-    x_m, var_m2 = (_column(run, "pose", name)[[last, first]] for name in ("x_m", "cov_xx_m2"))
-    gap_s = float(np.diff(pose["t_ns"])[0]) * 1e-9
-    limits = load(tmp_path / "car.toml").time
-
-    # As in docs/explanation/time_segments.md: accelerating, braking or turning all the time.
-    off_m = 0.5 * limits.max_accel_mps2 * gap_s**2
-    off_m += 0.5 * SPEED_MPS * gap_s * limits.max_turn_rate_radps * gap_s
-    off_m = min(off_m, SPEED_MPS * gap_s + 0.5 * limits.max_accel_mps2 * gap_s**2)
-    assert gap_s > 3.0
-    assert float(np.diff(x_m)[0]) == pytest.approx(SPEED_MPS * gap_s, abs=0.2)
-    assert float(np.diff(var_m2)[0]) == pytest.approx(off_m**2 / 4.0, rel=0.1)
-    assert float(np.diff(pose["travelled_m"])[0]) <= STEP_M + 1e-6
-
-
-def test_batch_smoother_corrects_pose_across_gap(marked: Outcome) -> None:
-    pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
-
-    score = score_smoother(marked.run, marked.run.path.parent / "truth.json", {})
-
-    assert score.poses == 14
-    # Afterwards the position after the gap is known.
-    assert score.smoother_rmse_m < score.filter_rmse_m
-    assert score.smoother_end_m < 2.0

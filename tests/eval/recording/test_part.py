@@ -23,28 +23,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return scene_run(tmp_path_factory.mktemp("part"))
 
 
-def entities(path: Path) -> set[str]:
-    return {chunk.entity_path.split("/")[1] for chunk in RrdReader(path).stream()}
-
-
 def test_tables_of_a_part_have_only_its_rows_and_selected_columns(run: RunFolder) -> None:
     part = run_between(run, at(10), at(19))
 
     assert part.table("frames")["t_ns"].to_pylist() == [at(frame) for frame in range(10, 20)]
     assert part.table("frames", ["frame"]).column_names == ["frame"]
     assert sum(len(batch) for batch in part.batches("detections", ["label"])) == 2 * 10
-
-
-def test_recording_at_a_moment_begins_two_seconds_before(run: RunFolder, tmp_path: Path) -> None:
-    path = crosscue.save_recording(run.path, tmp_path / "at.rrd", at=3.0)
-
-    times: set[int] = set()
-    for chunk in RrdReader(path).stream():
-        if not chunk.is_static and chunk.entity_path == "/camera/picture":
-            column = chunk.to_record_batch().column("drive")
-            times.update(column.cast("int64").to_pylist())
-    # The run ends less than 4 s after the moment.
-    assert times == {at(frame) for frame in range(10, 50)}
 
 
 def test_moment_in_nanoseconds_yields_the_same_recording(run: RunFolder, tmp_path: Path) -> None:
@@ -59,13 +43,6 @@ def test_moment_in_nanoseconds_yields_the_same_recording(run: RunFolder, tmp_pat
     ]
 
     assert rows[0] == rows[1]
-
-
-def test_unselected_views_are_not_recorded(run: RunFolder, tmp_path: Path) -> None:
-    path = crosscue.save_recording(run.path, tmp_path / "only.rrd", only=("belief", "cues"))
-
-    assert {"plots", "cues"} <= entities(path)
-    assert not {"camera", "ahead", "plan"} & entities(path)
 
 
 def test_approach_is_recorded_from_its_first_step_to_its_last(tmp_path: Path) -> None:

@@ -13,19 +13,15 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 from crosscue.detectors import rle
-from crosscue.detectors.base import RoadMask
 from crosscue.detectors.images import Encoded
 from crosscue.eval import cli
 from crosscue.eval.recording import save_rrd
 from crosscue.eval.recording.camera import shown
-from crosscue.eval.recording.columns import time_of
-from crosscue.eval.recording.layout import ViewData, blueprint
-from crosscue.eval.recording.marks import road_lines
 from crosscue.eval.recording.notes import inert
 from crosscue.eval.recording.plan import log_landmarks
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.replay.errors import LogError
-from support.scene_run import FRAMES, LABEL, TOPIC, scene_run, write_pictures
+from support.scene_run import FRAMES, LABEL, scene_run
 from support.scoring import at, good_truth, truth_folder
 
 
@@ -84,23 +80,6 @@ def test_each_frame_has_picture_marks_and_belief_on_the_timeline(
     assert rows["/plan/true_car"] == 2
 
 
-def test_cue_state_changes_with_its_frames(tmp_path: Path) -> None:
-    path = _saved_recording(tmp_path)
-
-    states = _cells(path, "/cues/road_left", "state")
-    assert states == [None, ["found"], None] or states == [[], ["found"], []]
-    # Not found, found in the last frames, and not found after the last one.
-    assert _rows(path)["/cues/cross_traffic_right"] == 3
-
-
-def test_arrows_follow_a_crossing_car(tmp_path: Path) -> None:
-    path = _saved_recording(tmp_path)
-
-    vectors = _cells(path, "/camera/cars", "vectors")
-    assert [len(one or []) for one in vectors] == [0] + [1] * (FRAMES - 1)
-    assert all(one[0][0] > 0.0 == one[0][1] for one in vectors[1:])
-
-
 def test_labels_are_plain_text_and_entity_paths_are_fixed(tmp_path: Path) -> None:
     path = _saved_recording(tmp_path)
 
@@ -134,13 +113,6 @@ def test_run_without_some_tables_records_the_others(
     assert ("/plan/car" in rows) == ("pose" not in without)
     assert ("/plots/belief/left" in rows) == ("belief" not in without)
     assert ("/camera/objects" in rows) == ("frames" not in without)
-
-
-def test_recording_is_little_larger_than_its_pictures(tmp_path: Path) -> None:
-    bytes_ = write_pictures(tmp_path / "pictures.mcap")
-    size = _saved_recording(tmp_path).stat().st_size
-
-    assert bytes_ < size < 1.05 * bytes_ + 300_000
 
 
 def test_unsupported_picture_encodings_become_jpeg() -> None:
@@ -182,24 +154,6 @@ def test_view_accepts_truth_without_a_track(
     assert "/plan/true_car" not in rows
 
 
-def test_layout_has_views_for_available_data() -> None:
-    pose = {name: np.array([0.0, 1.0]) for name in ("x_m", "y_m")}
-    complete = blueprint(ViewData(TOPIC, pose, has_truth=True, has_scene=True))
-    bare = blueprint(ViewData(None, None, has_truth=False, has_scene=True))
-    alone = blueprint(ViewData(None, pose, has_truth=False, has_scene=False))
-
-    counted = [len(list(_views(one.root_container))) for one in (complete, bare, alone)]
-    assert counted == [11, 5, 6]
-
-
-def _views(part: Any) -> Any:
-    for one in getattr(part, "contents", None) or []:
-        if hasattr(one, "contents") and not hasattr(one, "origin"):
-            yield from _views(one)
-        else:
-            yield one
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 30), st.integers(0, 20), st.integers(3, 30), st.integers(3, 20))
 def test_outline_follows_the_border_of_the_mask(x: int, y: int, width: int, height: int) -> None:
@@ -211,22 +165,6 @@ def test_outline_follows_the_border_of_the_mask(x: int, y: int, width: int, heig
     assert (line[0] == line[-1]).all()
     assert line.min(axis=0).tolist() == [x + 0.5, y + 0.5]
     assert line.max(axis=0).tolist() == [x + width - 0.5, y + height - 0.5]
-
-
-def test_road_lines_are_in_picture_pixels() -> None:
-    mask = rle.encode_mask(np.ones((4, 8), np.bool_), (0, 5), (8, 9))
-
-    lines = road_lines(RoadMask(0, (80, 90), mask, (8, 9)))
-
-    everything = np.vstack(lines)
-    assert everything.min() >= 0.0
-    assert everything[:, 0].max() <= 80.0
-    assert everything[:, 1].min() == pytest.approx(55.0)
-
-
-def test_time_since_boot_is_shown_as_a_duration() -> None:
-    assert not time_of(5).is_date
-    assert time_of(1_700_000_000_000_000_000).is_date
 
 
 def test_used_landmarks_are_labelled_on_the_map(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 
 import crosscue
 from crosscue.eval import cli
-from crosscue.eval.report.mlflow_sink import mlflow_name
 from crosscue.eval.runs.tags import write_tags
 from support.scoring import run_folder, truth_folder
 
@@ -87,10 +86,3 @@ def test_missing_mlflow_names_the_package_to_install(monkeypatch: pytest.MonkeyP
 
     with pytest.raises(crosscue.UsageError, match=r"pip install mlflow-skinny"):
         crosscue.open_mlflow("http://localhost:1")
-
-
-def test_metric_names_are_sanitised_for_mlflow() -> None:
-    assert mlflow_name("cues.stop_sign.by_condition.low sun.recall") == (
-        "cues.stop_sign.by_condition.low sun.recall"
-    )
-    assert mlflow_name("a|b<c>") == "a_b_c_"

@@ -14,10 +14,9 @@ from rerun.chunk import RrdReader
 from crosscue.eval.drives.score import ScoreWork
 from crosscue.eval.recording import save_rrd
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.tables.log_time import ClockGap, broken_at, gaps_of
+from crosscue.eval.runs.tables.log_time import ClockGap, gaps_of
 from crosscue.eval.scoring.drives import ScoreSettings
-from crosscue.eval.scoring.pose.score import ScoredPoses
-from support.gap_drive import BEGIN, ROW, SECOND, Clock, replayed, write_drive
+from support.gap_drive import Clock, replayed, write_drive
 
 PAUSE = Clock(pause_s=(5.0, 7.1))
 
@@ -44,14 +43,6 @@ def _crosses(rows: Sequence[tuple[int, Any]], gap: ClockGap) -> bool:
     """Return True if a line crosses the gap."""
     before = [value for t_ns, value in rows if t_ns < gap.middle_ns]
     return bool(np.isfinite(before[-1][0]))
-
-
-def test_gap_spans_the_pause_of_odometry(paused: RunFolder) -> None:
-    (gap,) = gaps_of(paused.drive_manifest().timeline)
-
-    assert (gap.start_ns, gap.end_ns) == (BEGIN + 5 * SECOND - ROW, BEGIN + 71 * ROW)
-    assert gap.text == "gap of 2.2 s"
-    assert broken_at([gap], np.array([gap.start_ns, gap.end_ns])).tolist() == [1]
 
 
 def test_lines_of_a_recording_break_at_gaps(paused: RunFolder, tmp_path: Path) -> None:
@@ -105,28 +96,3 @@ def test_report_shades_each_gap_with_its_duration(
         assert np.isnan(np.asarray(axes.lines[0].get_xdata(), np.float64)).sum() == 1
     (by_way,) = [f.axes[0] for f in figures if "travelled" in f.axes[0].get_xlabel()]
     assert np.isnan(np.asarray(by_way.lines[0].get_ydata(), np.float64)).sum() == 1
-
-
-def test_long_gap_is_shortened_on_the_time_axis() -> None:
-    t_ns = np.concatenate([np.arange(60), np.arange(60, 140) + 12_000]) * ROW
-    n = len(t_ns)
-    gap = ClockGap(59 * ROW, 12_060 * ROW, "gap of 1200.1 s")
-    zero, two = np.zeros(n), np.zeros((n, 2))
-    poses = ScoredPoses(
-        t_ns, two, two, zero, np.zeros((n, 3, 3)), zero, zero, zero, 1.0, "", (gap,)
-    )
-
-    seconds = poses.seconds
-
-    shown_s = float(seconds[60] - seconds[59])
-    assert shown_s == pytest.approx(0.25 * 13.8, abs=0.1)
-    assert np.allclose(np.diff(seconds)[np.arange(n - 1) != 59], 0.1)
-
-
-def test_repeated_time_is_shaded_as_clock_set_back(tmp_path: Path) -> None:
-    run = replayed(tmp_path, write_drive(tmp_path, Clock(set_at_s=6.0, by_s=-3.0)))
-
-    (gap,) = gaps_of(run.drive_manifest().timeline)
-
-    assert gap.text == "clock set back"
-    assert (gap.start_ns, gap.end_ns) == (BEGIN + 3 * SECOND, BEGIN + 6 * SECOND - ROW)

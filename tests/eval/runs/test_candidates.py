@@ -1,6 +1,5 @@
 """Sentences on detections that were used neither for a cue nor for a range."""
 
-from crosscue.detectors.cues.candidates import NO_CURVE
 from crosscue.eval.runs.candidates import CandidateRow, candidate_lines
 
 
@@ -25,29 +24,6 @@ def test_unreached_threshold_is_reported_with_highest_score() -> None:
         "traffic_light: 87 detections, none above 0.90 (highest 0.62); "
         "see crosscue fit detector, or lower [cues] traffic_light_score"
     )
-
-
-def test_cues_of_equal_counts_share_a_line_and_empty_ones_have_none() -> None:
-    cars = _row(9, {"below score": 4, "not seen from the side": 5})
-    lines = candidate_lines(
-        {"parked_left": cars, "parked_right": cars, "stop_sign": _row(0, {})}, {}
-    )
-
-    assert lines == [
-        "parked_left, parked_right: 9 detections, 0 used; 4 below score (0.90), "
-        "5 not seen from the side"
-    ]
-
-
-def test_ranges_without_a_curve_are_reported() -> None:
-    ranged = {"traffic_light": _row(100, {"below score": 15, NO_CURVE: 80, "no height": 5})}
-
-    assert candidate_lines({}, ranged) == [
-        "range: 80 traffic lights measured, no curve: [ranges.traffic_light] is not given; "
-        "crosscue fit ranges, or for ranges from motion set camera.focal_px and leave out "
-        "ranges.kind",
-        "range: 0 traffic lights used; 5 no height",
-    ]
 
 
 def test_road_cue_is_reported_only_if_it_was_never_used() -> None:

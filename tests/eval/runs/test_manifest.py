@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pydantic import ValidationError
 
 from crosscue.eval import cli
 from crosscue.eval.batch.merge import merge_runs
 from crosscue.eval.catalog.decoded_logs import decode_tables
-from crosscue.eval.runs.account import Account, account
+from crosscue.eval.runs.account import account
 from crosscue.eval.runs.folder import RunFolder, create, open_run, write_manifest
 from crosscue.eval.runs.manifest import (
     FORMAT_VERSION,
@@ -107,13 +106,6 @@ def test_invalid_manifest_is_refused_in_one_line(
     with pytest.raises(RunError, match=message) as error:
         open_run(run.path)
     assert "\n" not in str(error.value)
-
-
-def test_records_refuse_unknown_fields_and_changes() -> None:
-    with pytest.raises(ValidationError, match="Extra inputs"):
-        Account(**{**LOST.as_json(), "lost": 1})
-    with pytest.raises(ValidationError, match="frozen"):
-        estimated().notices = ("other",)
 
 
 def test_run_schema_covers_all_stages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,12 +7,9 @@ import pytest
 
 import crosscue
 from crosscue.eval import cli
-from crosscue.eval.batch.merge import gathered, merge_runs
-from crosscue.eval.runs.folder import MANIFEST, clear, create, locked, open_run, staged
-from crosscue.eval.runs.manifest import MergedManifest
-from crosscue.replay.errors import RunError, UnreadableRunError, UsageError
+from crosscue.eval.batch.merge import gathered
+from crosscue.replay.errors import UnreadableRunError, UsageError
 from support.catalog_runs import add_run, runs_below
-from support.manifests import estimated
 from support.trees import tree
 
 
@@ -58,30 +55,6 @@ def test_tags_are_columns_of_runs_and_approaches(runs: Path) -> None:
     rows = found.query("select run from approaches where tags.weather = 'rain'")
     assert rows.to_pylist() == [{"run": "a/monday"}]
     assert len(found.select("tags['weather'] is null")) == 3
-
-
-def test_overwritten_run_keeps_its_tags(runs: Path) -> None:
-    run = open_run(runs / "a/monday")
-    crosscue.tag_runs([run.path], {"weather": "rain"})
-    with locked(run), staged(run) as new:
-        new.file(MANIFEST).write_text(estimated().model_dump_json(by_alias=True))
-    assert crosscue.tag_runs([run.path]).tags == {run.path: {"weather": "rain"}}
-
-    clear(create(run.path, overwrite=True))
-
-    assert [path.name for path in run.path.iterdir()] == ["tags.json"]
-
-
-def test_merged_manifest_keeps_tags_of_each_drive(runs: Path) -> None:
-    crosscue.tag_runs([runs / "a/monday"], {"weather": "rain"})
-    found, failures = gathered([runs / "a"])
-    manifest = merge_runs(found, create(runs / "all", overwrite=False), failures).run.manifest()
-
-    assert isinstance(manifest, MergedManifest)
-    assert {one.name: one.tags for one in manifest.drives} == {
-        "monday": {"weather": "rain"},
-        "tuesday": {},
-    }
 
 
 def test_copies_of_a_run_with_different_tags_are_not_merged(runs: Path) -> None:
@@ -130,9 +103,3 @@ def test_damaged_tags_are_reported_and_not_overwritten(runs: Path) -> None:
     assert "3" in path.read_text()
     assert not (runs / "a/tuesday/tags.json").exists()
     assert "tags.json: unreadable" in crosscue.catalog(runs).left_out["a/monday"]
-
-
-def test_locked_run_is_not_tagged(runs: Path) -> None:
-    run = open_run(runs / "a/monday")
-    with locked(run), pytest.raises(RunError, match="is writing it"):
-        crosscue.tag_runs([run.path], {"weather": "rain"})

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.eval.scoring.intervals import fraction, mean, wilson
+from crosscue.eval.scoring.intervals import fraction, wilson
 from crosscue.eval.scoring.scene.cues import match_cues, score_cues
-from crosscue.replay.vehicle.cue_table import CUES
 from support.scoring import (
     ENTER,
     approach,
@@ -39,14 +38,6 @@ def test_wilson_interval_is_nan_without_data_and_refuses_impossible_counts() -> 
         wilson(4, 3)
 
 
-def test_mean_over_one_drive_has_no_interval() -> None:
-    one = mean(np.array([0.2, 0.4]), np.array([5, 5]))
-
-    assert one.value == pytest.approx(0.3)
-    assert np.isnan(one.low)
-    assert np.isnan(one.high)
-
-
 def test_repeated_frames_narrow_wilson_interval_but_not_interval_over_drives() -> None:
     right = np.array([True, True, False, True, False])
     drives = np.arange(5)
@@ -75,19 +66,6 @@ def test_cue_scores_equal_those_counted_by_hand() -> None:
     assert score.is_sources_reading
 
 
-def test_frames_are_scored_or_excluded_with_reason() -> None:
-    found = {"stop_sign": {3: 1, 7: 0, 45: 1, 80: 2}, "do_not_enter": {0: 1}}
-    scores = score_cues(match_cues(tables(found, frames=50), good_truth()))
-
-    assert len(scores) == len(CUES)
-    for score in scores.values():
-        for reading in score.readings.values():
-            assert reading.scored + sum(reading.left_out.values()) == reading.frames == 51
-    assert scores["road_left"].readings["object"].left_out["not looked for"] == 40
-    # Frame 80 is after the end of the truth.
-    assert scores["stop_sign"].readings["object"].left_out["outside the truth's time"] == 1
-
-
 def test_object_and_feature_readings_differ_for_closed_road() -> None:
     one = approach(features={"left": False, "right": True, "straight": False}, one_way="right")
     drive = truth([span("road_left", 0, 40), span("one_way_right", 0, 40, present=False)], [one])
@@ -103,17 +81,6 @@ def test_object_and_feature_readings_differ_for_closed_road() -> None:
     assert sign["feature"].precision.value == 1.0
 
 
-def test_cue_without_intersection_ahead_is_false() -> None:
-    far = approach(start_ns=at(20), enter_ns=at(40))
-    judged = match_cues(tables({"traffic_light": {5: 1, 25: 1}}), truth([], [far]))
-    score = score_cues(judged)["traffic_light"]
-
-    # Without truth of lights, the other criterion leads, and the score reports it.
-    assert score.reading == "feature"
-    assert not score.is_sources_reading
-    assert (score.precision.right, score.precision.of) == (1, 2)
-
-
 def test_hidden_objects_do_not_count_in_visible_recall() -> None:
     drive = truth(
         [
@@ -127,47 +94,6 @@ def test_hidden_objects_do_not_count_in_visible_recall() -> None:
     assert score.recall is not None
     assert score.recall_seen is not None
     assert (score.recall.value, score.recall_seen.value) == (0.5, 1.0)
-
-
-def test_object_truth_is_not_completed_with_features() -> None:
-    found = {"parked_left": {3: 1}, "cross_traffic_left": {3: 1}}
-    of_things = score_cues(match_cues(tables(found), truth([span("parked_left", 0, 20)])))
-    of_features = score_cues(match_cues(tables(found), truth([])))
-
-    assert of_things["parked_left"].scored > 0
-    assert (of_things["cross_traffic_left"].reading, of_things["cross_traffic_left"].scored) == (
-        "object",
-        0,
-    )
-    assert of_features["cross_traffic_left"].reading == "feature"
-
-
-def test_custom_cue_is_scored_and_reported_if_not_evaluated() -> None:
-    drive = truth([span("zebra", 0, 10), span("zebra", 10, 40, present=False), span("gate", 0, 40)])
-    scores = score_cues(match_cues(tables({"zebra": dict.fromkeys(range(5, 15), 1)}), drive))
-
-    zebra, gate = scores["zebra"], scores["gate"]
-    assert (zebra.precision.right, zebra.precision.of) == (5, 10)
-    assert zebra.reading == "object"
-    assert gate.scored == 0
-    assert gate.readings["object"].left_out["not looked for"] == 10
-
-
-def test_moment_annotations_without_frame_are_counted() -> None:
-    moment = span("stop_sign", 0, 1).model_copy(
-        update={"start_ns": None, "end_ns": None, "t_ns": at(3) + 1}
-    )
-    judged = match_cues(tables({"stop_sign": {3: 1}}), truth([moment]))
-
-    assert score_cues(judged)["stop_sign"].moments_unmatched == 1
-
-
-def test_merged_drives_sum_counts_and_clusters() -> None:
-    judged = [one for name in ("a", "b") for one in match_cues(good_tables(), good_truth(name))]
-    score = score_cues(judged)["stop_sign"]
-
-    assert (score.precision.right, score.precision.of, score.precision.clusters) == (60, 60, 2)
-    assert score.readings["object"].frames == 100
 
 
 @settings(max_examples=30, deadline=None)
@@ -228,14 +154,3 @@ def test_scores_by_distance_sum_up_and_conditions_follow_approach() -> None:
         tag: (part.frames, part.precision.value) for tag, part in score.by_condition.items()
     } == {"rain": (20, 1.0), "dusk": (20, 1.0), "no tag": (20, 0.0)}
     assert set(score.by_distance) == {"0-10", "10-20", "20-30"}
-
-
-def test_cue_of_road_with_unknown_truth_is_not_scored() -> None:
-    unknown = approach(features={"left": True, "right": True, "straight": None})
-    found = {"vehicles_past": dict.fromkeys(range(10), 1)}
-
-    score = score_cues(match_cues(tables(found, frames=10), truth(approaches=[unknown])))
-
-    reading = score["vehicles_past"].readings["feature"]
-    assert reading.scored == 0
-    assert reading.left_out["no truth at this time"] == 10

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from crosscue.eval.drives.score import ScoreWork
 from crosscue.eval.report.summary import pose_summary, scores_text
@@ -66,14 +65,3 @@ def test_rows_with_repeated_log_time_are_counted_in_all_scores(tmp_path: Path) -
         assert one["in"] == one["used"] + sum(one["skipped"].values())
     assert f"<b>Ambiguous:</b> {frames} frames" in page
     assert f"{pose['ambiguous']} lie at moments that come twice" in page
-
-
-@pytest.mark.parametrize("clock", [Clock(), Clock(pause_s=(5.0, 9.1))])
-def test_no_row_is_ambiguous_without_clock_set_back(tmp_path: Path, clock: Clock) -> None:
-    run = _replayed(tmp_path, clock)
-
-    scored = ScoreWork(tmp_path / "truth.json", ScoreSettings(), (10.0,))(run.path)
-
-    assert scored.metrics["coverage"]["frames_ambiguous"] == 0
-    assert AMBIGUOUS not in run.file("score/metrics.json").read_text()
-    assert "mbiguous:</b>" not in scored.report.read_text()

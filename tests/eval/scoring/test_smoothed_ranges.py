@@ -46,23 +46,3 @@ def test_range_smoother_is_more_accurate_than_filter() -> None:
         assert (after.var_m2 <= before.var_m2 + 1e-12).all()
 
     assert np.mean(smoother_m2) < 0.8 * np.mean(filter_m2)
-
-
-def test_restarted_range_does_not_change_previous_range() -> None:
-    rng = np.random.default_rng(seed=4)
-    first = filtered(60.0 - STEP_M * np.arange(10) + rng.normal(0.0, 2.0, 10))
-    second = filtered(90.0 - STEP_M * np.arange(10) + rng.normal(0.0, 2.0, 10))
-
-    together = smoothed_rows(rows(first + second), odometer(21))
-    alone = smoothed_rows(rows(first), odometer(11))
-
-    np.testing.assert_allclose(together.range_m[:10], alone.range_m, rtol=1e-12)
-
-
-def test_rows_without_odometry_are_not_smoothed() -> None:
-    beliefs = filtered(60.0 - STEP_M * np.arange(10.0))
-
-    after = smoothed_rows(rows(beliefs), odometer(5))
-
-    np.testing.assert_array_equal(after.range_m[4:], rows(beliefs).range_m[4:])
-    assert after.var_m2[0] < beliefs[0].var_m2

@@ -13,7 +13,6 @@ from crosscue.eval.batch.jobs import in_turn
 from crosscue.eval.cli import run
 from crosscue.eval.studies import simulated_drives
 from crosscue.eval.studies.intersections import run as study_intersections
-from crosscue.eval.studies.intersections.tables import cue_rows
 from crosscue.replay.vehicle.cue_table import groups
 from crosscue.replay.vehicle.vehicle import DetectorSection, RangeCurve, Ranges, Vehicle
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
@@ -101,27 +100,3 @@ def test_second_start_of_study_replays_nothing(
     assert run(["study", "intersections", "-o", str(study), *ARGUMENTS, "-q"]) == 0
 
     assert (study / "study.json").read_bytes() == before
-
-
-def test_every_published_cue_has_row_without_detections() -> None:
-    assert [row["positives"] for row in cue_rows({})] == [0] * len(groups())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--layouts", "A,Z"], "expected some of A to H, each once"),
-        (["--layouts", "A,A"], "each once"),
-        (["--runs", "0"], "expected 1 or more"),
-        (["--width", "100"], "multiple of 16"),
-        (["--workers", "0"], "expected 1 or more"),
-    ],
-)
-def test_invalid_study_arguments_are_refused_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
-    assert run(["study", "intersections", "-o", str(tmp_path), *arguments]) == 2
-
-    error = capsys.readouterr().err
-    assert message in error
-    assert error.count("\n") == 1

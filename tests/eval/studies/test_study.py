@@ -1,18 +1,15 @@
 """Studies: reproducible with any number of workers, resumed after a stop, with checked input."""
 
-import json
 import math
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import RunFolder
@@ -24,30 +21,22 @@ from crosscue.eval.studies.intervals import (
     ratio_of,
     ratio_of_means,
 )
-from crosscue.eval.studies.page import PageTable, write_study_page
 from crosscue.eval.studies.town import work
-from crosscue.eval.studies.town.field_study import drive_field, finish_field
 from crosscue.eval.studies.town.landmark_study import comparisons_of
 from crosscue.eval.studies.town.range_study import (
-    CALIBRATION_SEED,
-    calibrate,
     drive_choices,
-    implied_m,
     summarise_ranges,
 )
 from crosscue.eval.studies.town.replayed import through_log
 from crosscue.eval.studies.town.run import drive_study, finish_landmarks, finish_range
 from crosscue.eval.studies.town.settings import (
-    FieldStudy,
     LandmarkStudy,
     RangeStudy,
     load_study,
 )
-from crosscue.eval.studies.town.work import assemble, chunks_of, run
-from crosscue.localization.town.drive import DriveResult, Keys, drive_many
+from crosscue.localization.town.drive import DriveResult
 from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
-from crosscue.replay.columns import Floats
-from crosscue.replay.errors import RunError, StudyFileError, UsageError, WorkerError
+from crosscue.replay.errors import StudyFileError
 
 TOWN = TownDrive(city=City(largest_km2=2.0))
 SMALL = LandmarkStudy(
@@ -76,16 +65,6 @@ def run_drives(study: LandmarkStudy, folder: Path, workers: int = 1) -> Path:
     return folder
 
 
-def counting(calls: list[int], fail_at: int | None = None) -> Callable[[TownDrive, Keys], Floats]:
-    def drive(settings: TownDrive, seeds: Keys) -> Floats:
-        calls.append(len(seeds))
-        if fail_at is not None and len(calls) >= fail_at:
-            raise MemoryError("the worker died here")
-        return drive_many(settings, seeds)
-
-    return drive
-
-
 @pytest.mark.slow
 def test_study_files_do_not_depend_on_number_of_workers(tmp_path: Path) -> None:
     one = study_bytes(run_study(SMALL, tmp_path / "one", workers=1))
@@ -93,22 +72,6 @@ def test_study_files_do_not_depend_on_number_of_workers(tmp_path: Path) -> None:
 
     assert {"drives.parquet", "summary.json", "study.html", "landmarks_range.svg"} <= set(one)
     assert one == three
-
-
-def test_study_resumes_after_failed_worker(tmp_path: Path) -> None:
-    chunks = chunks_of(SMALL.cases(), SMALL.drives, SMALL.seed)
-    with pytest.raises(WorkerError, match="finished chunks are kept"):
-        list(run(chunks, tmp_path / "a", 1, drive=counting([], fail_at=5)))
-    kept = len(list((tmp_path / "a/chunks").glob("*.parquet")))
-    calls: list[int] = []
-    list(run(chunks, tmp_path / "a", 1, drive=counting(calls)))
-    assemble(chunks, tmp_path / "a")
-    clean = run_drives(SMALL, tmp_path / "b")
-
-    assert kept == 4
-    assert len(calls) == len(chunks) - kept
-    a, b = (folder / "drives.parquet" for folder in (tmp_path / "a", clean))
-    assert a.read_bytes() == b.read_bytes()
 
 
 @pytest.mark.slow
@@ -136,28 +99,6 @@ def test_killed_study_resumes_to_same_bytes(tmp_path: Path) -> None:
 
     assert process.returncode == -signal.SIGKILL
     assert study_bytes(left) == study_bytes(clean)
-
-
-def test_damaged_chunk_is_simulated_again(tmp_path: Path) -> None:
-    chunks = chunks_of(SMALL.cases(), SMALL.drives, SMALL.seed)
-    list(run(chunks, tmp_path, 1))
-    victim = tmp_path / "chunks" / f"{chunks[1].name}.parquet"
-    damaged = bytearray(victim.read_bytes())
-    damaged[len(damaged) // 3] ^= 0xFF
-    victim.write_bytes(damaged)
-    calls: list[int] = []
-    list(run(chunks, tmp_path, 1, drive=counting(calls)))
-
-    assert calls == [chunks[1].count]
-
-
-def test_larger_study_reuses_chunks_of_smaller_one(tmp_path: Path) -> None:
-    few, more = (chunks_of(SMALL.cases(), drives, SMALL.seed) for drives in (4, 8))
-    list(run(few, tmp_path, 1))
-    calls: list[int] = []
-    list(run(more, tmp_path, 1, drive=counting(calls)))
-
-    assert len(calls) == len(more) - len(few)
 
 
 def test_extra_distance_is_averaged_over_pairs_reached_goals_and_all_drives() -> None:
@@ -222,12 +163,6 @@ def test_distance_until_loss_decreases_with_compass_interval() -> None:
         assert one.lost_after_m[None].value < 1000.0
 
 
-def test_implied_distance_equals_value_computed_by_hand() -> None:
-    assert implied_m(20.0, 25.0) == pytest.approx(13_312.0)
-    assert implied_m(30.0, 25.0) == pytest.approx(13_392.0)
-    assert implied_m(20.0, 20.0) == 20_800.0
-
-
 def test_strategies_share_cities_and_conditions_do_not(tmp_path: Path) -> None:
     table = RunFolder(run_drives(SMALL, tmp_path)).table("drives")
     area = table["area_km2"].to_numpy().reshape(3, 2, SMALL.drives)
@@ -236,15 +171,6 @@ def test_strategies_share_cities_and_conditions_do_not(tmp_path: Path) -> None:
     np.testing.assert_array_equal(area[0], area[2])
     assert (area[0, 0] != area[0, 1]).all()
     assert len(np.unique(table["seed"].to_numpy())) == 2 * SMALL.drives
-
-
-def test_folder_of_another_study_is_refused(tmp_path: Path) -> None:
-    run_study(SMALL, tmp_path)
-    other = SMALL.model_copy(update={"seed": 9})
-
-    with pytest.raises(RunError, match="other settings"):
-        list(drive_study(other, tmp_path, 1))
-    list(drive_study(other, tmp_path, 1, overwrite=True))
 
 
 @pytest.mark.parametrize(
@@ -281,20 +207,6 @@ def test_invalid_study_file_is_refused_with_line_number(
         load_study(path, RangeStudy)
 
 
-def test_missing_study_file_is_refused_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run(["study", "range", "--settings", str(tmp_path / "none.toml")]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
-
-
-def test_oversized_study_file_is_refused() -> None:
-    with pytest.raises(StudyFileError, match="/dev/zero: larger than"):
-        load_study(Path("/dev/zero"), RangeStudy)
-
-
 @pytest.mark.parametrize(
     ("flag", "value"),
     [("--compass", "-5"), ("--detection-rate", "1.5"), ("--landmark-density", "101")],
@@ -304,77 +216,6 @@ def test_invalid_drive_option_is_named(
 ) -> None:
     assert cli.run(["study", "drive", "-o", str(tmp_path), f"{flag}={value}"]) == 2
     assert f"{flag} {value}" in capsys.readouterr().err
-
-
-def test_page_is_self_contained_and_adapts_to_screen_and_colour_scheme(tmp_path: Path) -> None:
-    table = PageTable("<heading>", ("what", "km"), (("<b>", "1.0"),))
-    write_study_page(tmp_path / "p.html", "Title", ["a & b"], [table, table], [])
-    page = (tmp_path / "p.html").read_text()
-
-    assert "prefers-color-scheme:dark" in page
-    assert 'name="viewport"' in page
-    assert page.count('<div class="scroll"><table>') == page.count("<table>") == 2
-    assert "<b>" not in page
-    assert "default-src 'none'" in page
-    assert "http" not in page.replace("http-equiv", "")
-
-
-@pytest.mark.parametrize("density", [-1.0, 101.0, math.nan])
-def test_landmark_densities_out_of_range_are_refused(density: float) -> None:
-    with pytest.raises(ValidationError, match="densities_per_km2"):
-        LandmarkStudy(densities_per_km2=(density,))
-
-
-def test_detection_rates_out_of_range_are_refused() -> None:
-    with pytest.raises(ValidationError, match="detection_rates"):
-        LandmarkStudy(detection_rates=(1.5,))
-
-
-def test_city_without_intersections_is_refused(tmp_path: Path) -> None:
-    blocks = City(
-        smallest_km2=0.25, largest_km2=0.25, shortest_block_m=900.0, longest_block_m=950.0
-    )
-    study = SMALL.model_copy(update={"drive": TownDrive(city=blocks)})
-
-    with pytest.raises(UsageError, match=r"no intersection.*drive\.city"):
-        list(drive_study(study, tmp_path, 1))
-
-
-@pytest.mark.parametrize("flags", [["--drives", "0"], ["--workers", "0"], ["--seed", "-3"]])
-def test_study_options_out_of_range_are_refused(
-    tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run(["study", "range", "-o", str(tmp_path), *flags]) == 2
-    assert flags[0] in capsys.readouterr().err
-
-
-def test_study_prints_strict_json_without_progress(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    settings = tmp_path / "s.toml"
-    settings.write_text(
-        'version = 1\nkind = "range"\ncompass_2sigma_deg = [60.0]\n'
-        "[drive.city]\nlargest_km2 = 2.0\n"
-    )
-    command = ["study", "range", "--settings", str(settings), "--drives", "4"]
-
-    assert cli.run([*command, "-o", str(tmp_path / "out"), "--json"]) == 0
-    captured = capsys.readouterr()
-    assert captured.err == ""
-    found = json.loads(captured.out)
-    assert [r["drives"] for r in found["results"]] == [4, 4]
-    assert found["study"]["drive"]["city"]["largest_km2"] == 2.0
-
-
-def test_default_seeds_differ_from_calibration_seed() -> None:
-    assert CALIBRATION_SEED not in (RangeStudy().seed, LandmarkStudy().seed, FieldStudy().seed)
-
-
-@pytest.mark.slow
-def test_default_compass_interval_equals_calibrated_one() -> None:
-    default = TownDrive()
-
-    assert calibrate(default, 2, tolerance=0.01) == default.sensors.compass_interval_m
 
 
 @pytest.mark.slow
@@ -413,22 +254,6 @@ def test_simulated_drive_replayed_from_log_matches_simulation(tmp_path: Path) ->
     assert score.nees_xyh.mean < 15.0
 
 
-@pytest.mark.slow
-def test_field_runs_are_reused(tmp_path: Path) -> None:
-    study = FieldStudy(range_runs=1, landmark_runs=1, minutes=2.0)
-    first = [run for _, run in drive_field(study, tmp_path, 1, through_log)]
-    logs = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/drive.mcap")}
-    again = [run for _, run in drive_field(study, tmp_path, 1, through_log)]
-    finish_field(study, again, tmp_path)
-
-    assert first == again
-    assert {path: path.stat().st_mtime_ns for path in logs} == logs
-    assert [run.has_landmarks for run in first] == [False, True]
-    assert all(run.is_whole and run.minutes == pytest.approx(2.0, abs=0.01) for run in first)
-    with pytest.raises(RunError, match="other settings"):
-        list(drive_field(FieldStudy(minutes=3.0), tmp_path, 1, through_log))
-
-
 def test_logistic_fit_recovers_generating_curve() -> None:
     rng = np.random.default_rng(3)
     x = rng.uniform(0.0, 12_000.0, 4000)
@@ -439,13 +264,6 @@ def test_logistic_fit_recovers_generating_curve() -> None:
     assert a[0] == pytest.approx(8.0, rel=0.15)
     assert b[0] == pytest.approx(-1e-3, rel=0.15)
     assert at_80.low < 8000.0 - 1000.0 * math.log(4.0) < at_80.high
-
-
-def test_range_is_infinite_if_all_drives_succeed_and_zero_if_none() -> None:
-    x = np.linspace(0.0, 5000.0, 50)
-
-    assert math.isinf(range_at(x, np.ones(50), 0.8).value)
-    assert range_at(x, np.zeros(50), 0.8).value == 0.0
 
 
 def test_intervals_of_study_cover_true_values() -> None:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import crosscue
-from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.eval.cli import run
 from crosscue.eval.vehicle.check import Checked, _normalized, check_drive_signals
 from crosscue.eval.vehicle.ground_picture import draw_ground
@@ -46,18 +44,6 @@ def checked_signals(yaw_sign: float = 1.0, wheel_scale: float = 1.0) -> Checked:
     return check_drive_signals([log], Vehicle(version=1), EVERYTHING)
 
 
-def test_consistent_signals_have_no_contradictions() -> None:
-    found = checked_signals()
-
-    assert found.contradictions == ()
-    by_name = {row.signal: row for row in found.signals}
-    assert by_name["yaw_rate"].count == 400
-    assert by_name["yaw_rate"].rate_hz == pytest.approx(20.0)
-    assert by_name["yaw_rate"].low == pytest.approx(-math.degrees(0.3), rel=0.01)
-    assert by_name["yaw_rate"].high == pytest.approx(math.degrees(0.3), rel=0.01)
-    assert "the course of GNSS fix" in by_name["yaw_rate"].agrees
-
-
 def test_yaw_rate_of_wrong_sign_is_a_contradiction() -> None:
     assert any(
         "positive to the right" in text for text in checked_signals(yaw_sign=-1.0).contradictions
@@ -77,16 +63,6 @@ def test_steering_is_compared_without_offset_at_a_ratio_of_15() -> None:
     found = _normalized(wheel, Vehicle(version=1, odometry=odometry))
 
     np.testing.assert_allclose(found.values, [0.0, 0.2], atol=1e-12)
-
-
-def test_horizon_is_the_limit_of_a_level_road() -> None:
-    camera = Camera(focal_px=800.0, center_px=(320.0, 200.0), pitch_rad=0.05, z_m=1.4)
-    size_px = (640, 400)
-
-    ground = GroundPlane.of(camera, size_px)
-    ((x, y),) = ground.project(np.array([[1e7, 0.0]]))
-
-    assert ground.horizon_px(np.array([x]))[0] == pytest.approx(y, abs=1e-3)
 
 
 def test_horizon_is_drawn_only_with_known_intrinsics() -> None:
@@ -126,16 +102,6 @@ def test_intrinsics_of_other_pictures_are_contradictions(
     # The generated pictures are tiny, with the published intrinsics of 1920 x 1080.
     assert any(message in text for text in found.contradictions)
     assert f"WRONG    {found.contradictions[0]}" in repr(found)
-
-
-def test_published_focal_length_is_not_a_contradiction(tmp_path: Path) -> None:
-    drive = pandaset_drive(tmp_path / "002")
-
-    found = crosscue.check_vehicle(drive, write_vehicle(tmp_path / "car.toml", "focal_px = 1970.0"))
-
-    # The generated pictures are tiny: their size contradicts, the published length does not.
-    assert found.contradictions
-    assert not any("publishes" in text for text in found.contradictions)
 
 
 def test_check_page_and_json_have_equal_content(

@@ -85,24 +85,6 @@ def test_ellipse_query_matches_an_exhaustive_search(
     assert [one.sigmas for one in found] == sorted(one.sigmas for one in found)
 
 
-def test_query_returns_the_nearest_candidates_up_to_max_count(grid: Path) -> None:
-    with LandmarkDatabase(grid) as database:
-        centre = np.array([110.0, 60.0]) + 5e6
-        nearest = database.near(centre, 1e4 * np.eye(2), max_count=3)
-        names = [one.place.name for one in database.within(np.array([0.0, 0.0]) + 5e6, 51.0)]
-
-    assert [one.place.name for one in nearest] == ["12", "13", "22"]
-    assert names == ["0", "1", "10"]
-
-
-def test_empty_database_has_no_candidates(tmp_path: Path) -> None:
-    path = database_of(tmp_path / "none.sqlite", np.empty((0, 2)))
-
-    with LandmarkDatabase(path) as database:
-        assert len(database) == 0
-        assert database.near(np.zeros(2), 1e6 * np.eye(2)) == ()
-
-
 @pytest.mark.parametrize(
     ("cov", "message"),
     [
@@ -124,13 +106,6 @@ def test_invalid_covariance_is_refused(cov: list[list[float]], message: str) -> 
 def test_valid_covariance_is_positive(sd_x: float, sd_y: float, correlation: float) -> None:
     off = correlation * sd_x * sd_y
     assert is_positive(np.array([[sd_x**2, off], [off, sd_y**2]]))
-
-
-def test_coordinates_that_are_not_finite_are_refused() -> None:
-    with pytest.raises(ValueError, match="landmark x: expected finite numbers"):
-        LandmarkPosition("x", np.array([np.nan, 0.0]), np.eye(2))
-    with pytest.raises(ValueError, match="heading inf"):
-        LandmarkPosition("x", np.zeros(2), np.eye(2), np.inf)
 
 
 def test_invalid_names_and_feature_shapes_are_refused() -> None:
@@ -207,20 +182,6 @@ def test_unexpected_tables_are_refused(grid: Path, tmp_path: Path) -> None:
         LandmarkDatabase(path)
 
 
-def test_changed_feature_byte_is_found_by_checksum(tmp_path: Path) -> None:
-    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
-    whole = bytearray(path.read_bytes())
-    where = whole.index(some_features(1).descriptors.tobytes())
-    whole[where + 100] ^= 1
-    path.write_bytes(whole)
-
-    with LandmarkDatabase(path) as database:
-        keys = [one.key for one in database]
-        assert len(database.features(keys[0])) == 20
-        with pytest.raises(LogFormatError, match="landmark 1: its checksum does not match"):
-            database.features(keys[1])
-
-
 def test_changed_coordinates_and_covariance_are_found(tmp_path: Path) -> None:
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
     hand = sqlite3.connect(path)
@@ -257,15 +218,6 @@ def test_damaged_byte_is_refused_or_harmless(
     except LogError as refused:
         message = str(refused)
         assert message.startswith(str(path))
-
-
-def test_landmarks_are_appended_to_an_existing_file(tmp_path: Path) -> None:
-    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
-    with LandmarkWriter(path, "orb") as writer:
-        writer.add(place_at(1.0, 1.0, "more"), some_features(9))
-
-    with LandmarkDatabase(path) as database:
-        assert [one.place.name for one in database] == ["0", "1", "2", "more"]
 
 
 def _add(path: Path, names: list[str], max_pages: int = 1_000_000) -> None:
@@ -305,24 +257,6 @@ def test_second_concurrent_writer_is_refused(
         with pytest.raises(OutputError, match="another process is writing it"):
             LandmarkWriter(path, "orb")
         first.add(place_at(1.0, 1.0, "more"), some_features(9))
-    with LandmarkDatabase(path) as database:
-        assert len(database) == 2
-
-
-@pytest.mark.parametrize("name", ["a%41.sqlite", "q?mode=x.sqlite", "h#sh.sqlite", "ü b.sqlite"])
-def test_special_characters_in_file_names_are_literal(tmp_path: Path, name: str) -> None:
-    database_of(tmp_path / name, GRID[:2])
-
-    assert [p.name for p in tmp_path.iterdir()] == [name]
-    with LandmarkDatabase(tmp_path / name) as database:
-        assert len(database) == 2
-
-
-def test_file_name_that_is_not_utf8_is_accepted(tmp_path: Path) -> None:
-    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff\xfe.sqlite"))
-    database_of(path, GRID[:2])
-
-    assert [os.fsencode(p.name) for p in tmp_path.iterdir()] == [b"\xff\xfe.sqlite"]
     with LandmarkDatabase(path) as database:
         assert len(database) == 2
 

@@ -20,10 +20,8 @@ from crosscue.localization.town.drive import (
     LANDMARK_SET,
     LANDMARK_TAKEN,
     STEP_FIELDS,
-    DriveOutcome,
     DriveRecord,
     DriveResult,
-    as_result,
     drive_many,
     drive_traced,
     simulate_town_drive,
@@ -136,14 +134,6 @@ def test_event_counts_match_the_result() -> None:
     assert len(passed) == result.passed
 
 
-def test_result_record_equals_its_row() -> None:
-    row = drive_many(KINDS["town"], seeds(1))[0]
-    result = as_result(row)
-
-    assert isinstance(result.steps, int)
-    np.testing.assert_array_equal(np.array(result, float), row)
-
-
 def test_drives_in_parts_are_bit_identical_to_all_at_once() -> None:
     whole = drive_many(KINDS["town"], seeds(9))
     parts = [drive_many(KINDS["town"], seeds(3, first)) for first in (0, 3, 6)]
@@ -173,14 +163,6 @@ def test_nees_of_drives_is_in_its_band(settings: TownDrive) -> None:
     assert low < rows[:, FIELD["nees"]].mean() < high
 
 
-def test_nees_without_a_compass_exceeds_its_band() -> None:
-    """Without a compass, true positions spread along an arc, but the filter assumes an ellipse."""
-    rows = many(TownDrive(sensors=Sensors(compass_2sigma_deg=None)), 400)
-    _, high = mean_band(3, 400)
-
-    assert rows[:, FIELD["nees"]].mean() > high
-
-
 @pytest.mark.parametrize("compass_deg", [20.0, 30.0])
 def test_lateral_variance_on_a_straight_drive_follows_the_range_law(compass_deg: float) -> None:
     """The lateral variance is r * ds * D, regardless of the heading's process noise."""
@@ -193,37 +175,6 @@ def test_lateral_variance_on_a_straight_drive_follows_the_range_law(compass_deg:
             belief = ekf.update_heading(belief, 0.0, r).belief
 
         assert belief.cov[1, 1] == pytest.approx(r * interval_m * way_m, rel=0.15)
-
-
-def test_cars_on_long_streets_are_lost_at_the_predicted_distance() -> None:
-    """Without turns, the mean distance is near 25^2 / (r ds)."""
-    city = City(
-        smallest_km2=400.0,
-        largest_km2=400.0,
-        dead_end_fraction=0.0,
-        one_way_fraction=0.0,
-        shortest_block_m=1000.0,
-        longest_block_m=1000.0,
-        goal_at_least_m=250.0,
-    )
-    # The slip is large enough that the start heading soon loses its effect.
-    sensors = Sensors(compass_2sigma_deg=60.0, compass_interval_m=4.0, slip_per_sqrt_m=0.03)
-    rows = many(TownDrive(city=city, sensors=sensors), 200)
-    lost = rows[(rows[:, FIELD["outcome"]] == DriveOutcome.LOST) & (rows[:, FIELD["turns"]] == 0)]
-    law_m = 25.0**2 / (math.radians(30.0) ** 2 * 4.0)
-
-    assert len(lost) > 20
-    assert lost[:, FIELD["travelled_m"]].mean() == pytest.approx(law_m, rel=0.15)
-
-
-def test_landmarks_are_passed_but_not_detected_at_zero_rate() -> None:
-    none = drive_many(TownDrive(city=TOWN), seeds(6))
-    blind = TownDrive(city=TOWN, landmarks_per_km2=5.0, sensors=Sensors(detection_rate=0.0))
-    unseen = drive_many(blind, seeds(6))
-
-    assert (none[:, FIELD["passed"]] == 0).all()
-    assert (unseen[:, FIELD["passed"]] > 0).any()
-    assert (unseen[:, FIELD["detected"]] == 0).all()
 
 
 def test_city_without_intersections_is_refused() -> None:

@@ -13,19 +13,16 @@ from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.studies.town.consistency import nees_along_the_arc
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.town.drive import (
-    LANDMARK_REFUSED,
-    LANDMARK_TAKEN,
     DriveResult,
     Traced,
     drive_many,
     drive_traced,
 )
-from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
+from crosscue.localization.town.settings import Sensors, TownDrive
 from crosscue.replay.columns import Floats
 
 NEES = DriveResult._fields.index("nees")
 FINE_M = 1e-4
-NO_GATE = 1e9
 
 
 def fine_encoders(compass_2sigma_deg: float | None, *, goals: int = 1) -> TownDrive:
@@ -44,16 +41,6 @@ def compass_innovations(settings: TownDrive, traced: Traced) -> tuple[Floats, Fl
     spread = var + 2.0 * slip / track_m**2 + (math.radians(sensors.compass_2sigma_deg) / 2.0) ** 2
     is_read = ~np.isnan(compass)
     return wrap_all(compass - expected)[is_read], spread[is_read]
-
-
-def landmark_nis(traced: Traced) -> list[float]:
-    found = []
-    for event in traced.of_kind(LANDMARK_TAKEN, LANDMARK_REFUSED):
-        row = traced.steps[int(event[0]) - 1]
-        spread = np.array([[row[10], row[11]], [row[11], row[13]]]) + 25.0 * np.eye(2)
-        off = event[4:6] - row[7:9]
-        found.append(float(off @ np.linalg.solve(spread, off)))
-    return found
 
 
 @pytest.mark.slow
@@ -80,20 +67,6 @@ def test_compass_innovations_are_white_and_consistent(compass_deg: float) -> Non
     assert len(nis) > 20_000
     assert low < nis.mean() < high
     assert abs(following.mean()) < 2.0 / math.sqrt(len(following))
-
-
-def test_landmark_nis_is_in_its_band() -> None:
-    settings = TownDrive(
-        city=City(largest_km2=9.0),
-        landmarks_per_km2=5.0,
-        navigation=Navigation(strategy="landmark to landmark"),
-        sensors=Sensors(compass_2sigma_deg=10.0, encoder_step_m=FINE_M, landmark_gate_nis=NO_GATE),
-    )
-    nis = [one for seed in range(120) for one in landmark_nis(drive_traced(settings, seed))]
-    low, high = mean_band(2, len(nis))
-
-    assert len(nis) > 200
-    assert low < np.mean(nis) < high
 
 
 def test_errors_without_a_compass_are_consistent_along_an_arc() -> None:

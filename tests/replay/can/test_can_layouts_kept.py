@@ -20,12 +20,11 @@ from crosscue.replay.can.dbc_text import read_dbc
 from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.can.layout import CanMessage
 from crosscue.replay.can.layout_cache import VARIABLE, layout_cache_folder
-from crosscue.replay.can.sources import DatabaseText, read_text
+from crosscue.replay.can.sources import DatabaseText
 from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import DEFAULT_LIMITS
 from support.can_layouts import dbc_text, messages
 from support.data import shared
 
@@ -67,22 +66,6 @@ def _reprs(messages: list[CanMessage]) -> list[str]:
     ]
 
 
-def _shared_dbc_files() -> list[Path]:
-    return sorted(shared().rglob("*.dbc"))
-
-
-@pytest.mark.slow
-def test_layouts_of_real_files_equal_cantools() -> None:
-    files = _shared_dbc_files()
-
-    assert len(files) >= 11
-    for path in files:
-        source = read_text(path, DEFAULT_LIMITS)
-        quick = read_dbc(source.text)
-        assert quick is not None, path
-        assert _reprs(quick) == _reprs(_layout_by_cantools(source)), path
-
-
 @pytest.mark.slow
 @given(message=st.one_of(messages(), messages(multiplexed=True)))
 @settings(max_examples=100, deadline=None)
@@ -93,26 +76,6 @@ def test_random_layouts_equal_cantools(message: CanMessage) -> None:
 
     assert quick is not None
     assert _reprs(quick) == _reprs(_layout_by_cantools(source))
-
-
-def test_extended_multiplexing_floats_and_can_fd_equal_cantools() -> None:
-    source = DatabaseText(Path("x.dbc"), EXTENDED)
-
-    quick = read_dbc(source.text)
-
-    assert quick is not None
-    assert _reprs(quick) == _reprs(_layout_by_cantools(source))
-    wide, fd = quick
-    assert {s.name: (s.multiplexer, set(s.branches)) for s in wide.signals} == {
-        "kind": (None, set()),
-        "inner": ("kind", {1}),
-        "deep": ("inner", {3, 7, 8, 9}),
-        "whole": ("kind", {2}),
-        "other": (None, set()),
-    }
-    assert fd.is_fd
-    assert not wide.is_fd
-    assert fd.signals[0].is_float
 
 
 @pytest.mark.parametrize("text", [EXTENDED, "savvycan/bms.dbc", "savvycan/LeafPowertrainBus.dbc"])
@@ -190,20 +153,6 @@ def _are_same(a: CanDatabase, b: CanDatabase) -> bool:
     return _reprs(list(a.messages)) == _reprs(list(b.messages)) and a.notices == b.notices
 
 
-def test_second_load_parses_no_file(
-    tmp_path: Path, cache_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    files = [*_shared_dbc_files(), _dbc_file(tmp_path)]
-    parsed = _record_parses(monkeypatch)
-    first = [CanDatabase.load([path], keep_first=True) for path in files]
-    assert len(parsed) == len(files) == len(list(cache_dir.iterdir()))
-
-    second = [CanDatabase.load([path], keep_first=True) for path in files]
-
-    assert len(parsed) == len(files)
-    assert all(_are_same(a, b) for a, b in zip(first, second, strict=True))
-
-
 def test_second_load_reads_only_signals_of_met_messages(
     tmp_path: Path, cache_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -271,18 +220,6 @@ def test_damaged_cache_entry_is_parsed_again(
         assert entry.read_bytes() == stored
 
     assert len(parsed) == len(copies)
-
-
-@pytest.mark.parametrize("value", ["off", "", "/dev/null/nowhere", "/proc/nowhere"])
-def test_files_are_parsed_without_cache_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: str
-) -> None:
-    monkeypatch.setenv(VARIABLE, value)
-    parsed = _record_parses(monkeypatch)
-    path = _dbc_file(tmp_path)
-
-    assert _are_same(CanDatabase.load([path]), CanDatabase.load([path]))
-    assert len(parsed) == 2
 
 
 def test_cache_folder_follows_environment() -> None:

@@ -54,10 +54,3 @@ def test_each_frame_is_accounted_for_by_exactly_one_decoder(
     admitted = len(Admission("can0", ledger, TEN_SLOTS)(rows, log_ns))
 
     assert decoded + admitted + ledger.topic("can0").skipped.total() == len(frames)
-
-
-def test_mobileye_ids_include_all_configured_slots() -> None:
-    ids = all_ids(MobileyeSettings())
-
-    assert {0x700, 0x738, 0x739, 0x756, 0x760} <= ids
-    assert ids - all_ids(TEN_SLOTS) == set(range(0x757, 0x760))

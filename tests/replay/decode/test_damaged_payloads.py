@@ -3,7 +3,6 @@
 import json
 from base64 import b64encode
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -15,9 +14,7 @@ from google.protobuf import (  # type: ignore[import-untyped]
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
-from crosscue.eval import cli
 from crosscue.replay.columns import Topic
 from crosscue.replay.ledger import Ledger
 from support.ros_messages import (
@@ -109,32 +106,3 @@ def test_only_the_damaged_message_is_dropped(kind: str, seed: int, count: int) -
     assert (account.skipped.total(), account.dropped.total()) == (0, 1)
     assert (account.in_file, account.used, len(block)) == (count, count - 1, count - 1)
     assert block.log_ns.tolist() == [t * 1_000_000 for t in range(count) if t != bad]
-
-
-@pytest.mark.parametrize(
-    ("encoding", "cut", "status"), [("cdr", 0, 0), ("cdr", 3, 3), ("odd", 3, 0)]
-)
-@pytest.mark.parametrize("command", ["info", "decode"])
-def test_command_exits_with_3_only_for_damaged_messages(
-    command: str, encoding: str, cut: int, status: int, tmp_path: Path
-) -> None:
-    rng = np.random.default_rng(1)
-    log = tmp_path / "made.mcap"
-    with log.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        numbers = {}
-        for name, coding in (("/good", "cdr"), ("/t", encoding)):
-            topic, _ = _ros2(rng, "sensor_msgs/msg/Imu")
-            schema = writer.register_schema(topic.type_name, "ros2msg", topic.schema)
-            numbers[name] = writer.register_channel(name, coding, schema)
-        for i in range(9):
-            for name, number in numbers.items():
-                _, payload = _ros2(rng, "sensor_msgs/msg/Imu")
-                size = len(payload) - (cut if name == "/t" and i == 4 else 0)
-                writer.add_message(number, i * 10**8, payload[:size], i * 10**8)
-        writer.finish()  # type: ignore[no-untyped-call]
-
-    argv = [command, str(log), *(["-o", str(tmp_path / "out")] if command == "decode" else [])]
-
-    assert cli.run(argv) == status

@@ -15,7 +15,6 @@ from rosbags.typesys.store import Typestore
 
 from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
 from crosscue.replay.decode import decoder_for
-from crosscue.replay.decode.refuse import MISFIT, WRONG_CODING
 from crosscue.replay.decode.ros.decoder import RosDecoder
 from crosscue.replay.decode.ros.fields import WalkedFields
 from crosscue.replay.decode.ros.standard import RosConversion, generic
@@ -222,56 +221,6 @@ def _decode_with_rosbags(store: Typestore, raw: bytes, name: str, is_cdr: bool) 
         return None
 
 
-def test_message_with_wrong_length_is_dropped_with_field_and_time() -> None:
-    store = ros2_store()
-    good = store.types["std_msgs/msg/String"]("abc")
-    raw = serialized(store, good, "std_msgs/msg/String")
-    wrong_length = raw[:4] + b"\x32" + raw[5:]
-    ledger = Ledger("made")
-
-    decoded = decoder_of(ros2_topic("/s", "std_msgs/msg/String"))(
-        block_of("/s", [raw, wrong_length, raw]), ledger
-    )
-
-    assert len(decoded) == 2
-    assert ledger.topic("/s").dropped == {MISFIT: 1}
-    assert ledger.details[0].t_ns == 1_000_000
-    assert "string data extends past the end" in ledger.details[0].detail
-
-
-@pytest.mark.parametrize("head", [b"\x00\x06", b"\x00\x07", b"\x00\x03", b"\x01\x00", b"\xff\xff"])
-def test_unsupported_encapsulation_is_skipped_and_damaged_one_dropped(head: bytes) -> None:
-    store = ros2_store()
-    raw = serialized(store, store.types["std_msgs/msg/Float64"](1.5), "std_msgs/msg/Float64")
-    ledger = Ledger("made")
-
-    decoded = decoder_of(ros2_topic("/f", "std_msgs/msg/Float64"))(
-        block_of("/f", [head + raw[2:], raw]), ledger
-    )
-
-    assert len(decoded) == 1
-    account = ledger.topic("/f")
-    if head[0]:
-        assert (account.skipped, account.dropped) == ({}, {MISFIT: 1})
-    else:
-        assert (account.skipped, account.dropped) == ({WRONG_CODING: 1}, {})
-
-
-def test_block_with_both_byte_orders_keeps_row_order() -> None:
-    store, name = ros2_store(), "geometry_msgs/msg/PointStamped"
-    rng = np.random.default_rng(3)
-    messages = [random_message(rng, store, name) for _ in range(9)]
-    payloads = [serialized(store, m, name, little=i % 3 != 1) for i, m in enumerate(messages)]
-    ledger = Ledger("made")
-
-    decoded = decoder_of(ros2_topic("/p", name))(block_of("/p", payloads), ledger)
-
-    assert isinstance(decoded.rows, Table)
-    assert_same_values(decoded.rows, messages, store, name)
-    assert decoded.header_ns is not None
-    np.testing.assert_array_equal(decoded.header_ns, decoded.rows["header.stamp"])
-
-
 def test_taking_rows_of_both_byte_orders_keeps_values() -> None:
     store, name = ros2_store(), "std_msgs/msg/Int32"
     payloads = [serialized(store, store.types[name](i), name, little=i % 2 == 0) for i in range(10)]
@@ -283,50 +232,6 @@ def test_taking_rows_of_both_byte_orders_keeps_values() -> None:
 
     np.testing.assert_array_equal(fields.number("data"), np.arange(10))
     np.testing.assert_array_equal(fields.take(keep).number("data"), [0, 3, 6, 9])
-
-
-def test_can_frames_are_decoded_to_columns() -> None:
-    store, name = ros2_store(), "can_msgs/msg/Frame"
-    header = store.types["std_msgs/msg/Header"]
-    time = store.types["builtin_interfaces/msg/Time"]
-
-    def frame(identifier: int, dlc: int, **flags: bool) -> bytes:
-        message = store.types[name](
-            header(time(7, 5), "can0"),
-            identifier,
-            flags.get("remote", False),
-            flags.get("extended", False),
-            flags.get("error", False),
-            dlc,
-            np.arange(1, 9, dtype=np.uint8),
-        )
-        return serialized(store, message, name)
-
-    payloads = [
-        frame(0x123, 3),
-        frame(0x1FFF_FFFF, 8, extended=True),
-        frame(0x7FF, 4, remote=True),
-        frame(0x20, 8, error=True),
-        frame(0x800, 8),
-        frame(0x100, 9),
-    ]
-    ledger = Ledger("made")
-
-    decoded = decoder_of(ros2_topic("/can", name))(block_of("/can", payloads), ledger)
-
-    frames = decoded.rows
-    assert isinstance(frames, CanFrames)
-    assert frames.arbitration_id.tolist() == [0x123, 0x1FFF_FFFF, 0x7FF, 0x20]
-    assert frames.kind.tolist() == [0, 0, 1, 2]
-    assert frames.length.tolist() == [3, 8, 0, 8]
-    assert frames.data[0].tolist() == [1, 2, 3, 0, 0, 0, 0, 0]
-    assert frames.is_extended.tolist() == [False, True, False, False]
-    assert decoded.header_ns is not None
-    assert decoded.header_ns.tolist() == [7_000_000_005] * 4
-    assert ledger.topic("/can").dropped == {
-        "identifier has more bits than its frame kind": 1,
-        "data length code over 8": 1,
-    }
 
 
 def test_compressed_images_share_memory_with_the_log() -> None:
@@ -393,102 +298,6 @@ def test_learned_image_layout_validates_lengths(is_cdr: bool) -> None:
             assert set(from_layout.header_ns.tolist()) == {7_000_000_008}
 
 
-def test_raw_image_with_too_few_bytes_is_dropped() -> None:
-    store, name = ros2_store(), "sensor_msgs/msg/Image"
-    header = store.types["std_msgs/msg/Header"](
-        store.types["builtin_interfaces/msg/Time"](1, 0), "cam"
-    )
-
-    def image(size: int) -> bytes:
-        pixels = np.zeros(size, np.uint8)
-        return serialized(store, store.types[name](header, 2, 3, "rgb8", 0, 9, pixels), name)
-
-    ledger = Ledger("made")
-    images = decoder_of(ros2_topic("/cam", name))(block_of("/cam", [image(18), image(17)]), ledger)
-
-    assert isinstance(images.rows, Images)
-    assert images.rows.pixel_format == ("rgb8",)
-    assert images.rows.width_px is not None
-    assert images.rows.width_px.tolist() == [3]
-    assert ledger.topic("/cam").dropped == {"picture has fewer bytes than its size needs": 1}
-
-
-STANDARD_COLUMNS = {
-    "sensor_msgs/msg/Imu": {
-        "accel_x_mps2": "linear_acceleration.x",
-        "gyro_z_radps": "angular_velocity.z",
-        "quat_w": "orientation.w",
-    },
-    "sensor_msgs/msg/MagneticField": {"mag_y_t": "magnetic_field.y"},
-    "sensor_msgs/msg/NavSatFix": {
-        "latitude_deg": "latitude",
-        "altitude_m": "altitude",
-        "status": "status.status",
-        "covariance_m2": "position_covariance",
-    },
-    "nav_msgs/msg/Odometry": {
-        "x_m": "pose.pose.position.x",
-        "speed_x_mps": "twist.twist.linear.x",
-        "yaw_rate_radps": "twist.twist.angular.z",
-    },
-    "geometry_msgs/msg/PoseStamped": {"z_m": "pose.position.z", "quat_x": "pose.orientation.x"},
-}
-
-
-@pytest.mark.parametrize("is_cdr", [True, False])
-@pytest.mark.parametrize("name", sorted(STANDARD_COLUMNS))
-def test_standard_columns_contain_the_matching_fields(name: str, is_cdr: bool) -> None:
-    rng = np.random.default_rng(11)
-    store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
-    messages = [random_message(rng, store, name) for _ in range(5)]
-    payloads = [serialized(store, each, name) for each in messages]
-
-    table = decoder_of(topic_of("/t", name))(block_of("/t", payloads), Ledger("made")).rows
-
-    assert isinstance(table, Table)
-    expected = [dict(numbers_in(message, store, name)) for message in messages]
-    for column, path in STANDARD_COLUMNS[name].items():
-        expected_column = np.array([np.asarray(each[path]) for each in expected])
-        np.testing.assert_array_equal(table[column], expected_column)
-
-
-@pytest.mark.parametrize("is_cdr", [True, False])
-def test_camera_info_keeps_matrices_and_distortion(is_cdr: bool) -> None:
-    store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
-    name = "sensor_msgs/msg/CameraInfo"
-    message = random_message(np.random.default_rng(1), store, name)
-    lens = "d" if is_cdr else "D"
-    setattr(message, lens, np.arange(5.0))
-    payloads = [serialized(store, message, name)]
-
-    table = decoder_of(topic_of("/t", name))(block_of("/t", payloads), Ledger("made")).rows
-
-    assert isinstance(table, Table)
-    assert table["k"].shape == (1, 9)
-    assert table["p"].shape == (1, 12)
-    np.testing.assert_array_equal(table["d"], [np.arange(5.0)])
-
-
-def test_missing_definition_falls_back_to_standard_type() -> None:
-    store, name = ros2_store(), "sensor_msgs/msg/MagneticField"
-    message = random_message(np.random.default_rng(2), store, name)
-    payloads = [serialized(store, message, name)]
-
-    table = decoder_of(Topic("/mag", name, "cdr"))(block_of("/mag", payloads), Ledger("x")).rows
-
-    assert isinstance(table, Table)
-    assert table["mag_x_t"][0] == message.magnetic_field.x  # type: ignore[attr-defined]
-    assert decoder_for(Topic("/x", "unknown_msgs/msg/Thing", "cdr")) is None
-    assert decoder_for(Topic("/x", "sensor_msgs/Imu", "ros1")) is None
-    assert decoder_for(Topic("/x", "anything", "flatbuffer")) is None
-
-
-def test_columns_pass_unchanged() -> None:
-    block = Block("/t", np.zeros(2, np.int64), Table({"a": np.zeros(2)}))
-
-    assert decoder_of(Topic("/t", "crosscue/Table", "columns"))(block, Ledger("x")) is block
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "complaint"),
@@ -517,23 +326,6 @@ def test_invalid_definition_is_refused_in_one_line(text: str, complaint: str) ->
         decoder_for(topic)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
-
-
-def test_exponentially_expanding_definition_is_refused() -> None:
-    levels = [
-        f"MSG: made_msgs/L{i}\n" + "".join(f"L{i + 1} f{k}\n" for k in range(10)) for i in range(9)
-    ]
-    text = ("=" * 80 + "\n").join(["L0 a\n", *levels, "MSG: made_msgs/L9\nint8 x\n"])
-
-    with pytest.raises(SchemaError, match="expands to over"):
-        decoder_for(Topic("/t", "made_msgs/msg/Root", "cdr", text.encode(), "ros2msg"))
-
-
-def test_schema_lacking_field_of_standard_type_is_refused() -> None:
-    topic = Topic("/imu", "sensor_msgs/msg/Imu", "cdr", b"float64 x\n", "ros2msg")
-
-    with pytest.raises(SchemaError, match=r"/imu: .*lacks the field linear_acceleration\.x"):
-        decoder_for(topic)
 
 
 @pytest.mark.slow

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
-from crosscue.eval.cli import run
 from crosscue.replay.columns import Block, Images, Topic
 from crosscue.replay.decode.packets import NO_PICTURE, NOT_DECODED
 from crosscue.replay.ledger import Ledger
@@ -89,25 +86,3 @@ def test_damaged_packet_is_dropped_and_next_group_is_complete(tmp_path: Path) ->
 
     assert ledger.topic(topic.name).dropped.total() >= 1
     assert all(found[12 * STEP_NS + k * STEP_NS] == 12 + k for k in range(12))
-
-
-def test_detect_processes_every_picture_of_a_video(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = video(tmp_path / "front.mp4")
-    argv = [
-        "detect",
-        str(log),
-        "-o",
-        str(tmp_path / "run"),
-        "--json",
-        "--no-cache",
-        "--detectors",
-        "support.detecting:build",
-    ]
-
-    assert run(argv) == 0
-
-    assert json.loads(capsys.readouterr().out)["frames"] == 24
-    times = pq.read_table(tmp_path / "run" / "frames.parquet")["t_ns"].to_pylist()
-    assert times == [k * STEP_NS for k in range(24)]

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from math import atan2, pi
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.columns import Block, CanFrames, Floats, Table
+from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
-from crosscue.replay.mobileye.can.encode import FRAME_NS, LATENCY_NS, bursts_of, encode_tables
+from crosscue.replay.mobileye.can.encode import LATENCY_NS, bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.layout import Columns, Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings
-from crosscue.replay.mobileye.tables import LEFT, RIGHT, table_block
+from crosscue.replay.mobileye.tables import table_block
 from support.mobileye_frames import MS, block_of, random_drive, random_words, values
 
 ROTATED = MobileyeSettings(mounting=DevicePosition(1.85, -0.1, 0.02))
@@ -172,105 +170,6 @@ def test_decoded_obstacles_are_within_half_a_step(seed: int, n: int) -> None:
     assert np.isnan(radar[~is_matched]).all()
 
 
-def test_simulated_angle_is_bearing_from_device() -> None:
-    objects = Table({"x_m": np.array([21.85]), "y_m": np.array([4.9])})
-    decoded_table = table(decode(encode_burst(10**18, objects, UNROTATED), UNROTATED), "obstacles")
-    on_wire = frame_words(encode_burst(10**18, objects, UNROTATED), 0x73B)
-
-    assert values(decoded_table, "angle_rad")[0] == pytest.approx(
-        atan2(5.0, 20.0), abs=0.005 * pi / 180
-    )
-    assert (on_wire >> 48) - (1 << 16) == round(-atan2(5.0, 20.0) * 180 / pi * 100)
-
-
-def frame_words(block: Block, identifier: int) -> int:
-    assert isinstance(block.rows, CanFrames)
-    row = int(np.flatnonzero(block.rows.arbitration_id == identifier)[0])
-    return int.from_bytes(block.rows.data[row].tobytes(), "little")
-
-
-def test_absent_columns_are_sent_as_missing() -> None:
-    objects = Table({"x_m": np.array([30.0]), "y_m": np.array([0.0])})
-    decoded_table = table(decode(encode_burst(10**18, objects, UNROTATED), UNROTATED), "obstacles")
-
-    for name in ("length_m", "radar_x_m", "radar_vx_mps", "accel_x_mps2"):
-        assert np.isnan(values(decoded_table, name)).all(), name
-    assert decoded_table["radar_id"].tolist() == [-1]
-    assert decoded_table["valid"].tolist() == [1]
-
-
-def test_slots_are_assigned_to_nearest_objects_in_range() -> None:
-    x_m = np.append(np.linspace(240.0, 20.0, 16), [252.0, 1.0, 50.0])
-    y_m = np.append(np.zeros(18), [35.0])
-    decoded_table = table(
-        decode(encode_burst(10**18, Table({"x_m": x_m, "y_m": y_m}), UNROTATED), UNROTATED),
-        "obstacles",
-    )
-
-    assert len(decoded_table) == 13
-    assert (np.diff(values(decoded_table, "x_m")) > 0).all()
-    assert values(decoded_table, "x_m")[0] == pytest.approx(20.0, abs=1 / 32)
-
-
-def test_frames_of_burst_are_evenly_spaced() -> None:
-    objects = Table({"x_m": np.array([30.0, 40.0]), "y_m": np.array([0.0, 1.0])})
-    block = encode_burst(10**18, objects, UNROTATED, latency_ns=70 * MS)
-
-    assert isinstance(block.rows, CanFrames)
-    assert block.rows.arbitration_id.tolist() == [0x738, *range(0x739, 0x73F)]
-    assert block.log_ns[0] == 10**18 + 70 * MS
-    assert np.diff(block.log_ns).tolist() == [FRAME_NS] * 6
-
-
-def test_image_without_objects_is_one_status_frame() -> None:
-    empty = Table({"x_m": np.zeros(0), "y_m": np.zeros(0)})
-    assert len(encode_burst(10**18, empty, UNROTATED)) == 1
-
-
-@pytest.mark.parametrize("how", [UNROTATED, ROTATED])
-def test_lanes_round_trip_within_quantization_steps(how: MobileyeSettings) -> None:
-    n = 30
-    rng = np.random.default_rng(5)
-    side = np.where(np.arange(n) % 2 == 0, LEFT, RIGHT).astype(np.int8)
-    columns: Columns = {
-        "side": side,
-        "c0_m": side * rng.uniform(1.0, 2.5, n),
-        "c1": rng.uniform(-0.05, 0.05, n),
-        "c2_per_m": rng.uniform(-1e-3, 1e-3, n),
-        "c3_per_m2": rng.uniform(-1e-6, 1e-6, n),
-        "view_range_m": rng.uniform(20.0, 90.0, n),
-        "lane_type": np.ones(n, dtype=np.int16),
-        "quality": np.full(n, 3, dtype=np.int16),
-    }
-    sent = table_block("can1", "lanes", np.arange(n) * 100 * MS, columns)
-    decoded_table = table(decode(encode_tables([sent], how, "can1"), how), "lanes")
-
-    np.testing.assert_array_equal(decoded_table["side"], side)
-    for x_m in (2.0, 20.0):
-        expected = cubic(columns, x_m)
-        actual = cubic(dict(decoded_table.columns), x_m)
-        steps_m = 1 / 512 + x_m / 2048 + x_m**2 / 2048000 + x_m**3 / 2**29
-        assert np.abs(expected - actual).max() <= steps_m + 1e-5
-
-
-def cubic(columns: Columns, x_m: float) -> Floats:
-    c = [columns[name].astype(np.float64) for name in ("c0_m", "c1", "c2_per_m", "c3_per_m2")]
-    y_m: Floats = c[0] + c[1] * x_m + c[2] * x_m**2 + c[3] * x_m**3
-    return y_m
-
-
-def test_lane_without_marking_is_sent_as_missing() -> None:
-    nothing = np.full(2, np.nan)
-    columns: Columns = {"side": np.array([LEFT, RIGHT], dtype=np.int8)}
-    columns |= dict.fromkeys(("c0_m", "c1", "c2_per_m", "c3_per_m2", "view_range_m"), nothing)
-    sent = table_block("can1", "lanes", np.array([0, MS]), columns)
-    frames = encode_tables([sent], ROTATED, "can1")
-
-    assert frame_words(frames, 0x766) & 0xFFFFFF == (-480 & 0xFFFF) << 8 | 2
-    assert frame_words(frames, 0x768) & 0xFFFFFF == 480 << 8 | 2
-    assert table(decode(frames, ROTATED), "lanes")["has_marking"].tolist() == [False, False]
-
-
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
@@ -284,12 +183,6 @@ def test_value_out_of_message_range_is_refused(column: str, value: float, messag
     objects = Table({"x_m": np.array([30.0]), "y_m": np.array([0.0]), column: np.array([value])})
     with pytest.raises(ValueError, match=message):
         encode_burst(10**18, objects, UNROTATED)
-
-
-def test_speed_out_of_message_range_is_clipped() -> None:
-    objects = Table({"x_m": np.array([30.0]), "y_m": np.zeros(1), "vx_mps": np.array([-200.0])})
-    decoded_table = table(decode(encode_burst(10**18, objects, UNROTATED), UNROTATED), "obstacles")
-    assert values(decoded_table, "vx_mps").tolist() == [-127.9375]
 
 
 def test_invalid_tables_and_bursts_are_refused() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -12,14 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.columns import Block, CanFrames, Table
-from crosscue.replay.decode import decoder_for
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.layout import layout
 from crosscue.replay.mobileye.ros.reader import RosMobileye
 from crosscue.replay.mobileye.ros.sign import VOTES_WANTED
-from crosscue.replay.mobileye.settings import LaneSign, MobileyeSettings
+from crosscue.replay.mobileye.settings import MobileyeSettings
 from support.mobileye_frames import (
     MS,
     frames,
@@ -30,7 +28,7 @@ from support.mobileye_frames import (
     triple,
     values,
 )
-from support.mobileye_ros import TOPIC_TYPES, as_cdr, messages_of
+from support.mobileye_ros import TOPIC_TYPES, messages_of
 
 BUS_SETTINGS = MobileyeSettings(
     mounting=DevicePosition(1.9, 0.1), family="extended", ros_lane_sign="right"
@@ -91,27 +89,6 @@ def test_messages_decode_to_same_columns_as_frames(seed: int) -> None:
     assert not any(account.skipped for account in ledger.accounts.values())
 
 
-def test_serialized_messages_decode_to_same_columns_as_frames() -> None:
-    """Messages are serialized by rosbags and decoded by crosscue's message decoder."""
-    drive = random_drive(6, np.random.default_rng(8))
-    ledger = Ledger("log")
-    decoded = []
-    for topic, block in (as_cdr(block) for block in messages_of(drive)):
-        decode = decoder_for(topic)
-        assert decode is not None
-        decoded.append(decode(block, ledger))
-    bag, _ = tables_from_bag(decoded)
-    can = tables_from_can(drive)
-
-    for name in ("status", "obstacles", "lanes"):
-        from_frames, from_messages = sorted_by_time(can[name]), sorted_by_time(bag[name])
-        for column in set(from_frames.columns) - {"burst"}:
-            np.testing.assert_array_equal(
-                from_frames[column], from_messages[column], err_msg=column
-            )
-    assert not any(account.skipped for account in ledger.accounts.values())
-
-
 @pytest.mark.parametrize(
     ("name", "variant"),
     [
@@ -132,17 +109,6 @@ def test_standalone_messages_decode_to_same_columns_as_frames(name: str, variant
     for column in can[message.table].columns:
         if column != "sign":
             np.testing.assert_array_equal(can[message.table][column], bag[message.table][column])
-
-
-def test_high_beam_message_combines_two_frames() -> None:
-    sent = frames([(0x729, "64C8800C320000"), (0x730, "1B05")])
-    bag, _ = tables_from_bag(messages_of(sent))
-    can = tables_from_can(sent)
-
-    assert values(bag["high_beam_area"], "distance_m").tolist() == [100.0]
-    for column in can["high_beam_state"].columns:
-        if column not in ("t_ns", "burst"):
-            assert can["high_beam_state"][column] == bag["high_beam_state"][column]
 
 
 @pytest.mark.slow
@@ -173,23 +139,6 @@ def obstacle_drive() -> list[Block]:
     return messages_of(frames(sent, times))
 
 
-def test_missing_obstacle_message_is_dropped() -> None:
-    statuses, obstacles = obstacle_drive()
-    _, ledger = tables_from_bag([statuses, obstacles.take(np.arange(8) != 3)])
-
-    account = ledger.topic("/parsed_tx/obstacle_data")
-    assert account.dropped.total() == 1
-    assert [(d.t_ns, d.detail) for d in ledger.drops()] == [(1066 * MS, "burst 1")]
-
-
-def test_obstacles_missing_in_every_burst_are_dropped() -> None:
-    statuses, obstacles = obstacle_drive()
-    _, ledger = tables_from_bag([statuses, obstacles.take(np.s_[:0])])
-    assert (
-        ledger.topic("/parsed_tx/obstacle_data").dropped.total() == 6
-    )  # the last burst may be incomplete
-
-
 def test_obstacles_without_status_keep_their_own_time() -> None:
     statuses, obstacles = obstacle_drive()
     bag, ledger = tables_from_bag([statuses.take(np.arange(4) != 2), obstacles])
@@ -197,14 +146,6 @@ def test_obstacles_without_status_keep_their_own_time() -> None:
     assert bag["obstacles"]["burst"].tolist() == [0, 0, 1, 1, -1, -1, 2, 2]
     assert bag["obstacles"]["slot"].tolist() == [0, 1, 0, 1, -1, -1, 0, 1]
     assert any("keep their own time" in n for n in ledger.notices)
-
-
-def test_obstacles_without_status_topic_are_returned_immediately() -> None:
-    obstacles = obstacle_drive()[1]
-    types = {obstacles.topic: "mobileye_560_660_msgs/ObstacleData"}
-    reader = RosMobileye("ros", types, Ledger("log"), BUS_SETTINGS)
-    assert [len(b) for b in reader(obstacles)] == [8]
-    assert reader.flush() == []
 
 
 def lane_drive(seconds: int, mirrored: bool) -> list[Block]:
@@ -232,24 +173,6 @@ def test_lane_sign_is_inferred_from_messages(mirrored: bool, seconds: int) -> No
     assert (values(lanes, "c0_m") * values(lanes, "side") > 0).all()
     assert len(lanes) == 2 * 15 * seconds
     assert any("positive to the left" in n for n in ledger.notices) == mirrored
-
-
-@pytest.mark.parametrize("sign", [s for s in get_args(LaneSign) if s != "auto"])
-def test_wrong_configured_lane_sign_is_kept_with_notice(sign: LaneSign) -> None:
-    how = replace(BUS_SETTINGS, ros_lane_sign=sign)
-    bag, ledger = tables_from_bag(lane_drive(2, mirrored=sign == "right"), how)
-
-    assert (values(bag["lanes"], "c0_m") * values(bag["lanes"], "side") < 0).all()
-    assert any("wrong side" in n for n in ledger.notices)
-
-
-def test_mirrored_obstacle_is_a_notice() -> None:
-    sent = frames([status(1, 0), (0x739, "0180014002003003"), *triple(0, 1)[1:]])
-    statuses, obstacles = messages_of(sent)
-    assert isinstance(obstacles.rows, Table)
-    mirrored = {**obstacles.rows.columns, "obstacle_angle": np.array([-49.4])}
-    _, ledger = tables_from_bag([statuses, replace(obstacles, rows=Table(mirrored))])
-    assert any("compare the obstacles' sides with a picture" in n for n in ledger.notices)
 
 
 def test_unused_messages_are_skipped_by_topic_and_reason() -> None:

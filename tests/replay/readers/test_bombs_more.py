@@ -181,15 +181,6 @@ def test_bomb_in_log_is_refused_with_size_and_limit(tmp_path: Path, case: str) -
 
 
 @pytest.mark.slow
-def test_max_chunk_option_sets_limit(tmp_path: Path) -> None:
-    path = _blf(3 * MIB)(tmp_path)
-
-    _, output, _ = measured(["info", str(path), "--max-chunk", "2"])
-
-    assert f"the limit is {2 * MIB} (--max-chunk)" in output
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["message", "file"])
 def test_max_chunk_option_limits_zstd_size_in_bag(tmp_path: Path, kind: str) -> None:
     path = (

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.base import Selection
-from crosscue.replay.logs.opening import open_log
 from support.can_files import damaged, read_back
 from support.can_kinds import KINDS, Kind, judge
 
@@ -63,18 +62,6 @@ def test_damage_adds_no_frames_and_hides_no_loss(tmp_path: Path, kind: Kind) -> 
 
 
 @EVERY_KIND
-def test_truncated_log_yields_its_first_frames(tmp_path: Path, kind: Kind) -> None:
-    frames = kind.frames(60)
-    content = kind.spell(frames)
-    expected = kind.expected(frames)
-
-    found, _ = read_back(_file(tmp_path, kind, content[: len(content) // 2]))
-
-    assert found
-    assert found == {name: expected[name][: len(rows)] for name, rows in found.items()}
-
-
-@EVERY_KIND
 def test_unselected_frames_are_counted_but_not_read(tmp_path: Path, kind: Kind) -> None:
     frames = kind.frames(200)
     expected = kind.expected(frames)
@@ -87,12 +74,3 @@ def test_unselected_frames_are_counted_but_not_read(tmp_path: Path, kind: Kind) 
 
     assert found == {name: [f for f in expected[name] if lo <= f.t_ns < hi]}
     assert {n: ledger.topic(n).found for n in expected} == {n: len(f) for n, f in expected.items()}
-
-
-@EVERY_KIND
-def test_topics_are_known_before_reading(tmp_path: Path, kind: Kind) -> None:
-    frames = kind.frames(50)
-
-    with open_log(_file(tmp_path, kind, kind.spell(frames))) as log:
-        assert {t.name for t in log.topics} == set(kind.expected(frames))
-        assert {t.type_name for t in log.topics} == {"crosscue/CanFrames"}

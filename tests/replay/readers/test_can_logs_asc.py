@@ -9,8 +9,6 @@ import can
 import pytest
 
 from crosscue.replay.columns import DATA, ERROR, REMOTE
-from crosscue.replay.errors import LogFormatError
-from crosscue.replay.logs.opening import open_log
 from support.can_files import Sent, assert_equal_to_python_can, read_back
 from support.data import shared
 
@@ -87,25 +85,6 @@ def test_invalid_line_is_dropped_and_reported(tmp_path: Path, line: str) -> None
     assert "line 4" in next(ledger.drops()).detail
 
 
-def test_relative_times_are_summed_over_all_lines(tmp_path: Path) -> None:
-    head = HEAD.replace("absolute", "relative")
-    event = "0.1 1  Statistic: D 0 R 0 XD 0 XR 0 E 0 O 0 B 0.00%\n"
-    text = head + LINE.replace("0.5", "0.1") + event + LINE.replace("0.5", "0.1")
-
-    found, ledger = read_back(_log(tmp_path, text))
-
-    assert [f.t_ns - NOON_NS for f in found["can/1"]] == [100_000_000, 300_000_000]
-    assert ledger.topic("").skipped == {"event that is not a CAN frame": 1}
-
-
-def test_dropped_line_in_relative_log_is_reported_as_time_shift(tmp_path: Path) -> None:
-    head = HEAD.replace("absolute", "relative")
-
-    _, ledger = read_back(_log(tmp_path, head + LINE + "junk\n" + LINE))
-
-    assert any("shifts later ones" in notice for notice in ledger.notices)
-
-
 def test_decimal_logs_are_read_as_decimal(tmp_path: Path) -> None:
     text = HEAD.replace("hex", "dec") + "0.5 1  100 Rx d 3 100 0 255\n0.6 1  100 Rx d 1 256\n"
 
@@ -151,54 +130,10 @@ def test_log_without_header_keeps_first_frame(tmp_path: Path) -> None:
     assert any("no readable start date" in notice for notice in ledger.notices)
 
 
-def test_comments_in_any_encoding_are_ignored(tmp_path: Path) -> None:
-    text = HEAD + "// Prüfstand größer\n" + LINE + "// nächster\n"
-
-    found, ledger = read_back(_log(tmp_path, text, "latin-1"))
-
-    assert len(found["can/1"]) == 1
-    assert ledger.is_whole
-
-
 def test_commented_out_frame_is_counted_as_skipped(tmp_path: Path) -> None:
     _, ledger = read_back(_log(tmp_path, HEAD + LINE + "// x" + LINE))
 
     assert ledger.topic("").skipped == {"comment that holds a frame": 1}
-
-
-def test_base_change_inside_file_ends_reading(tmp_path: Path) -> None:
-    other = HEAD.replace("hex", "dec")
-
-    found, ledger = read_back(_log(tmp_path, HEAD + LINE + other + LINE))
-
-    assert len(found["can/1"]) == 1
-    assert ledger.topic("").dropped_unknown == ["a different 'base' line inside the file"]
-
-
-def test_concatenated_logs_keep_their_dates(tmp_path: Path) -> None:
-    later = HEAD.replace("Jul 10", "Jul 11")
-
-    found, ledger = read_back(_log(tmp_path, HEAD + LINE + later + LINE))
-
-    assert [f.t_ns - NOON_NS for f in found["can/1"]] == [500_000_000, 86_400_500_000_000]
-    assert ledger.is_whole
-
-
-def test_missing_end_of_trigger_block_is_reported(tmp_path: Path) -> None:
-    begin = "Begin Triggerblock Fri Jul 10 12:00:00.000 pm 2015\n"
-
-    _, cut = read_back(_log(tmp_path, HEAD + begin + LINE))
-    _, whole = read_back(_log(tmp_path, HEAD + begin + LINE + "End TriggerBlock\n"))
-
-    assert not cut.is_whole
-    assert whole.is_whole
-
-
-def test_log_with_header_only_has_no_topics(tmp_path: Path) -> None:
-    with open_log(_log(tmp_path, HEAD)) as log:
-        assert log.topics == ()
-    with pytest.raises(LogFormatError, match="no frame of a Vector ASC log"):
-        open_log(_log(tmp_path, "once upon a time\n"))
 
 
 @pytest.mark.parametrize("name", ["issue_1256.asc", "logfile.asc"])

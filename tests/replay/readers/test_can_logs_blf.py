@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 import struct
-import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.base import Selection
-from crosscue.replay.columns import ERROR
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.ledger import NOT_ASKED_TIME, Ledger
-from crosscue.replay.limits import Limits
+from crosscue.replay.ledger import NOT_ASKED_TIME
 from crosscue.replay.logs.opening import open_log
 from support.can_files import (
     START_NS,
@@ -37,82 +33,6 @@ def _log(folder: Path, content: bytes) -> Path:
     return path
 
 
-def _container(content: bytes, declared: int | None = None) -> bytes:
-    coded = zlib.compress(content)
-    size = len(content) if declared is None else declared
-    head = struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 32 + len(coded), 10, 2, size)
-    return head + coded + bytes(len(coded) % 4)
-
-
-def _objects(frames: list[Sent]) -> bytes:
-    return zlib.decompress(blf(frames, container=1 << 30)[144 + 32 :])
-
-
-def test_damaged_container_drops_only_its_frames(tmp_path: Path) -> None:
-    frames = random_frames(400)
-    content = bytearray(blf(frames, container=4000))
-    hit = content.find(b"LOBJ", 3000) + 60
-    content[hit] ^= 0xFF
-
-    found, ledger = read_back(_log(tmp_path, bytes(content)))
-
-    read = [f for rows in found.values() for f in rows]
-    assert set(read) < {f for rows in by_bus(frames).values() for f in rows}
-    assert len(read) > 250
-    assert ledger.topic("").dropped.total() == len(frames) - len(read)
-    assert "checksum" in next(ledger.drops()).detail
-
-
-def test_unclosed_log_is_read_completely_and_reported(tmp_path: Path) -> None:
-    frames = random_frames(200)
-
-    found, ledger = read_back(_log(tmp_path, blf(frames, is_closed=False)))
-
-    assert sum(map(len, found.values())) == 200
-    assert ledger.topic("").dropped_unknown == ["file was not closed by its writer"]
-    assert any("no start time" in notice for notice in ledger.notices)
-
-
-def test_missing_declared_objects_are_dropped(tmp_path: Path) -> None:
-    frames = random_frames(50)
-    content = bytearray(blf(frames))
-    content[32:36] = struct.pack("<L", 60)
-
-    _, ledger = read_back(_log(tmp_path, bytes(content)))
-
-    assert ledger.topic("").dropped.total() == 10
-
-
-def test_error_frames_are_kept(tmp_path: Path) -> None:
-    (frame,) = random_frames(1, fd=False)
-    error = Sent(frame.t_ns, "1", 0x12, b"\1\2", False, ERROR)
-
-    found, _ = read_back(_log(tmp_path, blf([error])))
-
-    assert found == by_bus([error])
-
-
-def test_other_objects_are_counted_as_skipped(tmp_path: Path) -> None:
-    objects = bytearray(_objects(random_frames(3, fd=False)))
-    objects[12:16] = struct.pack("<L", 96)
-    header = blf(random_frames(3))[:144]
-
-    found, ledger = read_back(_log(tmp_path, header + _container(bytes(objects))))
-
-    assert sum(map(len, found.values())) == 2
-    assert ledger.topic("").skipped == {"object of type 96 is not a CAN frame": 1}
-    assert ledger.is_whole
-
-
-def test_objects_outside_containers_are_read(tmp_path: Path) -> None:
-    frames = random_frames(50)
-
-    found, ledger = read_back(_log(tmp_path, blf(frames)[:144] + _objects(frames)))
-
-    assert found == by_bus(frames)
-    assert ledger.topic("").dropped.total() == 0
-
-
 def test_object_signature_inside_payload_is_ignored(tmp_path: Path) -> None:
     frames = [Sent(f.t_ns, f.bus, 0x7, b"xLOBJabc", False) for f in random_frames(20)]
 
@@ -120,34 +40,6 @@ def test_object_signature_inside_payload_is_ignored(tmp_path: Path) -> None:
 
     assert found == by_bus(frames)
     assert ledger.is_whole
-
-
-@pytest.mark.parametrize("size", [0, 1, 15, 1 << 20, 0xFFFFFFFF])
-@pytest.mark.parametrize("stored", [False, True])
-def test_object_of_invalid_size_drops_one_frame(tmp_path: Path, size: int, stored: bool) -> None:
-    frames = random_frames(100, fd=False)
-    objects = bytearray(_objects(frames))
-    objects[10 * 48 + 8 : 10 * 48 + 12] = struct.pack("<L", size)
-    content = blf(frames)[:144] + (bytes(objects) if stored else _container(bytes(objects)))
-
-    found, ledger = read_back(_log(tmp_path, content))
-
-    assert sum(map(len, found.values())) == 99
-    assert ledger.topic("").dropped.total() == 1
-
-
-@pytest.mark.parametrize("declared", [100, 50_000_000])
-def test_container_larger_than_declared_or_limit_is_refused(tmp_path: Path, declared: int) -> None:
-    frames = random_frames(30)
-    bomb = _container(bytes(50_000_000), declared)
-    path = _log(tmp_path, blf(frames) + bomb)
-    ledger = Ledger(str(path))
-
-    with open_log(path, Limits(chunk_bytes=1 << 20)) as log:
-        rows = sum(len(block) for block in log.read(ledger))
-
-    assert rows == 30
-    assert not ledger.is_whole
 
 
 def test_invalid_containers_after_frames_are_reported(tmp_path: Path) -> None:
@@ -244,29 +136,6 @@ def test_time_range_yields_exact_frames_and_account(
     assert sum(one.used for one in accounts) == len(wanted)
     assert {reason for one in accounts for reason in one.skipped} <= {NOT_ASKED_TIME}
     assert ledger.is_whole
-
-
-def test_bytes_outside_time_range_are_reported_as_unread(tmp_path: Path) -> None:
-    window = Selection(start_ns=START_NS + 50 * 10**9, end_ns=START_NS + 52 * 10**9)
-
-    found, ledger = read_back(_log(tmp_path, MINUTE_LOG), window)
-
-    assert found == by_bus(MINUTE_FRAMES[5_000:5_200])
-    assert "bytes outside --from/--to not read" in ledger.integrity
-    unread = int(re.findall(r"(\d+) bytes outside", ledger.integrity)[0])
-    assert unread > 0.85 * len(MINUTE_LOG)
-    assert sum(one.found for name, one in ledger.accounts.items() if name) < 700
-
-
-def test_time_range_finds_frames_after_clock_goes_back(tmp_path: Path) -> None:
-    again = [replace(f, t_ns=f.t_ns - 59 * 10**9) for f in MINUTE_FRAMES[5_900:]]
-    frames = [*MINUTE_FRAMES[:3_000], *again, *MINUTE_FRAMES[3_000:]]
-    window = Selection(start_ns=START_NS, end_ns=START_NS + 10**9)
-
-    found, ledger = read_back(_log(tmp_path, blf(frames, container=4_000)), window)
-
-    assert found == by_bus([f for f in frames if START_NS <= f.t_ns < START_NS + 10**9])
-    assert sum(one.in_file for one in ledger.accounts.values()) == len(frames)
 
 
 def test_damage_inside_time_range_is_reported(tmp_path: Path) -> None:

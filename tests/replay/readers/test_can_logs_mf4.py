@@ -86,29 +86,6 @@ def _tables(path: Path, selection: Selection = EVERYTHING) -> tuple[dict[str, li
     return found, ledger
 
 
-@pytest.mark.parametrize("compression", [0, 1, 2])
-def test_signals_are_read_as_tables_with_names_units_and_times(
-    tmp_path: Path, compression: int
-) -> None:
-    path = _signals(tmp_path / "x.mf4", compression=compression)
-
-    found, ledger = _tables(path)
-
-    assert set(found) == {"drive", "drive (2)"}
-    (block,) = found["drive"]
-    table = block.rows
-    assert isinstance(table, Table)
-    np.testing.assert_array_equal(table["speed"], np.arange(1000) * 0.5 - 10)
-    np.testing.assert_array_equal(table["angle"], np.linspace(-1, 1, 1000))
-    np.testing.assert_array_equal(table["torque"], -np.arange(1000))
-    assert table.units == {"speed": "km/h", "angle": "deg", "torque": "Nm"}
-    np.testing.assert_array_equal(np.diff(block.log_ns), 10_000_000)
-    assert "label" not in table.columns
-    assert any("label" in notice for notice in ledger.notices)
-    assert ledger.topic("drive").declared == ledger.topic("drive").used == 1000
-    assert ledger.is_whole
-
-
 def test_signals_of_all_data_types_match_asammdf_input(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     times = np.arange(500) * 1e-3
@@ -142,12 +119,6 @@ def test_bus_logs_match_python_can(tmp_path: Path, compression: int) -> None:
     assert_equal_to_python_can(path, _read_with_python_can(path), "can/{}", within_ns=2_000)
 
 
-@pytest.mark.slow
-def test_real_log_matches_python_can() -> None:
-    path = shared(*REAL)
-    assert_equal_to_python_can(path, _read_with_python_can(path), "can/{}", within_ns=2_000)
-
-
 def test_unselected_rows_are_counted_but_not_read(tmp_path: Path) -> None:
     path = _signals(tmp_path / "x.mf4")
     everything, _ = _tables(path)
@@ -171,16 +142,6 @@ def _frames_of_cut(path: Path, content: bytes, at: int) -> tuple[int, bool] | No
         return sum(map(len, found.values())), ledger.is_whole
     assert "\n" not in message
     return None
-
-
-@pytest.mark.parametrize("compression", [0, 2])
-def test_truncation_is_reported(tmp_path: Path, compression: int) -> None:
-    frames = [f for f in random_frames(300) if f.kind == 0]
-    content = _bus_log(tmp_path / "whole.mf4", frames, compression).read_bytes()
-    for at in range(0, len(content) - 1, len(content) // 150):
-        outcome = _frames_of_cut(tmp_path / "x.mf4", content, at)
-        if outcome is not None and outcome[0] < len(frames):
-            assert not outcome[1], f"cut at {at}: {outcome[0]} frames, no loss reported"
 
 
 def test_truncation_of_real_log_is_reported(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -119,19 +118,6 @@ def test_real_unfinalized_log_matches_asammdf_after_finalizing(
     _assert_same_frames(ours, _read_with_asammdf(path))
 
 
-def test_unfinalized_log_is_reported_in_notices() -> None:
-    path = shared("can", "css_unfinalized", "00000014.MF4")
-
-    _, ledger = read_back(path)
-
-    notice = "not finalized by the logger; 28721 records recovered from the data block"
-    assert notice in ledger.notices
-    assert {name: one.used for name, one in ledger.accounts.items() if name} == {
-        "can/1": 14_360,
-        "can/2": 14_361,
-    }
-
-
 VARIANTS: dict[str, dict[str, Any]] = {
     "one group": {"virtual": False},
     "virtual": {"virtual": True},
@@ -177,18 +163,6 @@ def test_all_layouts_of_channel_groups_yield_every_frame(tmp_path: Path, variant
     assert (notice in ledger.notices) != options.get("is_finalized", False)
 
 
-@pytest.mark.parametrize("variant", ["one group", "virtual", "identifiers of 2 bytes", "finalized"])
-def test_synthetic_logs_match_asammdf(tmp_path: Path, variant: str) -> None:
-    options = VARIANTS[variant]
-    frames = [f for f in _frames(400, virtual=options["virtual"]) if f.kind == 0]
-    path = tmp_path / "x.mf4"
-    path.write_bytes(unsorted(frames, **options).content)
-
-    ours, _ = _read_with_crosscue(path, _start_ns(path))
-
-    _assert_same_frames(ours, _read_with_asammdf(path))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("order", ["after", "before", "last"])
 @pytest.mark.parametrize("virtual", [False, True])
@@ -230,18 +204,6 @@ def test_cut_between_records_of_unfinalized_log_is_disclosed_as_undetectable(
     assert CUT_UNSEEN not in read_back(path)[1].integrity
 
 
-def test_end_inside_payload_drops_one_frame(tmp_path: Path) -> None:
-    frames = _frames(50, virtual=False)
-    whole = unsorted(frames, virtual=False)
-    path = tmp_path / "x.mf4"
-    path.write_bytes(whole.content[: whole.ends[-1] - 1])
-
-    found, ledger = read_back(path)
-
-    assert sum(map(len, found.values())) == len(frames) - 1
-    assert sum(account.dropped.total() for account in ledger.accounts.values()) == 1
-
-
 @pytest.mark.parametrize("virtual", [False, True])
 def test_unknown_record_identifier_is_reported_and_adds_no_frames(
     tmp_path: Path, virtual: bool
@@ -260,77 +222,3 @@ def test_unknown_record_identifier_is_reported_and_adds_no_frames(
         assert found == by_bus(inside, "can/{}")
         assert not ledger.is_whole
         assert any("unknown record identifier 238" in drop.detail for drop in ledger.drops())
-
-
-def test_bytes_after_last_declared_record_are_ignored(tmp_path: Path) -> None:
-    frames = _frames(100, virtual=True)
-    whole = unsorted(frames, virtual=True, is_finalized=True)
-    path = tmp_path / "x.mf4"
-    content = bytearray(whole.content) + b"\xee" * 16
-    at = whole.data_at - 24 + 8
-    content[at : at + 8] = (int.from_bytes(content[at : at + 8], "little") + 16).to_bytes(
-        8, "little"
-    )
-    path.write_bytes(content)
-
-    found, ledger = read_back(path)
-
-    assert sum(map(len, found.values())) == len(frames)
-    assert ledger.is_whole
-
-
-def test_frames_of_several_groups_are_in_time_order(tmp_path: Path) -> None:
-    frames: Sequence[Sent] = _frames(2_000, virtual=True)
-    path = tmp_path / "x.mf4"
-    path.write_bytes(unsorted(frames, virtual=True).content)
-
-    with open_log(path) as log:
-        for block in log.read(Ledger("x")):
-            assert bool((np.diff(block.log_ns) >= 0).all())
-
-
-def test_sorted_groups_of_one_bus_are_merged_in_time_order(tmp_path: Path) -> None:
-    frames = [f for f in _frames(3_000, virtual=True) if f.kind == 0 and not f.is_fd]
-    mixed, path = tmp_path / "mixed.mf4", tmp_path / "sorted.mf4"
-    mixed.write_bytes(unsorted(frames, virtual=True).content)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with asammdf.MDF(mixed) as mdf:
-            mdf.save(path, overwrite=True)
-
-    found, ledger = read_back(path)
-
-    assert ledger.is_whole
-    assert found == by_bus(frames, "can/{}")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("virtual", [False, True])
-def test_long_runs_of_equal_records_with_interruptions_yield_every_frame(
-    tmp_path: Path, virtual: bool
-) -> None:
-    frames = []
-    for k, one in enumerate(_frames(6_000, virtual=False)):
-        payload = k.to_bytes(2, "little") * 4
-        length = 3 if k in (900, 901, 2_500, 4_999) else 8
-        bus = "2" if 3_000 < k < 3_003 else "1"
-        is_fd = k == 4_000
-        frames.append(Sent(one.t_ns, bus, k % 2048, payload[:length], False, 0, is_fd))
-    path = tmp_path / "x.mf4"
-    whole = unsorted(frames, virtual=virtual)
-
-    path.write_bytes(whole.content)
-    found, ledger = read_back(path)
-    assert found == by_bus(frames, "can/{}")
-    assert ledger.is_whole
-
-    k = len(whole.starts) * 2 // 3
-    for content in (
-        whole.content[: whole.starts[k] + 5],
-        whole.content[: whole.starts[k]] + b"\xee" + whole.content[whole.starts[k] + 1 :],
-    ):
-        path.write_bytes(content)
-        found, ledger = read_back(path)
-        inside = [f for f, e in zip(frames, whole.ends, strict=True) if e <= whole.starts[k]]
-        assert found == by_bus(inside, "can/{}")
-        assert not ledger.is_whole

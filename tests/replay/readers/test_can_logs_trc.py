@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from crosscue.replay.columns import DATA, ERROR, REMOTE
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.readers.can_text.lines import CHUNK_BYTES
 from crosscue.replay.readers.can_text.message_numbers import GO_BACK, MISFIT, MISSING
 from crosscue.replay.readers.can_text.trc import NOT_UNDERSTOOD
 from support.can_files import Sent, assert_equal_to_python_can, random_frames, read_back, trc
@@ -93,16 +92,6 @@ def test_invalid_line_is_dropped_and_reported(tmp_path: Path, line: str) -> None
 
 
 @pytest.mark.parametrize(
-    "line", [" 1) 1.6 Warng FFFFFFFF 4 00 00 00 08 BUSHEAVY", " 1) 1.6 ErrCt 0000 2 00 00"]
-)
-def test_status_lines_are_counted_as_skipped(tmp_path: Path, line: str) -> None:
-    found, ledger = read_back(_log(tmp_path, HEAD_V1 + LINE_V1 + line + "\n"))
-
-    assert len(found["can/1"]) == 1
-    assert ledger.topic("").skipped == {"status line, no frame": 1}
-
-
-@pytest.mark.parametrize(
     ("days", "t_ns"),
     [
         ("25569", 0),
@@ -120,13 +109,6 @@ def test_start_times_are_exact(tmp_path: Path, days: str, t_ns: int) -> None:
     assert found["can/1"][0].t_ns == t_ns
 
 
-def test_missing_start_time_yields_times_from_zero_and_notice(tmp_path: Path) -> None:
-    found, ledger = read_back(_log(tmp_path, ";$FILEVERSION=1.1\n" + LINE_V1))
-
-    assert found["can/1"][0].t_ns == 1_600_000
-    assert any("no $STARTTIME" in notice for notice in ledger.notices)
-
-
 @pytest.mark.parametrize(
     ("text", "match"),
     [
@@ -140,22 +122,6 @@ def test_missing_start_time_yields_times_from_zero_and_notice(tmp_path: Path) ->
 def test_unsupported_or_damaged_header_is_refused(tmp_path: Path, text: str, match: str) -> None:
     with pytest.raises(LogFormatError, match=match):
         open_log(_log(tmp_path, text))
-
-
-def test_version_change_inside_file_ends_reading(tmp_path: Path) -> None:
-    found, ledger = read_back(_log(tmp_path, HEAD_V1 + LINE_V1 + HEAD_V2 + LINE_V2))
-
-    assert len(found["can/1"]) == 1
-    assert ledger.topic("").dropped_unknown == ["a different version inside the file"]
-
-
-def test_concatenated_logs_keep_their_start_times(tmp_path: Path) -> None:
-    text = HEAD_V1 + LINE_V1 + HEAD_V1.replace("25569", "25570") + LINE_V1
-
-    found, ledger = read_back(_log(tmp_path, text))
-
-    assert [f.t_ns - T_NS for f in found["can/1"]] == [0, 86_400_000_000_000]
-    assert ledger.is_whole
 
 
 @pytest.mark.parametrize(
@@ -210,17 +176,6 @@ def test_every_deleted_row_is_reported_as_dropped(
     assert sum(map(len, found.values())) == 60 - len(deleted)
     assert ledger.topic("").dropped == ({MISSING: log.missing} if log.missing else {})
     assert ledger.is_whole == (not log.missing)
-
-
-def test_rows_missing_at_chunk_boundaries_are_reported(tmp_path: Path) -> None:
-    deleted = set(range(100, 40_000, 37))
-    log = _log_without("2.1", 40_000, deleted)
-
-    _, ledger = read_back(_log(tmp_path, log.text))
-
-    assert len(log.text) > 2 * CHUNK_BYTES
-    assert ledger.topic("").dropped == {MISSING: log.missing}
-    assert "line 105: 101; line 141: 138" in next(ledger.drops()).detail
 
 
 def _numbered(*numbers: int, head: str = HEAD_V1) -> str:

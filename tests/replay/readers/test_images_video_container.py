@@ -10,7 +10,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from crosscue.eval.cli import run
 from crosscue.replay.base import Selection
 from crosscue.replay.columns import Block, Images
 from crosscue.replay.errors import LogError, LogFormatError
@@ -19,7 +18,6 @@ from crosscue.replay.logs.opening import open_log
 from support.accounted import read
 from support.videos import number_of, numbers_at_times, video
 
-S = 1_000_000_000
 N = 24
 NO_REORDERING = {"bf": "0"}
 REORDERING = {"bf": "3", "b-adapt": "0", "g": "12"}
@@ -80,18 +78,6 @@ def _zero_packet(path: Path, which: int) -> None:
     path.write_bytes(data.replace(packet, bytes(len(packet))))
 
 
-def test_unsupported_codec_is_decoded_by_reader(tmp_path: Path) -> None:
-    path = video(tmp_path / "a.mp4", N, "mpeg4")
-    path.with_suffix(".csv").write_text(TIME_LINES)
-
-    blocks, ledger = read(path)
-
-    assert [int(b.log_ns[0]) for b in blocks] == TIMES_NS
-    assert [_number_in(block) for block in blocks] == list(range(N))
-    assert "codec mpeg4: decoded by the reader" in ledger.notices
-    assert ledger.is_whole
-
-
 @pytest.mark.parametrize("name", ["a.mp4", "a.avi"])
 @pytest.mark.parametrize("which", [0, 7, N - 1])
 def test_undecodable_picture_is_dropped_without_shifting_times(
@@ -109,16 +95,6 @@ def test_undecodable_picture_is_dropped_without_shifting_times(
     assert dict(ledger.topic("a").dropped) == {"picture cannot be decoded": 1}
     (loss,) = (d for d in ledger.details if d.is_dropped)
     assert (loss.t_ns, loss.detail) == (TIMES_NS[which], f"packet {which}")
-
-
-@pytest.mark.parametrize("options", [NO_REORDERING, REORDERING], ids=["plain", "reordered"])
-def test_missing_time_file_uses_video_times_with_notice(
-    tmp_path: Path, options: dict[str, str]
-) -> None:
-    blocks, ledger = read(video(tmp_path / "a.mp4", N, "libx264", options))
-
-    assert numbers_at_times(blocks, "h264") == {50_000_000 * i: i for i in range(N)}
-    assert ledger.notices[0].startswith("times are the video's own, starting at 0")
 
 
 def test_constant_rate_is_reported(tmp_path: Path) -> None:
@@ -230,30 +206,3 @@ def test_time_file_with_picture_names_is_refused_for_video(tmp_path: Path) -> No
 
     with pytest.raises(LogFormatError, match="names files; expected one time for each picture"):
         open_log(path)
-
-
-@pytest.mark.parametrize("name", ["a.mp4", "a.avi", "a.mkv", "a.mov"])
-def test_unsupported_content_with_video_suffix_is_refused(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_bytes(b"#EXTM3U\nhttp://127.0.0.1:9/a.ts\n" * 20)
-
-    with pytest.raises(LogFormatError, match="cut or damaged, no video can be found"):
-        open_log(tmp_path / name)
-
-
-def test_non_utf8_file_name_is_opened(tmp_path: Path) -> None:
-    path = video(tmp_path / "a.mp4", 3, "libx264", NO_REORDERING)
-    odd = path.rename(tmp_path / "a\udcff.mp4")
-
-    blocks, _ = read(odd)
-
-    assert sum(len(b) for b in blocks) == 3
-
-
-def test_info_reports_gaps_of_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
-    path.with_suffix(".txt").write_text(TIME_LINES)
-
-    assert run(["info", str(path)]) == 0
-    assert "a: 1 gap over 250 ms (5 periods), the longest 350 ms at 0.45 s" in (
-        capsys.readouterr().out
-    )

@@ -5,13 +5,12 @@ from __future__ import annotations
 from decimal import Decimal
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.errors import LogFormatError, LogTooLargeError
-from crosscue.replay.files.time_file_names import find_time_file, time_file_of_video
+from crosscue.replay.files.time_file_names import find_time_file
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.time_file import TimeFile, read_time_file
 
@@ -35,15 +34,6 @@ def test_seconds_are_parsed_to_the_nanosecond(tmp_path: Path, t_ns: list[int]) -
     lines = "\n".join(f"{Decimal(t) / S:.9f}" for t in t_ns)
 
     assert read(tmp_path, lines).t_ns.tolist() == t_ns
-
-
-@quick
-@given(st.lists(st.integers(0, 2**31 * S), min_size=1, max_size=20, unique=True))
-def test_date_times_are_parsed_to_the_nanosecond(tmp_path: Path, t_ns: list[int]) -> None:
-    dates = [f"{np.datetime_as_string(np.datetime64(t, 'ns')).replace('T', ' ')}" for t in t_ns]
-
-    assert read(tmp_path, "\n".join(dates)).t_ns.tolist() == t_ns
-    assert read(tmp_path, "\n".join(d.replace(" ", "T") + "Z" for d in dates)).t_ns.tolist() == t_ns
 
 
 @pytest.mark.parametrize(
@@ -78,14 +68,6 @@ def test_supported_notations_are_parsed(
     assert times.names == names
 
 
-def test_constant_rate_yields_times_without_drift(tmp_path: Path) -> None:
-    times = read(tmp_path, "rate_hz: 29.97\n")
-
-    at = times.times_at(np.array([0, 1, 2997]))
-    assert at.tolist() == [0, 33366700, 100 * S]
-    assert read(tmp_path, "rate_hz = 15").times_at(np.array([15])).tolist() == [S]
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -113,13 +95,6 @@ def test_constant_rate_yields_times_without_drift(tmp_path: Path) -> None:
 def test_invalid_line_is_refused_with_its_number(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(LogFormatError, match=message):
         read(tmp_path, text)
-
-
-def test_non_utf8_bytes_are_refused_with_line_number(tmp_path: Path) -> None:
-    (tmp_path / "times.txt").write_bytes(b"0.1\n0.2\n\xff\xfe\n")
-
-    with pytest.raises(LogFormatError, match="line 3: not UTF-8 text"):
-        read_time_file(tmp_path / "times.txt", DEFAULT_LIMITS)
 
 
 def test_time_file_over_size_limit_is_refused(tmp_path: Path) -> None:
@@ -160,12 +135,3 @@ def test_time_file_is_found_in_folder_or_next_to_it(tmp_path: Path) -> None:
         find_time_file(folder)
     (folder / "times.txt").touch()
     assert find_time_file(folder) == folder / "times.txt"
-
-
-def test_time_file_of_video_is_found_next_to_it(tmp_path: Path) -> None:
-    video = tmp_path / "drive.mp4"
-    assert time_file_of_video(video) is None
-    (tmp_path / "drive.csv").touch()
-    assert time_file_of_video(video) == tmp_path / "drive.csv"
-    (tmp_path / "drive.mp4.txt").touch()
-    assert time_file_of_video(video) == tmp_path / "drive.mp4.txt"

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import struct
 from io import BytesIO
-from itertools import takewhile
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from crosscue.replay.readers.mcap.chunks.scan import scan_of
 from support.mcap_files import Message, read_back
 
 MESSAGES = st.lists(
@@ -81,26 +77,3 @@ def test_messages_match_mcap_package(
     assert ours.messages == theirs
     assert ours.ledger.is_whole
     assert ours.adds_up()
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    records=st.lists(st.tuples(st.integers(0, 12), st.integers(0, 40)), max_size=50),
-    tail=st.binary(max_size=8),
-    stop=st.integers(1, 12),
-    max_count=st.integers(0, 60),
-)
-def test_scan_yields_records_before_first_stop_record(
-    records: list[tuple[int, int]], tail: bytes, stop: int, max_count: int
-) -> None:
-    coded = b"".join(struct.pack("<BQ", kind, size) + bytes(size) for kind, size in records)
-    buffer = np.frombuffer(coded + tail, dtype=np.uint8)
-    kinds = [
-        kind for kind, _ in takewhile(lambda one: one[0] not in (0, stop), records[:max_count])
-    ]
-    begins = np.cumsum([0, *(9 + size for _, size in records)])
-
-    scan = scan_of(buffer, np.arange(256) == stop, max_count)
-
-    assert scan.opcode.tolist() == kinds
-    assert [*scan.offset.tolist(), scan.end] == begins[: len(kinds) + 1].tolist()

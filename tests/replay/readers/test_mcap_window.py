@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 
 from crosscue.replay.base import Selection
 from crosscue.replay.readers.mcap import recording_pass as mcap_pass
-from crosscue.replay.readers.mcap.chunks.chunk_table import parse_chunk_indexes, run_of
-from crosscue.replay.readers.mcap.records import PREFIX
 from support.mcap_files import (
     ChunkOf,
     McapFile,
@@ -23,7 +21,6 @@ from support.mcap_files import (
     channel,
     message,
     read_back,
-    record,
     schema,
 )
 
@@ -115,34 +112,6 @@ def test_chunks_outside_time_range_are_not_read(tmp_path: Path) -> None:
     )
 
 
-def test_chunks_without_selected_topic_are_not_read(tmp_path: Path) -> None:
-    chunks = [chunk(k, topic=k % 3) for k in range(9)]
-    write_with_destroyed_chunks(tmp_path / "x.mcap", lambda k: k % 3 == 1, chunks)
-
-    reading = read_back(tmp_path / "x.mcap", Selection(frozenset({"/t1"})))
-
-    assert len(reading.messages["/t1"]) == 30
-    assert reading.ledger.is_whole
-    assert reading.ledger.accounts["/t2"].skipped == {"topic not selected": 30}
-
-
-def test_index_contradicting_chunk_header_is_ignored(tmp_path: Path) -> None:
-    coded = bytearray(McapFile([*DEFINITIONS, *map(chunk, range(9))]).coded())
-    at = coded.index(chunk(4).coded()) + PREFIX.size
-    coded[at : at + 16] = struct.pack("<QQ", 300, 409)  # Its header now states another start.
-    path = tmp_path / "x.mcap"
-    path.write_bytes(coded)
-
-    reading = read_back(path, Selection(None, 400, 405))
-
-    assert len(reading.messages["/t0"]) == 5
-    assert any("every chunk was examined" in notice for notice in reading.ledger.notices)
-    assert (
-        reading.ledger.accounts
-        == read_by_complete_pass(path, Selection(None, 400, 405)).ledger.accounts
-    )
-
-
 def test_inconsistent_message_counts_are_reported(tmp_path: Path) -> None:
     file = McapFile([*DEFINITIONS, *map(chunk, range(9))], summary_crc=False)
     counts = struct.pack("<HQ", 0, 90)
@@ -168,23 +137,3 @@ def test_wrong_time_in_index_without_checksum_is_detected(tmp_path: Path) -> Non
 
     assert [m[0] for m in reading.messages["/t0"]] == [*range(405, 410), *range(500, 505)]
     assert any("does not match the chunk" in notice for notice in reading.ledger.notices)
-
-
-@settings(max_examples=100, deadline=None)
-@given(sizes=st.lists(st.integers(0, 3), min_size=1, max_size=200))
-def test_run_length_never_exceeds_equal_records(sizes: list[int]) -> None:
-    records = b"".join(record(8, bytes(size)) for size in sizes) + b"tail"
-    at = 0
-    while at < len(records) - 4:
-        size = PREFIX.size + records[at + 1]
-        run = run_of(records, at, size)
-        same = 0
-        while records[at + same * size : at + same * size + 9] == records[at : at + 9]:
-            same += 1
-        assert 1 <= run <= same
-        at += run * size
-    assert at == len(records) - 4
-
-
-def test_empty_index_yields_empty_table() -> None:
-    assert len(parse_chunk_indexes(b"", (), (), 0)) == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +13,6 @@ from hypothesis import strategies as st
 
 from crosscue.replay.base import Selection
 from crosscue.replay.readers.rosbag1 import bag_pass as rosbag1_pass
-from crosscue.replay.readers.rosbag1.reader import open_bag
 from support.rosbag_files import START_NS, Reading, by_topic, read_rows, rows_of, write_bag
 
 MS = 1_000_000
@@ -85,23 +83,6 @@ def test_chunks_outside_time_range_are_not_read(tmp_path: Path) -> None:
     assert reading.ledger.is_whole
     assert "chunks" in reading.ledger.integrity
     assert reading.ledger.integrity.endswith("the rest was not")
-
-
-def test_index_is_read_in_large_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_bag(tmp_path / "a.bag", rows_of(2000), chunk_bytes=500)
-    sizes: list[int] = []
-    pread = os.pread
-
-    def counted(fd: int, size: int, at: int) -> bytes:
-        sizes.append(size)
-        return pread(fd, size, at)
-
-    monkeypatch.setattr(os, "pread", counted)
-    with open_bag(path) as log:
-        assert sum(topic.declared or 0 for topic in log.topics) == 2000
-
-    assert len(sizes) <= 4
-    assert sum(sizes) <= path.stat().st_size
 
 
 def test_wrong_time_in_index_is_detected(tmp_path: Path) -> None:

@@ -12,13 +12,9 @@ from typing import Literal
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rosbags.rosbag2 import Reader
 
 from crosscue.replay.base import Selection
-from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import NOT_ASKED_TIME
-from crosscue.replay.logs.opening import open_log
-from support.data import shared
 from support.rosbag_files import Row, by_topic, read_rows, rows_of, write_folder
 
 Storage = Literal["sqlite3", "mcap"]
@@ -53,17 +49,6 @@ def count_by_topic(rows: list[Row]) -> dict[str, int]:
     return dict(Counter(row.topic for row in rows))
 
 
-def test_real_folder_matches_rosbags() -> None:
-    path = shared("bags", "evo", "tf_example")
-    reading = read_rows(path)
-    with Reader(path) as reader:
-        theirs = [Row(c.topic, t, bytes(raw)) for c, t, raw in reader.messages()]
-
-    assert Counter(reading.rows) == Counter(theirs)
-    assert reading.ledger.is_whole
-    assert not reading.ledger.notices
-
-
 @pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize("compression", ["none", "file", "message"])
 def test_every_kind_of_folder_is_read_completely(
@@ -80,26 +65,6 @@ def test_every_kind_of_folder_is_read_completely(
     assert any("decompressed to" in notice for notice in reading.ledger.notices) == (
         compression == "file"
     )
-
-
-@pytest.mark.parametrize("storage", STORAGES)
-def test_files_are_read_in_order_of_time_not_name(tmp_path: Path, storage: Storage) -> None:
-    rows = rows_of(400)
-    folder = folder_of_parts(tmp_path / "bag", rows[200:], rows[:200], storage=storage)
-    write_metadata(folder, *(path.name for path in sorted(folder.iterdir())))
-    reading = read_rows(folder)
-
-    assert by_topic(reading.rows) == by_topic(rows)
-
-
-@pytest.mark.parametrize("storage", STORAGES)
-def test_overlapping_files_are_merged_by_time(tmp_path: Path, storage: Storage) -> None:
-    rows = rows_of(900)
-    folder = folder_of_parts(tmp_path / "bag", rows[0::3], rows[1::3], rows[2::3], storage=storage)
-    reading = read_rows(folder)
-
-    assert by_topic(reading.rows) == by_topic(rows)
-    assert reading.ledger.is_whole
 
 
 @pytest.mark.slow
@@ -119,17 +84,6 @@ def test_rows_split_over_files_are_read_in_order(
     assert by_topic(read_rows(folder).rows) == by_topic(rows)
 
 
-def test_unlisted_file_is_read_with_notice(tmp_path: Path) -> None:
-    rows = rows_of(300)
-    folder = folder_of_parts(tmp_path / "bag", rows[:100], rows[100:])
-    write_metadata(folder, "part_0.db3", counts=count_by_topic(rows))
-    reading = read_rows(folder)
-
-    assert by_topic(reading.rows) == by_topic(rows)
-    assert reading.ledger.is_whole
-    assert "part_1.db3 is not listed in metadata.yaml; it was read" in reading.ledger.notices
-
-
 def test_messages_of_missing_listed_file_are_dropped_by_topic(tmp_path: Path) -> None:
     rows = rows_of(300)
     folder = folder_of_parts(tmp_path / "bag", rows[:100], rows[100:])
@@ -141,15 +95,6 @@ def test_messages_of_missing_listed_file_are_dropped_by_topic(tmp_path: Path) ->
     assert {name: count for name, count in dropped.items() if count} == count_by_topic(rows[100:])
     for name, count in count_by_topic(rows).items():
         assert ledger.topic(name).in_file == count
-
-
-def test_missing_file_without_counts_is_reported(tmp_path: Path) -> None:
-    folder = folder_of_parts(tmp_path / "bag", rows_of(50))
-    write_metadata(folder, "part_0.db3", "part_1.db3")
-    ledger = read_rows(folder).ledger
-
-    assert not ledger.is_whole
-    assert [d.detail for d in ledger.drops()] == ["part_1.db3"]
 
 
 def test_messages_of_unreadable_listed_file_are_dropped(tmp_path: Path) -> None:
@@ -175,32 +120,6 @@ def test_too_low_counts_in_metadata_yield_notice(tmp_path: Path, declared: int) 
     assert by_topic(reading.rows) == by_topic(rows)
     assert reading.ledger.is_whole
     assert any(f"counts {declared} messages" in notice for notice in reading.ledger.notices)
-
-
-def test_messages_missing_from_metadata_count_are_dropped(tmp_path: Path) -> None:
-    rows = rows_of(200)
-    folder = folder_of_parts(tmp_path / "bag", rows)
-    write_metadata(folder, "part_0.db3", counts={"/can": 10_000})
-    reading = read_rows(folder)
-
-    assert by_topic(reading.rows) == by_topic(rows)
-    missing = 10_000 - len(by_topic(rows)["/can"])
-    assert reading.ledger.topic("/can").dropped == {"metadata.yaml counts more": missing}
-
-
-def test_topics_missing_from_metadata_are_read(
-    tmp_path: Path,
-) -> None:
-    rows = rows_of(300)
-    folder = write_folder(tmp_path / "bag", rows)
-    path = folder / "metadata.yaml"
-    # A different QoS text for one topic, and another topic renamed.
-    text = path.read_text().replace("offered_qos_profiles: []", "offered_qos_profiles: '- x: 1'", 1)
-    path.write_text(text.replace("name: /gps/fix", "name: /gone"))
-    reading = read_rows(folder)
-
-    assert by_topic(reading.rows) == by_topic(rows)
-    assert reading.ledger.is_whole
 
 
 @pytest.mark.parametrize(
@@ -266,30 +185,6 @@ def test_truncated_compressed_file_yields_readable_part(tmp_path: Path, storage:
     assert dropped == len(rows) - len(reading.rows)
 
 
-def test_compressed_file_cut_near_start_is_refused_with_its_name(tmp_path: Path) -> None:
-    folder = write_folder(tmp_path / "bag", rows_of(100), compression="file")
-    path = next(folder.glob("*.zstd"))
-    path.write_bytes(path.read_bytes()[:50])
-
-    with pytest.raises(LogError, match=r"bag\.db3\.zstd: .*compressed file is cut"):
-        open_log(folder)
-
-
-def test_decompression_stops_at_size_limit(tmp_path: Path) -> None:
-    import zstandard
-
-    from crosscue.replay.limits import Limits
-    from crosscue.replay.readers.rosbag2.split import unpack
-
-    packed = tmp_path / "a.db3.zstd"
-    tool = zstandard.ZstdCompressor(write_content_size=False)
-    packed.write_bytes(tool.compress(bytes(300 << 20)))
-    fault = unpack(packed, tmp_path / "a.db3", Limits(chunk_bytes=1 << 20))
-
-    assert "the limit (--max-chunk)" in fault
-    assert (tmp_path / "a.db3").stat().st_size < 80 << 20
-
-
 def test_two_types_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
     rows = rows_of(100)
     folder = folder_of_parts(tmp_path / "bag", rows[:50], rows[50:])
@@ -311,28 +206,3 @@ def test_time_range_spans_files(tmp_path: Path) -> None:
     assert by_topic(reading.rows) == by_topic(rows[150:250])
     skipped = sum(a.skipped[NOT_ASKED_TIME] for a in reading.ledger.accounts.values())
     assert skipped == 300
-
-
-def test_temporary_files_are_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = write_folder(tmp_path / "bag", rows_of(100), compression="file")
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(scratch))
-    with open_log(folder) as log:
-        from crosscue.replay.ledger import Ledger
-
-        blocks = log.read(Ledger("a"))
-        next(iter(blocks))
-        assert list(scratch.iterdir())
-        blocks.close()  # type: ignore[attr-defined]
-
-    assert not list(scratch.iterdir())
-
-
-def test_folder_without_readable_storage_file_is_refused(tmp_path: Path) -> None:
-    folder = folder_of_parts(tmp_path / "bag", rows_of(10))
-    (folder / "part_0.db3").write_bytes(b"")
-    (folder / "metadata.yaml").write_text("")
-
-    with pytest.raises(LogError, match="expected at least one readable storage file"):
-        open_log(folder)

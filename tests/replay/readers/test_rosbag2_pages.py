@@ -7,23 +7,19 @@ import random
 import sqlite3
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS
-from crosscue.replay.readers.rosbag2 import db3
 from crosscue.replay.readers.rosbag2.db3 import open_db3
 from crosscue.replay.readers.rosbag2.pages import PageRows, page_rows
 from crosscue.replay.readers.rosbag2.sqlite import open_database
-from support.data import shared
-from support.rosbag_files import by_topic, damaged_copies, read_rows, rows_of, write_folder
+from support.rosbag_files import read_rows
 
 TOPICS = """
 CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
@@ -122,13 +118,6 @@ def test_rows_read_from_pages_equal_sqlite_rows(
     assert rows_in_pages(path) == stored_rows(path)
 
 
-def test_rows_of_real_database_equal_sqlite_rows() -> None:
-    path = shared("bags", "evo", "tf_example", "tf_example.db3")
-
-    assert rows_in_pages(path) == stored_rows(path)
-    assert len(stored_rows(path)) == 518
-
-
 def test_long_payloads_in_scattered_pages_are_complete_and_batches_bounded(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     db = empty(path, 512, 0)
@@ -148,14 +137,6 @@ def test_long_payloads_in_scattered_pages_are_complete_and_batches_bounded(tmp_p
 
     assert [row for lot in lots for row in plain(lot)] == stored_rows(path)
     assert max(len(lot.messages.buffer) for lot in lots) <= 8 << 20
-
-
-def test_payloads_of_unselected_topics_are_not_read(tmp_path: Path) -> None:
-    path = tmp_path / "a.db3"
-    fill(empty(path, 1024, 0), 3, 200, 9000, has_index=True)
-    rows = [(*row[:3], row[3] if row[1] == 1 else b"") for row in stored_rows(path)]
-
-    assert rows_in_pages(path, frozenset({1})) == rows
 
 
 @pytest.mark.parametrize(
@@ -196,64 +177,6 @@ def test_unsupported_table_definition_is_left_to_sqlite(tmp_path: Path, old: str
     assert rows_in_pages(tmp_path / "a.db3") == []
 
 
-def test_row_with_fewer_values_than_columns_is_left_to_sqlite(tmp_path: Path) -> None:
-    path = tmp_path / "a.db3"
-    db = empty(path, 4096, 0)
-    db.executescript(
-        TOPICS + "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, "
-        "timestamp INTEGER); INSERT INTO messages VALUES(1, 1, 5); "
-        "ALTER TABLE messages ADD COLUMN data BLOB DEFAULT x'0102';"
-    )
-    db.close()
-
-    assert rows_in_pages(path) == []
-    assert [row.payload for row in read_rows(path).rows] == [b"\1\2"]
-
-
-def test_write_ahead_log_is_left_to_sqlite(tmp_path: Path) -> None:
-    db = sqlite3.connect(tmp_path / "a.db3", isolation_level=None)
-    db.execute("PRAGMA journal_mode=wal")
-    db.executescript(TOPICS + MESSAGES + "INSERT INTO messages VALUES(1, 1, 5, x'01');")
-
-    assert rows_in_pages(tmp_path / "a.db3") == []
-    assert len(read_rows(tmp_path / "a.db3").rows) == 1
-    db.close()
-
-
-def outcome(path: Path, selection: Selection = EVERYTHING) -> object:
-    """Return all rows and the account of a pass."""
-    try:
-        reading = read_rows(path, selection)
-    except CrosscueError as error:
-        return str(error)
-    ledger = reading.ledger
-    account = ledger.accounts, ledger.notices, ledger.integrity, ledger.is_whole
-    return by_topic(reading.rows), *account
-
-
-@pytest.mark.slow
-def test_damaged_copies_read_like_sqlite_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = next(write_folder(tmp_path / "bag", rows_of(250)).glob("*.db3"))
-    came = []
-
-    def counted(*arguments: Any) -> Iterator[PageRows]:
-        for lot in page_rows(*arguments):
-            came.append(len(lot))
-            yield lot
-
-    for how, copy in damaged_copies(path.read_bytes(), cuts=20, flips=150, seed=77):
-        path.write_bytes(copy)
-        with monkeypatch.context() as patch:
-            patch.setattr(db3, "page_rows", counted)
-            ours = outcome(path)
-        with monkeypatch.context() as patch:
-            patch.setattr(db3, "page_rows", lambda *_: iter(()))
-            assert ours == outcome(path), how
-    assert len(came) > 20
-
-
 @pytest.mark.slow
 def test_malformed_pages_end_reading_without_duplicates(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
@@ -289,17 +212,3 @@ def test_file_truncated_during_reading_is_reported(tmp_path: Path) -> None:
         list(blocks)
 
     assert not ledger.is_whole
-
-
-def test_database_is_locked_for_writing_while_pages_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "a.db3"
-    fill(empty(path, 4096, 0), 9, 150, 3000, has_index=True)
-    writer = sqlite3.connect(path, isolation_level=None, timeout=0)
-    with open_db3(path) as log:
-        blocks = log.read(Ledger("a"))
-        next(blocks)
-        with pytest.raises(sqlite3.OperationalError, match="locked"):
-            writer.execute("DELETE FROM messages")
-        list(blocks)
-        writer.execute("DELETE FROM messages")
-    writer.close()

@@ -153,18 +153,3 @@ def test_action_feedback_is_read_if_its_definition_is_stored(
         assert table.num_rows == ROWS
     with open_log(path) as log:
         assert {topic.name for topic in log.topics} == set(TYPES)
-
-
-def test_message_type_with_event_suffix_is_read_as_data(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        link = writer.add_connection(
-            "/door", "door_msgs/msg/Door_Event", msgdef="string data\n", rihs01="RIHS01_0"
-        )
-        writer.write(link, 10**18, payload("/word", 1))
-
-    status = cli.run(["convert", str(tmp_path / "bag"), "-o", str(tmp_path / "out.mcap"), "--json"])
-
-    assert json.loads(capsys.readouterr().out)["topics"]["/door"]["skipped"] == {}
-    assert status == 0

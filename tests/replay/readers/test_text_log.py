@@ -37,14 +37,3 @@ def test_invalid_line_is_dropped_and_others_are_read(line: str, tmp_path: Path) 
     assert block.rows.columns["x_m"].dtype == np.float64
     account = ledger.topic("/rows")
     assert (account.found, sum(account.dropped.values())) == (2, 1)
-
-
-def test_empty_lines_are_ignored(tmp_path: Path) -> None:
-    path = tmp_path / "log.txt"
-    path.write_text("1 2.0\n\n9 4.0\n  \n")
-    ledger = Ledger("log.txt")
-
-    (block,) = TextLog(path, "text", "/rows", ["x_m"], row_of).read(ledger)
-
-    assert len(block) == 2
-    assert not ledger.topic("/rows").dropped

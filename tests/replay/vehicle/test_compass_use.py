@@ -24,11 +24,3 @@ def test_magnetometer_is_used_if_calibrated_or_requested(compass: Compass, is_us
 
     assert (planned.source_of(Signal.MAGNETIC_FIELD) is not None) == is_used
     assert Vehicle(**vehicle.model_dump()).compass.uses_magnetometer == is_used
-
-
-def test_reason_for_unused_magnetometer_names_topic_and_command() -> None:
-    planned = plan([(0, MAGNETOMETER)], Vehicle(version=1))
-
-    assert (
-        "mag is not calibrated: run crosscue fit compass" in planned.missing[Signal.MAGNETIC_FIELD]
-    )

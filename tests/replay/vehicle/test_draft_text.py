@@ -4,12 +4,11 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.replay.columns import Block, Table, Topic
-from crosscue.replay.vehicle.drafting.camera import CameraMounting, camera_lines
+from crosscue.replay.vehicle.drafting.camera import CameraMounting
 from crosscue.replay.vehicle.drafting.text import _quoted, draft_text, examine
 from support.memory_log import MemoryLog
 
@@ -20,25 +19,6 @@ def test_quoted_name_round_trips_and_is_printable(name: str) -> None:
 
     assert tomllib.loads(f"name = {text}") == {"name": name}
     assert text.isprintable()
-
-
-@pytest.mark.parametrize("size_px", [(1280, 720), (0, 0)])
-def test_image_size_is_drafted_only_if_the_log_records_it(
-    size_px: tuple[int, int],
-) -> None:
-    k = np.array([[900.0, 0.0, 640.0, 0.0, 900.0, 360.0, 0.0, 0.0, 1.0]])
-    columns = {"width_px": np.array([size_px[0]]), "height_px": np.array([size_px[1]]), "k": k}
-    block = Block("/info", np.zeros(1, np.int64), Table(columns))
-    topics = (
-        Topic("/image", "sensor_msgs/msg/Image", "columns"),
-        Topic("/info", "sensor_msgs/msg/CameraInfo", "columns"),
-    )
-
-    lines = camera_lines([MemoryLog(topics, [block])], CameraMounting())
-
-    camera = tomllib.loads("\n".join(lines))["camera"]
-    assert (camera["focal_px"], camera["center_px"]) == (900.0, [640.0, 360.0])
-    assert camera.get("size_px") == (list(size_px) if all(size_px) else None)
 
 
 def speed_log(**columns_of: str) -> MemoryLog:
@@ -75,21 +55,3 @@ def test_table_with_the_speed_of_the_car_becomes_the_odometry() -> None:
     text, topics = drafted(speed_log(b="speed_mps", a="speed_x_mps"))
     assert topics["odometry"] == "a"
     assert 'odometry = "a"  # or: b' in text
-
-
-def test_speed_that_contradicts_gnss_is_listed_and_not_chosen() -> None:
-    text, topics = drafted(speed_log(in_kmph="speed_mps"))
-
-    assert "odometry" not in topics
-    assert "# not chosen: in_kmph: WRONG: contradicts it; 10 Hz, 14.4 to 72.0 m/s" in text
-
-
-def test_table_is_not_searched_where_a_topic_has_wheel_speeds() -> None:
-    log = speed_log(car="speed_mps")
-    wheels = Block("wheels", np.arange(9), Table({"rear_left_mps": np.full(9, 8.0)}))
-    topics = (*log.topics, Topic("wheels", "crosscue/WheelSpeeds", "columns"))
-
-    text, found = drafted(MemoryLog(topics, [*log.blocks, wheels]))
-
-    assert "odometry" not in found
-    assert "vehicle speed" not in text

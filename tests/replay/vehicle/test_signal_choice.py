@@ -118,24 +118,6 @@ def test_sign_of_signal_is_the_consistent_one(sign: int) -> None:
     assert not found.steering[0].verdict.wrong
 
 
-def test_unsigned_steering_angle_is_rejected() -> None:
-    steering = np.abs(np.arctan(2.7 * YAW_RATE / SPEED) * 15.0)
-    found = choices_among(
-        *wheels("ABS", SPEED, YAW_RATE), candidate_signal(SignalKind.STEERING, "A.ANGLE", steering)
-    )
-
-    assert "does not follow" in found.steering[0].verdict.wrong[0]
-
-
-def test_wheel_speeds_that_contradict_gnss_are_rejected() -> None:
-    found = choices_among(*wheels("OLD", SPEED, YAW_RATE, 1.6), *wheels("ABS", SPEED, YAW_RATE))
-
-    best, other = found.wheels
-    assert best.wheels["rear_left"].name == "ABS.rear_left"
-    assert not best.verdict.wrong
-    assert other.verdict.wrong == ("contradicts it",)
-
-
 def test_wheel_radius_is_estimated_from_angular_speeds() -> None:
     turning = [
         (replace(one, unit="rad/s"), replace(series, values=series.values / 0.31))
@@ -145,18 +127,6 @@ def test_wheel_radius_is_estimated_from_angular_speeds() -> None:
 
     assert best.radius_m == pytest.approx(0.31, rel=0.01)
     assert not best.verdict.wrong
-
-
-def test_yaw_rate_sign_is_undetermined_on_straight_road() -> None:
-    rng = np.random.default_rng(2)
-    found = choices_among(
-        *wheels("ABS", SPEED, STRAIGHT),
-        candidate_signal(SignalKind.YAW_RATE, "A.YAW", 0.001 * rng.standard_normal(len(T_S))),
-        yaw_rate=STRAIGHT,
-    )
-
-    assert found.yaw_rates[0].verdict.agrees_with == 0
-    assert not found.yaw_rates[0].verdict.wrong
 
 
 def test_signs_are_undetermined_without_wheels_and_gnss() -> None:

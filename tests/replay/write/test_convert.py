@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import subprocess
-import sys
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
@@ -23,11 +21,9 @@ from rosbags.highlevel import AnyReader
 
 from crosscue.eval.cli import run as crosscue
 from crosscue.replay.columns import Block, CanFrames, Messages, Topic
-from crosscue.replay.encode.copy_ranges import copy_ranges
 from crosscue.replay.errors import OutputError
 from crosscue.replay.files.partial_file import PartialFile
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.logs.opening import open_log
 from crosscue.replay.write.convert import BAD_SCHEMA, NO_TYPE, TOO_EARLY, LogWriter
 from crosscue.replay.write.mcap import ChannelMessages, Compression, McapWriter
 from support.data import shared
@@ -99,45 +95,6 @@ def test_each_message_is_stored_once_in_topic_order(
         assert summary.statistics.message_end_time == max(t for _, t, _, _, _ in stored)
 
 
-def test_topics_are_merged_by_log_time(tmp_path: Path) -> None:
-    path = tmp_path / "o.mcap"
-    with McapWriter(path) as writer:
-        for name, times in (("/a", [1, 4, 9]), ("/b", [2, 3, 8]), ("/c", [5, 0, 6])):
-            channel = writer.add_channel(name, "std_msgs/msg/Float64", SCHEMA)
-            writer.write(stretch_of(channel, times, [b"x"] * 3))
-
-    assert [(name, t) for name, t, *_ in messages_in_file_order(path)] == [
-        ("/a", 1),
-        ("/b", 2),
-        ("/b", 3),
-        ("/a", 4),
-        ("/c", 5),
-        ("/c", 0),
-        ("/c", 6),
-        ("/b", 8),
-        ("/a", 9),
-    ]
-
-
-def test_publish_time_and_sequence_are_kept(tmp_path: Path) -> None:
-    path = tmp_path / "o.mcap"
-    with McapWriter(path) as writer:
-        writer.add_channel("/none", "std_msgs/msg/Float64", SCHEMA)
-        channel = writer.add_channel("/a", "std_msgs/msg/Float64", SCHEMA)
-        writer.write(stretch_of(channel, [5, 6], [b"x", b"yy"]))
-
-    assert messages_in_file_order(path) == [("/a", 5, 7, 2000, b"x"), ("/a", 6, 8, 2001, b"yy")]
-
-
-def test_file_without_messages_is_valid(tmp_path: Path) -> None:
-    path = tmp_path / "o.mcap"
-    with McapWriter(path) as writer:
-        writer.add_channel("/a", "std_msgs/msg/Float64", SCHEMA)
-
-    assert messages_in_file_order(path) == []
-    assert messages_by_index(path) == []
-
-
 class FailingFile:
     """File whose writes fail with a full disk from the nth one on."""
 
@@ -184,20 +141,6 @@ def test_full_disk_leaves_no_file_and_one_line_error(
         _write_with_failure(tmp_path / "other.mcap", 3, monkeypatch)
 
 
-def _write_and_raise(path: Path) -> None:
-    with McapWriter(path) as writer:
-        channel = writer.add_channel("/a", "std_msgs/msg/Float64", SCHEMA)
-        writer.write(stretch_of(channel, [1], [b"x"]))
-        raise RuntimeError("stop")
-
-
-def test_error_while_writing_leaves_no_file(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="stop"):
-        _write_and_raise(tmp_path / "o.mcap")
-
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_existing_files_and_folders_are_not_changed(tmp_path: Path) -> None:
     (tmp_path / "there.mcap").write_bytes(b"mine")
     (tmp_path / "folder.mcap").mkdir()
@@ -209,25 +152,6 @@ def test_existing_files_and_folders_are_not_changed(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"there\.mcap"):
         McapWriter(tmp_path / "there.mcap" / "below.mcap")
     assert (tmp_path / "there.mcap").read_bytes() == b"mine"
-
-
-@pytest.mark.parametrize("lengths", [[3] * 9, [0, 1, 2, 0, 5], list(range(90)), [5000, 0, 9000]])
-def test_copy_ranges_copies_each_range(lengths: list[int]) -> None:
-    rng = np.random.default_rng(0)
-    source = rng.integers(0, 256, sum(lengths) + 64, dtype=np.uint8)
-    length = np.array(lengths, np.int64)
-    start = np.cumsum(length) - length
-    order = rng.permutation(len(lengths))
-    put = np.empty_like(start)
-    put[order] = np.cumsum(length[order]) - length[order]
-    target = np.zeros(sum(lengths), np.uint8)
-
-    copy_ranges(target, put, source, start, length)
-
-    for i, size in enumerate(lengths):
-        np.testing.assert_array_equal(
-            target[put[i] : put[i] + size], source[start[i] : start[i] + size]
-        )
 
 
 def write_source(path: Path, compression: CompressionType = CompressionType.ZSTD) -> None:
@@ -276,30 +200,6 @@ def test_ros2_messages_are_copied_exactly_and_others_counted(
         assert (
             sum(1 for c, _, raw in reader.messages() if reader.deserialize(raw, c.msgtype)) == 120
         )
-
-
-def test_convert_is_deterministic_and_idempotent(tmp_path: Path) -> None:
-    source = tmp_path / "in.mcap"
-    write_source(source)
-    outs = [tmp_path / f"{k}.mcap" for k in range(3)]
-    for out in outs:
-        assert crosscue(["convert", str(source), "-o", str(out), "-q"]) == 3
-    again = tmp_path / "again.mcap"
-    assert crosscue(["convert", str(outs[0]), "-o", str(again), "-q"]) == 0
-
-    assert len({out.read_bytes() for out in outs}) == 1
-    assert again.read_bytes() == outs[0].read_bytes()
-
-
-@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
-def test_every_compression_round_trips(tmp_path: Path, compression: str) -> None:
-    source, out = tmp_path / "in.mcap", tmp_path / "out.mcap"
-    write_source(source, CompressionType.LZ4)
-
-    crosscue(["convert", str(source), "-o", str(out), "--compression", compression, "-q"])
-
-    kept = [row for row in messages_in_file_order(source) if row[0] in ("/imu", "/s")]
-    assert sorted(messages_in_file_order(out)) == sorted(kept)
 
 
 def test_from_to_and_topics_select_messages(
@@ -427,53 +327,3 @@ def _as_text(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ", ".join(map(_as_text, value)) + "]"
     return repr(value.tolist()) if isinstance(value, np.ndarray) else repr(value)
-
-
-@pytest.mark.slow
-def test_real_comma2k19_segment_keeps_every_row(tmp_path: Path) -> None:
-    segment = shared("comma2k19", "Example_1", "b0c9d2329ad1606b_2018-08-02--08-34-47", "40")
-    out = tmp_path / "out.mcap"
-
-    crosscue(["convert", str(segment), "-o", str(out), "-q"])
-
-    before, after = Ledger("in"), Ledger("out")
-    with open_log(segment) as log, open_log(out) as copy:
-        source = list(log.read(before))
-        copied = list(copy.read(after))
-    assert {n: a.used for n, a in before.accounts.items() if a.used} == {
-        n: a.used for n, a in after.accounts.items()
-    }
-    assert sum(map(len, source)) == sum(map(len, copied)) > 190_000
-
-
-@pytest.mark.slow
-def test_rerun_imports_converted_file(tmp_path: Path) -> None:
-    source, out, rrd = tmp_path / "in.mcap", tmp_path / "out.mcap", tmp_path / "x.rrd"
-    write_source(source)
-    crosscue(["convert", str(source), "-o", str(out), "-q"])
-    code = (
-        "import sys, rerun as rr; rr.init('made', spawn=False); rr.save(sys.argv[2]); "
-        "rr.log_file_from_path(sys.argv[1]); rr.disconnect()"
-    )
-    environment = {**os.environ, "RERUN_ANALYTICS": "0"}
-
-    made = subprocess.run(
-        [sys.executable, "-c", code, str(out), str(rrd)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env=environment,
-        check=True,
-    )
-    stats = subprocess.run(
-        [sys.executable, "-m", "rerun", "rrd", "stats", str(rrd)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env=environment,
-        check=True,
-    )
-
-    assert "ERROR" not in made.stderr
-    (rows,) = [line for line in stats.stdout.splitlines() if line.startswith("num_rows = ")]
-    assert int(rows.split("=")[1].replace(" ", "").replace("\u2009", "")) >= 120

@@ -51,19 +51,6 @@ def test_convert_writes_readable_messages_and_exits_with_3(
     assert read.count() == 598
 
 
-def test_salvage_reports_damaged_byte_ranges(
-    damaged: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, _ = damaged
-
-    crosscue(["convert", str(path), "-o", str(tmp_path / "out.mcap"), "--salvage", "--json"])
-
-    account = json.loads(capsys.readouterr().out)
-    assert not account["is_whole"]
-    assert any(re.search(r"bytes \d+ to \d+", one["detail"]) for one in account["details"])
-    assert account["written"]["/a"]["messages"] == 598
-
-
 def test_damaged_rosbag1_is_salvaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = write_bag(tmp_path / "a.bag", rows_of(600), "bz2")
     content = bytearray(path.read_bytes())
@@ -87,13 +74,6 @@ def test_damaged_rosbag1_is_salvaged(tmp_path: Path, capsys: pytest.CaptureFixtu
         )
         == readable
     )
-
-
-def test_info_of_damaged_log_suggests_salvage(
-    damaged: tuple[Path, int], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert crosscue(["info", str(damaged[0])]) == 3
-    assert "convert LOG -o OUT.mcap --salvage" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("command", ["info", "convert"])

@@ -11,7 +11,7 @@ import pytest
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
-from crosscue.eval.scoring.boxes.matching import ALL, NOBODY, OVERLAPS, SIZES, LabelledBoxes, match
+from crosscue.eval.scoring.boxes.matching import ALL, OVERLAPS, SIZES, LabelledBoxes, match
 from crosscue.eval.scoring.boxes.reliability import class_calibration
 from crosscue.eval.scoring.boxes.scores import (
     IntervalEstimate,
@@ -139,26 +139,6 @@ def test_precision_recall_and_ap50_computed_by_hand() -> None:
     assert (all_.precision.value, all_.recall.value) == (0.5, 0.5)
 
 
-def test_ignored_labels_count_neither_as_missed_nor_as_false() -> None:
-    truth = boxes((0, 0, UNIT), (0, NOBODY, AWAY), ignored=(1,))
-    inside = (210.0, 210.0, 230.0, 230.0)
-    found = boxes((0, 0, UNIT), (0, 0, inside), (0, 0, AWAY), scores=[0.9, 0.8, 0.7])
-
-    _, all_, *_ = score_parts(truth, found, ("car",), {"car": 0.5}, np.arange(1))
-
-    assert (all_.labels, all_.right, all_.wrong) == (1, 1, 0)
-
-
-def test_duplicate_detection_of_label_is_false() -> None:
-    truth = boxes((0, 0, UNIT))
-    found = boxes((0, 0, UNIT), (0, 0, UNIT), scores=[0.9, 0.8])
-
-    matched = match(truth, found, 0)
-
-    assert matched.is_right[0].tolist() == [True, False]
-    assert matched.is_wrong[0].tolist() == [False, True]
-
-
 def test_labels_are_binned_by_true_and_false_detections_by_estimated_range() -> None:
     truth = boxes((0, 0, UNIT), (0, 0, AWAY), range_m=[10.0, 50.0])
     low = (400.0, 0.0, 440.0, 40.0)
@@ -170,15 +150,6 @@ def test_labels_are_binned_by_true_and_false_detections_by_estimated_range() -> 
     assert by_part["0 to 20 m"] == (1, 1, 0)
     assert by_part["40 to 60 m"] == (1, 0, 1)
     assert "20 to 40 m" not in by_part
-
-
-def test_bootstrap_requires_enough_blocks_and_is_reproducible() -> None:
-    assert drawn(np.array([0, 0, 1, 1]), 0) is None
-    first, again = (drawn(np.repeat(np.arange(6), 2), 3) for _ in range(2))
-    assert first is not None
-    np.testing.assert_array_equal(first, again)
-    # Pictures of one block are resampled together.
-    np.testing.assert_array_equal(first[:, 0], first[:, 1])
 
 
 def _blocks_of_pictures(
