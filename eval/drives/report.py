@@ -53,7 +53,7 @@ def report(
 
     Args:
         run: Run folder.
-        output: The page (default: report.html in the run folder, replaced if it exists).
+        output: The page (default: report.html in the run, replaced if it exists).
         threshold: Probability above which a feature is believed.
         overwrite: Replace an existing file.
 

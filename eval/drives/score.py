@@ -23,6 +23,7 @@ from crosscue.eval.scoring.runs import (
     judge_run,
     metrics_of,
     pooled_scores,
+    remember_truth,
     smoothed_ranges,
 )
 from crosscue.replay.errors import CrosscueError, UsageError
@@ -69,7 +70,7 @@ class ScoreWork:
     """Scoring of one run, in this process or in another.
 
     Attributes:
-        truth: The truth of all runs; None for the truth next to each run's log.
+        truth: The truth of all runs; None for that of each run's last score, or next to its log.
         settings: Settings of the scores.
         rpe_m: Distances of the relative pose error.
         has_smoother: True to also run the batch smoother.
@@ -109,6 +110,7 @@ class ScoreWork:
             report = write_files(
                 folder.file(FOLDER), [one], scores, metrics, has_figures=self.has_figures
             )
+            remember_truth(folder, truth_path, any_log=self.any_log)
         return Scored(one, metrics, report, smoothed)
 
     def attempt(self, path: Path) -> Scored | Failed:
@@ -229,7 +231,7 @@ def score_run(
 
     Args:
         run: A finished run.
-        truth: Its truth; None for the ``truth.json`` next to its log.
+        truth: Its truth; None for that of its last score, or the ``truth.json`` next to its log.
         threshold: Probability above which a feature counts as detected.
         detection: ``confirmed``: a detection counts when three frames confirm it and its range is
             within its 95 % interval; ``published``: from the first frame, with any range.

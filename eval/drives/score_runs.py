@@ -172,7 +172,8 @@ class ScoringSettings:
     """Settings of the scores of runs.
 
     Attributes:
-        truth: Truth of all runs (default: truth.json next to each run's log).
+        truth: Truth of all runs (default: that of each run's last score, or truth.json next to
+            its log).
         output: Folder for metrics, report and junit.xml, pooled over all runs.
         gates: File with bounds on metrics; the exit status is 1 when one is violated.
         threshold: Probability above which a feature counts as detected.
@@ -243,8 +244,7 @@ def score_runs(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> S
 
     Metrics and figures of each run are written to RUN/score. Several runs (folders, a folder of
     runs, a quoted pattern, @list.txt) are also scored together, and the pooled result is written to
-    the folder of -o. A run that cannot be scored does not stop the rest. Without --truth, each
-    run's truth is the truth.json next to its log.
+    the folder of -o. A run that cannot be scored does not stop the rest.
 
     A gate file (TOML) sets bounds on metrics. The exit status is 1 when a gate fails::
 

@@ -14,7 +14,7 @@ from crosscue.eval.failures.order import CauseGroup, cause_groups, diverse, rank
 from crosscue.eval.failures.record import Failure, failure_table, write_failures
 from crosscue.eval.failures.record import read_failures as read_table
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.scoring.runs import find_truth, judge_scene
+from crosscue.eval.scoring.runs import find_truth, judge_scene, remembered_truth
 from crosscue.replay.errors import CrosscueError, EmptyResultError, OutputError, UsageError
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
@@ -113,10 +113,12 @@ class FindWork:
         try:
             run = open_run(path)
             try:
-                truth = find_truth(run, self.truth)
+                known = remembered_truth(run) if self.truth is None else None
+                truth = find_truth(run, self.truth) if known is None else known.path
             except UsageError:
                 return failures_without_truth(run, self.threshold), False
-            scene = judge_scene(run, truth, any_log=self.any_log)
+            any_log = self.any_log or (known is not None and known.any_log)
+            scene = judge_scene(run, truth, any_log=any_log)
             return failures_beside_truth(run, scene, self.threshold), True
         except CrosscueError as error:
             return error
@@ -127,7 +129,8 @@ class FailureSettings:
     """Settings of a search for failures.
 
     Attributes:
-        truth: Truth of all runs (default: truth.json next to each run's log).
+        truth: Truth of all runs (default: that of each run's last score, or truth.json next to
+            its log).
         any_log: Accept truth made for another file of the same drive, such as a converted log.
         top: Only N failures, from as many causes and runs as possible (default: all).
         threshold: Probability above which a feature counts as believed.

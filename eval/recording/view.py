@@ -41,7 +41,7 @@ def save_recording(
     Args:
         run: A finished run.
         output: File to write, whose name ends in ``.rrd``; default: ``drive.rrd`` in the run.
-        truth: Truth file, to also draw the true track and ranges.
+        truth: Truth file, to also draw the true track and ranges (default: that of the last score).
         at: Record only from 2 s before this moment to 4 s after it, and mark it: seconds from the
             run's first frame, or nanoseconds as ``17...ns``.
         approach: Record only this approach, by its number in ``belief.parquet``.
@@ -58,6 +58,7 @@ def save_recording(
     """
     from crosscue.eval.recording import save_rrd
     from crosscue.eval.scoring.pose.score import truth_track
+    from crosscue.eval.scoring.runs import remembered_truth
     from crosscue.eval.scoring.truth import read_scored_truth as load_truth
 
     folder = run_given(run).folder
@@ -66,6 +67,8 @@ def save_recording(
         raise UsageError(f"{path}: expected a name that ends in .rrd")
     part = _part(folder, at, approach, only)
     track = ranges = None
+    scored = remembered_truth(folder) if truth is None else None
+    truth = truth if scored is None else scored.path
     if truth is not None:
         known = load_truth(Path(truth), str(folder.path))
         ranges = known.ranges
@@ -166,7 +169,7 @@ def view(
         at: Seconds from the run's first frame, or a time (17...ns).
         approach: Number of an approach in belief.parquet.
         only: Comma-separated views, such as cameras,belief.
-        truth: Truth file, to also draw the true track and ranges.
+        truth: Truth file, to also draw the true track and ranges (default: that of the last score).
         overwrite: Replace an existing recording.
     """
     if output is not None and output.exists() and not overwrite:

@@ -24,7 +24,9 @@ from crosscue.eval.runs.logs import log_location
 from crosscue.eval.runs.manifest import LogRow
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.replay.errors import RunError, SchemaError, UsageError
-from crosscue.replay.files.tree_text import spelled
+from crosscue.replay.files import door
+from crosscue.replay.files.tree_text import json_tree, spelled, strict_json
+from crosscue.replay.files.whole_file import file_sha256, write_text
 from crosscue.replay.remote.address import is_remote
 
 from . import intervals
@@ -46,6 +48,8 @@ from .pose.score import PoseScore, ScoredPoses
 from .run_tables import in_log_time
 from .truth import DriveTruth
 
+# Truth with which a run was scored.
+TRUTH_FILE: Final = "score/truth_file.json"
 # Tables of a run that are scored.
 TABLES: Final = ("frames", "cues", "range", "belief")
 # Tolerance for approaches outside the run, because clocks and last pictures differ a little.
@@ -75,6 +79,13 @@ class RunScored:
     why_no_pose: str
 
 
+class RememberedTruth(NamedTuple):
+    """Truth with which a run was scored, and whether it may be that of another file."""
+
+    path: Path
+    any_log: bool
+
+
 class SceneJudged(NamedTuple):
     """Comparison of a run with its truth, without the pose."""
 
@@ -83,7 +94,7 @@ class SceneJudged(NamedTuple):
 
 
 def find_truth(run: RunFolder, given: Path | None) -> Path:
-    """Return the given truth file, or the one next to (or in) a log of the run.
+    """Return the given truth file, the one of the last score, or the one next to (or in) a log.
 
     Raises:
         UsageError: No truth file is given, and none exists.
@@ -91,6 +102,9 @@ def find_truth(run: RunFolder, given: Path | None) -> Path:
     """
     if given is not None:
         return given
+    known = _remembered(run)
+    if known is not None:
+        return known[0].path
     folders: list[str] = []
     for log in run.drive_manifest().logs:
         if is_remote(log.path):
@@ -103,6 +117,45 @@ def find_truth(run: RunFolder, given: Path | None) -> Path:
     raise UsageError(
         f"{run.path}: no {FILE} next to its logs ({', '.join(folders)}); name it with --truth"
     )
+
+
+def remember_truth(run: RunFolder, truth_path: Path, *, any_log: bool) -> None:
+    """Record with which truth a run was scored, for the commands that look at it afterwards.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    tree = {"path": run.relative(truth_path), "sha256": file_sha256(truth_path), "any_log": any_log}
+    write_text(run.file(TRUTH_FILE), strict_json(tree) + "\n")
+
+
+def remembered_truth(run: RunFolder) -> RememberedTruth | None:
+    """Return the truth with which a run was last scored; None if it was not, or the file is gone.
+
+    Raises:
+        SchemaError: The truth has changed since.
+    """
+    found = _remembered(run)
+    if found is None:
+        return None
+    truth, sha256 = found
+    if file_sha256(truth.path) != sha256:
+        raise SchemaError(
+            f"{truth.path}: changed since {run.path} was scored with it; score it again, or name a "
+            "truth with --truth"
+        )
+    return truth
+
+
+def _remembered(run: RunFolder) -> tuple[RememberedTruth, str] | None:
+    """Return the truth of the last score with the hash that it had, if its file is still there."""
+    try:
+        tree = json_tree(door.read(run.file(TRUTH_FILE)))
+        truth = RememberedTruth(run.absolute(tree["path"]), bool(tree["any_log"]))
+        sha256 = str(tree["sha256"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return (truth, sha256) if truth.path.is_file() else None
 
 
 def _place(run: RunFolder, log: LogRow) -> Path:
