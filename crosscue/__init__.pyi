@@ -14,7 +14,6 @@ from crosscue.detectors.base import nothing_found as nothing_found
 from crosscue.detectors.box_detector import BoxDetector as BoxDetector
 from crosscue.detectors.catalog.cards import CardCheck as CardCheck
 from crosscue.detectors.catalog.cards import CardDraft as CardDraft
-from crosscue.detectors.catalog.cards import check_card as check_card
 from crosscue.detectors.catalog.cards import draft_card as draft_card
 from crosscue.detectors.catalog.known_models import FetchedModel as FetchedModel
 from crosscue.detectors.catalog.known_models import Model as Model
@@ -39,6 +38,8 @@ from crosscue.eval.catalog.decoded_logs import decode as decode
 from crosscue.eval.catalog.history import History as History
 from crosscue.eval.catalog.query.catalog import Catalog as Catalog
 from crosscue.eval.catalog.query.catalog import catalog as catalog
+from crosscue.eval.check import Checks as Checks
+from crosscue.eval.check import check as check
 from crosscue.eval.drives.demo import Demo as Demo
 from crosscue.eval.drives.demo import KnownDrive as KnownDrive
 from crosscue.eval.drives.demo import demo as demo
@@ -77,7 +78,6 @@ from crosscue.eval.fit.odometry import fit_odometry as fit_odometry
 from crosscue.eval.fit.ranges.fit import fit_ranges as fit_ranges
 from crosscue.eval.fit.signs.threshold import fit_signs as fit_signs
 from crosscue.eval.fit.temporal import fit_temporal as fit_temporal
-from crosscue.eval.fit.truth_check import check_truth as check_truth
 from crosscue.eval.fleet.compare import compare_many as compare_many
 from crosscue.eval.fleet.compare import compare_runs as compare_runs
 from crosscue.eval.fleet.history import history as history
@@ -124,7 +124,6 @@ from crosscue.eval.training.mask_rcnn import train_mask_rcnn as train_mask_rcnn
 from crosscue.eval.training.road import RoadTrainingSettings as RoadTrainingSettings
 from crosscue.eval.training.road import train_road as train_road
 from crosscue.eval.vehicle.draft import draft_vehicle as draft_vehicle
-from crosscue.eval.vehicle.drive_check import check_vehicle as check_vehicle
 from crosscue.replay.errors import AccountError as AccountError
 from crosscue.replay.errors import AnnotationError as AnnotationError
 from crosscue.replay.errors import CanDatabaseError as CanDatabaseError

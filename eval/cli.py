@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
 COMMANDS: Final[dict[str, str | tuple[str, str]]] = {
     "info": "eval.logs.summary:info",
+    "check": "eval.check:check",
     "convert": "eval.logs.convert:convert",
     "seal": "eval.logs.seals:seal",
     "vehicle init": "eval.vehicle.draft:draft_vehicle",
-    "vehicle check": "eval.vehicle.drive_check:check_vehicle",
     "decode": "eval.catalog.decoded_logs:decode",
     "detect": "eval.drives.replay:detect_drive",
     "estimate": "eval.drives.replay:estimate_run",
@@ -60,7 +60,6 @@ COMMANDS: Final[dict[str, str | tuple[str, str]]] = {
     "model show": "detectors.catalog.known_models:model",
     "model fetch": "detectors.catalog.known_models:fetch_models",
     "model init": "detectors.catalog.cards:draft_card",
-    "model check": "detectors.catalog.cards:check_card",
     "fit compass": "eval.fit.compass:fit_compass",
     "fit odometry": "eval.fit.odometry:fit_odometry",
     "fit signs": "eval.fit.signs.threshold:fit_signs",
@@ -75,7 +74,6 @@ COMMANDS: Final[dict[str, str | tuple[str, str]]] = {
     "truth": "datasets.truth.carried:write_truth",
     "truth from-gnss": "eval.fit.gnss_truth:truth_from_gnss",
     "truth import": "eval.failures.imported_truth:import_truth",
-    "truth check": "eval.fit.truth_check:check_truth",
     "run schema": "eval.schemas:run",
     "truth schema": "eval.schemas:truth",
     "simulate": "datasets.simulate:simulate_approaches",
@@ -91,6 +89,14 @@ COMMANDS: Final[dict[str, str | tuple[str, str]]] = {
     "demo": "eval.drives.demo:demo",
     "plugins": "detectors.plugins:plugins",
     "completion": "eval.completion:completion",
+}
+
+# Former commands, and what replaces them.
+MOVED: Final = {
+    "vehicle check": "check V.toml LOG",
+    "truth check": "check T.json LOG",
+    "model check": "check MODEL",
+    "seal --check": "check LOG",
 }
 
 EXIT_STATUS: Final = """\
@@ -226,6 +232,10 @@ def run(argv: Sequence[str]) -> int:
     if argv[0] == "--version":
         print(f"crosscue {installed('crosscue')}")
         return 0
+    for former, now in MOVED.items():
+        if former.split() == list(argv[:2]):
+            print(f"crosscue: {former}: is now 'crosscue {now}'", file=sys.stderr)
+            return 2
     name = _command_of(argv)
     if name is None:
         return _unknown(argv)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
 import numpy as np
 
@@ -21,10 +21,9 @@ from crosscue.datasets.truth.tum import read_tum
 from crosscue.eval.scoring import truth as score_truth
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.files.whole_file import sha256_of
-from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import Result
-from crosscue.verb import Option
 
 from .log_images import LogSpan, log_pictures, log_span
 
@@ -48,6 +47,7 @@ class TruthFit(Result):
         outside: Number of approaches and cues outside the log's stamps; above 0 only if the log's
             clock was set back.
         is_checked_by_hash: True if the truth names the log's hash.
+        log: The log; None if the truth was checked without one.
     """
 
     seconds: float
@@ -60,6 +60,7 @@ class TruthFit(Result):
     poses: int
     outside: int
     is_checked_by_hash: bool
+    log: Path | None
 
     def lines(self) -> Iterator[str]:
         """Yield what the truth contains, and what of it was not checked."""
@@ -69,6 +70,9 @@ class TruthFit(Result):
         if self.outside:
             text = "of them reach beyond the log, whose clock was set back"
             yield f"outside    {self.outside} {text}"
+        if self.log is None:
+            yield "log        not compared: name the log, too"
+            return
         if self.moments:
             met = f"{self.moments_with_frame} of {self.moments}"
             yield f"moments    {met} meet a picture of the log"
@@ -78,23 +82,20 @@ class TruthFit(Result):
 
 def check_truth(
     truth: Path | str,
-    log: Annotated[Path | str, Option("--log")],
+    log: Path | str | None = None,
     vehicle: Vehicle | Path | str | None = None,
     *,
-    limits: LimitsGiven = DEFAULT_LIMITS,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> TruthFit:
-    """Check a truth file against its log.
+    """Check a truth file, against its log if that is named.
 
     All files that it names are checked, too. The check fails for times outside the log, unknown
     cues or classes, overlapping approaches, boxes outside the picture, pictures of another size,
     and the hash of another log.
 
-    Examples:
-        crosscue truth check truth.json --log drive.mcap
-
     Args:
         truth: Truth file, or its folder.
-        log: Log that the truth belongs to.
+        log: Log that the truth belongs to; None to check the files of the truth alone.
         vehicle: Vehicle file: camera topic, if the log has several cameras.
         limits: Limits for reading the log.
 
@@ -102,16 +103,12 @@ def check_truth(
         SchemaError: The truth does not fit the log; the first error found is reported.
         LogError: The log or the track cannot be read.
     """
-    path, log_path, settings = Path(truth), Path(log), vehicle_given(vehicle)
+    path, log_path = Path(truth), None if log is None else Path(log)
     drive = score_truth.read_scored_truth(path, str(log_path))
     known = drive.truth
     folder = path if path.is_dir() else path.parent
-    has_hash = bool(known.log_sha256)
-    if has_hash and not set(known.log_sha256.values()) & set(sha256_of(log_path).values()):
-        raise SchemaError(
-            f"{path}: belongs to {known.log or 'another log'} by its hash, not to {log_path}"
-        )
-    outside = _check_times(known, log_span(log_path, limits), path, log_path)
+    has_hash = bool(known.log_sha256) and log_path is not None
+    outside = 0 if log_path is None else _check_log(known, path, log_path, limits)
     poses = 0
     if known.pose is not None:
         track = read_tum(folder / known.pose)
@@ -119,13 +116,12 @@ def check_truth(
         _check_overlap(f"{folder / known.pose}: track", track.t_ns, known, path)
     moments = np.array([one.t_ns for one in known.cues if one.t_ns is not None], np.int64)
     pictures, objects = None, 0
-    if len(moments) or known.objects is not None:
-        pictures = log_pictures(log_path, settings, limits)
+    if log_path is not None and (len(moments) or known.objects is not None):
+        pictures = log_pictures(log_path, vehicle_given(vehicle), limits)
     if known.objects is not None:
-        assert pictures is not None
         objects = _check_objects(folder / known.objects, pictures, known.own_cues)
     matched = 0 if pictures is None else int(np.isin(moments, pictures.t_ns).sum())
-    if len(moments) and not matched:
+    if len(moments) and pictures is not None and not matched:
         raise SchemaError(
             f"{path}: cues: {log_path} has no picture at any of {len(moments)} moments; the times "
             "are of another log or clock"
@@ -142,7 +138,18 @@ def check_truth(
         poses,
         outside,
         has_hash,
+        log_path,
     )
+
+
+def _check_log(truth: Truth, path: Path, log_path: Path, limits: Limits) -> int:
+    """Refuse truth of another log by its hash or times; return the number of parts outside it."""
+    wanted = set(truth.log_sha256.values())
+    if wanted and not wanted & set(sha256_of(log_path).values()):
+        raise SchemaError(
+            f"{path}: belongs to {truth.log or 'another log'} by its hash, not to {log_path}"
+        )
+    return _check_times(truth, log_span(log_path, limits), path, log_path)
 
 
 def _check_times(truth: Truth, span: LogSpan, path: Path, log_path: Path) -> int:
@@ -185,9 +192,10 @@ def _check_overlap(what: str, t_ns: np.typing.NDArray[np.int64], truth: Truth, p
         )
 
 
-def _check_objects(path: Path, pictures: LogPictures, own_cues: Sequence[str]) -> int:
+def _check_objects(path: Path, pictures: LogPictures | None, own_cues: Sequence[str]) -> int:
     annotations = read_coco(path)
     cues_by_label(annotations, {}, own_cues, any_thing=True)
-    match_frames(annotations, pictures)
+    if pictures is not None:
+        match_frames(annotations, pictures)
     check_boxes(annotations)
     return sum(len(picture.things) for picture in annotations.pictures)

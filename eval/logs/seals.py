@@ -1,4 +1,4 @@
-"""Write and verify seals of logs."""
+"""Seal logs, and compare logs with their seals."""
 
 from __future__ import annotations
 
@@ -108,57 +108,44 @@ class SealCheck(Result):
             yield f"and {len(self.spans) - SHOWN} more; --json lists them"
 
 
-class Seals(Listing[Sealed | SealCheck]):
+class Seals(Listing[Sealed]):
     """Logs and their seals; its repr is a table."""
 
     head = ("log", "seal", "blocks", "state")
     root = "logs"
     is_printed_in_parts = True
 
-    @property
-    def exit_status(self) -> int:
-        """3 when a log differs from its seal, else 0."""
-        return max((one.exit_status for one in self), default=0)
-
-    def cells(self, row: Sealed | SealCheck) -> tuple[object, ...]:
+    def cells(self, row: Sealed) -> tuple[object, ...]:
         """Return the cells of a row."""
-        if isinstance(row, Sealed):
-            state = "written" if row.is_new else "unchanged"
-        else:
-            state = "matches" if row.is_whole else "differs"
-        return (row.log, row.seal.name, row.blocks, state)
+        return (row.log, row.seal.name, row.blocks, "written" if row.is_new else "unchanged")
 
 
-def seal(*logs: str | Path, check: bool = False, overwrite: bool = False) -> Seals:
-    """Write a checksum of each MiB beside a log, or verify a log with it.
+def seal(*logs: str | Path, overwrite: bool = False) -> Seals:
+    """Write a checksum of each MiB beside a log.
 
     ROS 1 bags, .db3, candump, ASC and TRC logs, videos and .npy data sets contain no checksum, so a
     flipped payload byte goes unnoticed. Seal a log once it is known to be good. Every later command
     verifies the parts of the log that it reads, and reports damaged byte ranges. A seal that no
-    longer matches its log is replaced only with --overwrite; run --check first. URLs cannot be
-    sealed.
+    longer matches its log is replaced only with --overwrite; run crosscue check LOG first, which
+    verifies the entire log. URLs cannot be sealed.
 
     Examples:
         crosscue seal drive.bag can0.log        writes drive.bag.seal and can0.log.seal
-        crosscue seal --check drive.bag         verifies the entire log
         crosscue seal segment/                  writes segment.seal, for all files of the folder
 
     Args:
         logs: Recordings on this machine, files or folders.
-        check: Verify against the seal.
         overwrite: Replace a seal that does not match the log.
 
     Raises:
         UsageError: A log is a URL or a seal; nothing is sealed.
         LogError: A log cannot be read, or its seal is damaged.
         OutputError: A log differs from its seal, or the seal cannot be written.
-        CrosscueError: A log has no seal to check.
     """
     rows = []
     for log in [_place(log) for log in logs]:
-        row = _checked(log) if check else _sealed(log, overwrite=overwrite)
-        rows.append(row)
-        emit(row)
+        rows.append(_sealed(log, overwrite=overwrite))
+        emit(rows[-1])
     return Seals(rows)
 
 
@@ -182,7 +169,15 @@ def _place(name: str | Path) -> Path:
     return log
 
 
-def _checked(log: Path) -> SealCheck:
+def check_seal(name: Path | str) -> SealCheck:
+    """Compare a whole log with its seal.
+
+    Raises:
+        UsageError: The log is a URL or a seal.
+        LogError: The log cannot be read, or its seal is damaged.
+        CrosscueError: The log has no seal to check.
+    """
+    log = _place(name)
     found = seal_over(log)
     if found is None:
         name = seal_path(log).name

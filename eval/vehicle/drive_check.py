@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
-from crosscue.eval.logs.log import WholeDriveGiven, opened
+from crosscue.eval.logs.log import Log, UnopenedLog, opened
 from crosscue.replay.base import name_of
-from crosscue.replay.errors import EmptyResultError, UsageError
+from crosscue.replay.errors import EmptyResultError
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result, json_key, listing
-from crosscue.verb import Option
 
 from .check import Checked, check_drive_signals
 from .check_page import check_report_place, write_check
@@ -84,12 +82,12 @@ class VehicleCheck(Result):
 
 
 def check_vehicle(
-    log: WholeDriveGiven,
-    vehicle: Annotated[Vehicle | Path | str, Option("--vehicle")],
-    output: Annotated[Path | str | None, Option(metavar="FILE")] = None,
+    log: Log | UnopenedLog | Path | str,
+    vehicle: Vehicle | Path | str,
+    output: Path | str | None = None,
     *,
     start_s: float = 0.0,
-    seconds: Annotated[float, Option(metavar="S")] = 10.0,
+    seconds: float = 10.0,
     overwrite: bool = False,
 ) -> VehicleCheck:
     """Check a vehicle file on part of a drive, and list contradictions.
@@ -97,9 +95,6 @@ def check_vehicle(
     The values of each signal are listed. The page shows a picture with the horizon, distances along
     the road, and the regions searched for road. The exit status is 1 when signals contradict each
     other.
-
-    Examples:
-        crosscue vehicle check drive.mcap --vehicle car.toml -o check.html
 
     Args:
         log: The drive, or its path.
@@ -118,8 +113,6 @@ def check_vehicle(
     path = None if output is None else Path(output)
     if path is not None:
         check_report_place(path, overwrite)
-    if not (math.isfinite(seconds) and seconds > 0.0):
-        raise UsageError(f"seconds: {seconds:g}, expected more than 0")
     settings = vehicle_given(vehicle)
     with opened(log) as drive:
         part = drive.part(start_s, start_s + seconds)

@@ -45,7 +45,7 @@ OPENS_LOGS: dict[str, tuple[str, int]] = {
     "fit detector": ("{run} --labels {coco}", 1),
     "view": ("{run} -o {out}.rrd", 3),
     "vehicle init": ("{log} -o {out}.toml", 3),
-    "vehicle check": ("{log} --vehicle {car} -o {out}.html", 3),
+    "check": ("{log} {car} {truth} -o {out}.html", 3),
     "fit compass": ("{compass} --vehicle {its_car}", 4),
     "truth from-gnss": ("{compass} -o {out} --vehicle {gnss_car}", 4),
     "fit odometry": ("{compass} --vehicle {its_car} --truth {its_truth}", 4),
@@ -53,7 +53,6 @@ OPENS_LOGS: dict[str, tuple[str, int]] = {
     "fit landmarks": ("{log} --database {db} --poses {truth} --vehicle {car}", 1),
     "landmarks add": ("{out}.db {log} --poses {truth} --vehicle {car}", 1),
     "truth import": ("{coco} --log {log} -o {out}.json --vehicle {car}", 3),
-    "truth check": ("{truth} --log {log} --vehicle {car}", 3),
     "browse": ("{run} --truth {truth} --any-log -o {out}", 3),
     "export": ("{failures} -o {out}", 3),
 }
@@ -69,7 +68,6 @@ OPENS_NO_LOG: dict[str, str] = {
     "run schema": "nothing",
     "demo": "what it made", "simulate": "nothing", "study range": "what it made",
     "study landmarks": "what it made", "study field": "what it made",
-    "model check": "pictures, and a network",
     "model fetch": "a network", "model init": "a network", "model list": "nothing",
     "model show": "a card", "completion": "nothing", "plugins": "nothing",
     "study intersections": "what it made", "study layouts": "what it made",
@@ -234,7 +232,7 @@ READS_FILES: dict[str, str] = {
     "landmarks add": "{db} --images {folder} --coordinates {folder}/places.csv",
     "fit landmarks": "--pairs {folder}/pairs.csv",
     "fit signs": "{folder}/labels.csv --label stop_sign",
-    "model check": "{folder}/net.toml --picture {picture} -o {out}.jpg",
+    "check": "{folder}/net.toml --picture {picture} -o {out}.jpg",
     "model init": "{folder}/net.onnx -o {folder}/new.toml --picture {picture}",
     "train road": "--data {folder} -o {out}.safetensors",
     "train mask-rcnn": "--data {folder}/coco.json --images {folder}/images -o {out}.safetensors "
@@ -257,7 +255,7 @@ def test_oversized_picture_file_is_refused_with_status_4(
     (folder / "labels.csv").write_text(f"picture,label,x0,y0,x1,y1\na.{coded},stop sign,1,1,9,9\n")
     (folder / "coco.json").write_text(_coco([(f"a.{coded}", 0), ("b.png", 1)], (24, 16)))
     (folder / "net.onnx").write_bytes(bright_box_model())
-    if command == "model check":
+    if command == "check":
         assert cli.run(["model", "init", str(folder / "net.onnx"), "-q"]) == 0
     with LandmarkWriter(tmp_path / "known.db", "orb"):
         pass

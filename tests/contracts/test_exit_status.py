@@ -49,7 +49,7 @@ STATUS: Final[dict[str, list[tuple[int, str]]]] = {
     "1": [
         (1, "convert {log} -o {log}/below.mcap"),
         (1, "score {run} --truth {truth} --without-figures --gate {violated}"),
-        (1, "truth check {truth} --log {other}"),
+        (1, "check {truth} {other}"),
         (1, "decode {log} -o {out} --vehicle {contradicting}"),
         (1, f"decode {{log}} -o {{out}} {LATER}"),
     ],
@@ -60,7 +60,7 @@ STATUS: Final[dict[str, list[tuple[int, str]]]] = {
         (2, "replay {log} -o {out} --vehicle {mute}"),
         (2, "study range -o {out} --settings {noise}"),
         (2, "score {run} --truth {truth} --gate {noise}"),
-        (2, "model check {noise}"),
+        (2, "model show {noise}"),
     ],
     "3": [
         (3, "info {cut}"),
@@ -78,9 +78,9 @@ STATUS: Final[dict[str, list[tuple[int, str]]]] = {
         (4, "decode {log} -o {out} --vehicle {without_dbc}"),
         (4, "landmarks match {db} {gone}"),
         (4, "landmarks match {db} {noise}"),
-        (4, "truth check {gone} --log {log}"),
-        (4, "truth check {noise} --log {log}"),
-        (4, "truth check {newer} --log {log}"),
+        (4, "check {gone}"),
+        (4, "check {noise}"),
+        (4, "check {newer} {log}"),
     ],
     "130, 143": [
         (130, "detect {log} -o {out} --detectors support.stopping:interrupted --no-cache"),
@@ -106,10 +106,10 @@ EMPTY: Final[dict[str, list[tuple[int, str]]]] = {
     ],
     "all four": _all_four("{nothing_whole}"),
     "`score`": _empty_cases("score"),
-    "`truth`, `truth import`, `truth check`": _empty_cases("truth"),
+    "`truth`, `truth import`": _empty_cases("truth"),
     "`fit ...`, `train ...`": _empty_cases("fit", "train"),
     "`landmarks add`": _empty_cases("landmarks"),
-    "`vehicle init`, `vehicle check`": _empty_cases("vehicle"),
+    "`vehicle init`, `check`": _empty_cases("vehicle", "check"),
     "`merge`": _empty_cases("merge"),
     "`info`, `query`": [
         (0, "info {rowless}"),

@@ -54,7 +54,7 @@ LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
     },
     "eval/fit/log_images.py": {
         "truth import": "truth import {coco} --log {log} -o {out}.json --vehicle {car}",
-        "truth check": "truth check {labelled} --log {log} --vehicle {car}",
+        "check of truth": "check {labelled} {log} {car}",
     },
     "eval/fit/signs/scores.py": {
         "fit signs": "fit signs {drive} --label stop/sign --threshold 0.5"
@@ -66,7 +66,7 @@ LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
         "fit landmarks": "fit landmarks {log} --database {db} --poses {truth} --vehicle {car} "
         "--different-beyond 10 --every 1",
     },
-    "eval/vehicle/check.py": {"vehicle check": "vehicle check {log} --vehicle {car} -o {out}.html"},
+    "eval/vehicle/check.py": {"check": "check {log} {car} -o {out}.html"},
     "eval/recording/camera.py": {"view": "view {run} -o {out}.rrd"},
     "eval/failures/export.py": {"export": "export {failures} -o {out}"},
     "eval/report/frame_pictures.py": {"browse": "browse {failures} -o {out}"},

@@ -117,7 +117,7 @@ PLANTED: Final[dict[str, tuple[Callable[[Path], None], str, str]]] = {
     "table of a query is a pipe": (_pipe, "run/pose.parquet", "query {run} 'from pose'"),
     "table is a device": (_device, "run/cues.parquet", "query {run} 'from cues'"),
     "seal is a pipe": (_pipe, "{log}.seal", "info {log}"),
-    "seal is a device": (_device, "{log}.seal", "seal --check {log}"),
+    "seal is a device": (_device, "{log}.seal", "check {log}"),
     "input is a pipe": (
         _pipe,
         "run/input.json",

@@ -74,7 +74,7 @@ def test_coco_import_writes_present_and_absent_cues(tmp_path: Path, log: Path) -
     objects = json.loads((tmp_path / "objects.json").read_text())
     assert [image["t_ns"] for image in objects["images"]] == [one.t_ns for one in truth.cues]
     assert objects["annotations"][1]["bbox"] == [20, 5, 30.5, 10]
-    assert cli.run(["truth", "check", str(tmp_path), "--log", str(log), "-q"]) == 0
+    assert cli.run(["check", str(tmp_path), str(log), "-q"]) == 0
 
 
 def test_add_option_keeps_approaches_and_replaces_cues(tmp_path: Path, log: Path) -> None:
@@ -216,7 +216,7 @@ def test_map_option_assigns_labels_to_cues(
 
     assert _import(source, log, tmp_path / "t.json", "--map", "halt = stop=stop_sign", "dog=") == 0
     assert {one.cue for one in read_truth(tmp_path / "t.json").cues} == {"stop_sign"}
-    assert cli.run(["truth", "check", str(tmp_path / "t.json"), "--log", str(log), "-q"]) == 0
+    assert cli.run(["check", str(tmp_path / "t.json"), str(log), "-q"]) == 0
     for own, message in (
         ("cat=stop_sign", "no such label"),
         ("dog=sing", "no such cue"),
@@ -398,5 +398,5 @@ def test_truth_that_contradicts_its_log_is_refused(
 
     path = _write(tmp_path / "truth.json", tree)
 
-    assert cli.run(["truth", "check", str(path), "--log", str(log)]) in (1, 4)
+    assert cli.run(["check", str(path), str(log)]) in (1, 4)
     assert re.search(message, _error_line(capsys))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 import crosscue
 from crosscue.detectors.catalog.recognise import guesses, read_interface
+from crosscue.detectors.catalog.cards import check_card
 from crosscue.replay.errors import VehicleError
 from support.onnx_models import constant_model
 
@@ -82,13 +83,13 @@ def test_check_refuses_the_card(tmp_path: Path, seen: str) -> None:
     model = constant_model(SHAPE, {"rows": GARBAGE[seen]})
 
     with pytest.raises(VehicleError, match=f"net.toml: on noise, .*{seen}"):
-        crosscue.check_card(card(tmp_path, model, END_TO_END))
+        check_card(card(tmp_path, model, END_TO_END))
 
 
 def test_sensible_boxes_pass(tmp_path: Path) -> None:
     model = constant_model(SHAPE, {"rows": rows()})
 
-    found = crosscue.check_card(card(tmp_path, model, END_TO_END))
+    found = check_card(card(tmp_path, model, END_TO_END))
 
     assert str(found) == f"{tmp_path / 'net.toml'}: fits its network"
 

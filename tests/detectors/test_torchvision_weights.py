@@ -169,7 +169,7 @@ def test_coco_class_names_are_known_and_others_are_required(
     args = ["model", "init", str(path), "--overwrite", "--class-names", str(names)]
     assert run(args) == 0
     assert read_card(tmp_path / "my.toml").output.classes == NAMES
-    assert run(["model", "check", str(tmp_path / "my.toml")]) == 0
+    assert run(["check", str(tmp_path / "my.toml")]) == 0
 
 
 class _Malicious:

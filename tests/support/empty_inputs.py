@@ -15,7 +15,6 @@ from support.rosbag_files import Row, write_folder
 COMMANDS: dict[str, str] = {
     "truth": "{log} -o {out}",
     "truth import": "{empty}/coco.json --log {log} -o {out}.json --vehicle {car}",
-    "truth check": "{empty}/truth.json --log {other}",
     "fit compass": "{log} --vehicle {car}",
     "truth from-gnss": "{log} -o {out} --vehicle {car}",
     "fit odometry": "{log} --vehicle {car}",
@@ -31,7 +30,7 @@ COMMANDS: dict[str, str] = {
     "train road": "--data {empty} -o {out}.safetensors",
     "landmarks add": "{out}.db --images {empty} --coordinates {empty}/places.csv",
     "vehicle init": "{strange} -o {out}.toml",
-    "vehicle check": "{strange} --vehicle {bare} -o {out}.html",
+    "check": "{strange} {bare} -o {out}.html",
     "merge": "{empty} -o {out}",
     "browse": "{empty}/failures.parquet -o {out}",
     "export": "{empty}/failures.parquet -o {out}",

@@ -130,7 +130,7 @@ def draft_text(examined: Examined, folder: Path, mounting: CameraMounting) -> st
     lines = [
         "# A draft of a vehicle file, generated from the log. Check every line against the car.",
         "# Settings that the log does not determine are comments or have their defaults.",
-        "# To see it on an image: crosscue vehicle check LOG --vehicle THIS_FILE -o check.html",
+        "# To see it on an image: crosscue check THIS_FILE LOG -o check.html",
         "version = 1",
         'name = "unnamed"',
         "",

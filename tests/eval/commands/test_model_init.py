@@ -20,6 +20,7 @@ from crosscue.detectors.networks.backends import load_network
 from crosscue.detectors.networks.openvino import import_openvino
 from crosscue.detectors.networks.weights import Weights
 from crosscue.eval.cli import run
+from crosscue.detectors.catalog.cards import check_card
 from support.data import shared
 from support.onnx_models import Array, bright_box_model, constant_model
 from support.pictures import picture
@@ -198,7 +199,7 @@ def test_network_with_size_input_receives_the_picture_size(tmp_path: Path) -> No
     street.write_bytes(picture(0, ".jpg"))
 
     drafted = crosscue.draft_card(path)
-    checked = crosscue.check_card(drafted.path, street)
+    checked = check_card(drafted.path, street)
 
     assert checked.found == {"stop sign": 1}
     output = read_card(drafted.path).output
@@ -247,7 +248,7 @@ def test_check_picture_is_not_written_to_an_image_log(
     monkeypatch.chdir(home)
 
     crosscue.draft_card("net.onnx", class_names=["a"], size_px=(96, 64), picture=log / "00.jpg")
-    checked = crosscue.check_card("net.toml", log / "00.jpg")
+    checked = check_card("net.toml", log / "00.jpg")
 
     assert checked.picture == Path("net.00.found.jpg")
     assert [path.name for path in log.iterdir()] == ["00.jpg"]
@@ -273,7 +274,7 @@ def test_export_of_each_layout_gets_a_working_card(
     assert card.output.classes == ("person", "car", "stop-sign")
     assert card.meaning(2) == "stop sign"
     assert (card.input.width_px, card.input.height_px) == (128, 64)
-    assert run(["model", "check", str(tmp_path / "my.toml")]) == 0
+    assert run(["check", str(tmp_path / "my.toml")]) == 0
 
 
 def test_assumptions_are_reported_and_written_to_the_card(

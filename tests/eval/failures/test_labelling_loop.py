@@ -14,6 +14,7 @@ import crosscue
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.detectors.training.annotations import read_training_coco as read_to_train
 from crosscue.eval.failures.record import Failure
+from crosscue.eval.fit.truth_check import check_truth
 from crosscue.eval.runs.folder import write_manifest
 from crosscue.eval.runs.manifest import EstimateManifest
 from crosscue.replay.errors import AnnotationError, OutputError, SchemaError, UsageError
@@ -90,7 +91,7 @@ def test_corrected_boxes_are_imported_and_used_for_training_and_fitting(
         assert thing.box_px[0] == before.box_px[0]
     # The truth fits the log, and training and the fit of the detector read all pictures.
     log = worst.parent / "drive.mcap"
-    assert crosscue.check_truth(drive.truth, log).objects == len(objects.pictures)
+    assert check_truth(drive.truth, log).objects == len(objects.pictures)
     assert read_to_train(found.coco, found.images, ("car",)).objects == len(objects.pictures)
     fitted = crosscue.fit_detector(worst.parent / "run", drive.objects, detector="finder")
     assert [one.name for one in fitted.classes] == ["car"]

@@ -1,4 +1,4 @@
-"""``truth check`` and ``score`` apply the same rule to a truth if a log's clock was set back."""
+"""``check`` and ``score`` apply the same rule to a truth if a log's clock was set back."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from support.gap_drive import SECOND, Clock, replayed, write_drive
 
 
 def _status_of_check(folder: Path, log: Path) -> int:
-    return cli.run(["truth", "check", str(folder / "truth.json"), "--log", str(log)])
+    return cli.run(["check", str(folder / "truth.json"), str(log)])
 
 
 def _status_of_score(folder: Path, log: Path) -> int:

@@ -9,6 +9,7 @@ import pytest
 
 import crosscue
 from crosscue.eval.cli import run
+from crosscue.detectors.catalog.cards import check_card
 from support.onnx_models import bright_box_model
 
 
@@ -27,7 +28,7 @@ def test_card_is_drafted_and_checked_from_python(tmp_path: Path) -> None:
     (tmp_path / "net.onnx").write_bytes(bright_box_model())
 
     drafted = crosscue.draft_card(tmp_path / "net.onnx", class_names=["bright"], size_px=(96, 64))
-    checked = crosscue.check_card(drafted.path)
+    checked = check_card(drafted.path)
 
     assert drafted.draft.kind == "end-to-end"
     assert drafted.as_dict()["picture"] is None

@@ -11,6 +11,7 @@ import pytest
 import crosscue
 from crosscue.eval.cli import run
 from crosscue.eval.vehicle.check import Checked, _normalized, check_drive_signals
+from crosscue.eval.vehicle.drive_check import check_vehicle
 from crosscue.eval.vehicle.ground_picture import draw_ground
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Table, Topic
@@ -97,7 +98,7 @@ def test_intrinsics_of_other_pictures_are_contradictions(
     drive = pandaset_drive(tmp_path / "002")
     vehicle = write_vehicle(tmp_path / "car.toml", camera)
 
-    found = crosscue.check_vehicle(drive, vehicle)
+    found = check_vehicle(drive, vehicle)
 
     # The generated pictures are tiny, with the published intrinsics of 1920 x 1080.
     assert any(message in text for text in found.contradictions)
@@ -110,11 +111,12 @@ def test_check_page_and_json_have_equal_content(
     drive = pandaset_drive(tmp_path / "002")
     vehicle = write_vehicle(tmp_path / "car.toml", "focal_px = 1500.0")
     page = tmp_path / "check.html"
-    line = ["vehicle", "check", str(drive), "--vehicle", str(vehicle), "-o", str(page)]
+    line = ["check", str(drive), str(vehicle), "-o", str(page)]
 
     assert run([*line, "--json"]) == 1
 
-    printed = json.loads(capsys.readouterr().out)
+    (checked,) = json.loads(capsys.readouterr().out)["files"]
+    printed = checked["result"]
     assert printed["page"] == str(page)
     html = page.read_text(encoding="utf-8")
     assert all(row["signal"] in html for row in printed["signals"])
@@ -142,7 +144,7 @@ def test_invalid_check_options_are_refused_in_one_line(
     drive = pandaset_drive(tmp_path / "002")
     vehicle = write_vehicle(tmp_path / "car.toml", "focal_px = 1500.0")
 
-    assert run(["vehicle", "check", str(drive), "--vehicle", str(vehicle), *arguments]) == status
+    assert run(["check", str(drive), str(vehicle), *arguments]) == status
 
     printed = capsys.readouterr().err
     assert message in printed
