@@ -39,7 +39,7 @@ docs: $(VENV)/.ready-dev
 # Tests of what differs from main, by package, and by part of eval: make quick, or
 # make quick IN="replay eval/scoring".
 CHANGED = git diff --name-only $$(git merge-base HEAD origin/main 2>/dev/null || echo HEAD)
-PART = s,^(replay|detectors|fusion|localization|datasets|eval/[a-z]+)/.*,\1,p;s,^eval/cli\.py$$,eval/commands,p
+PART = s,^(replay|detectors|fusion|localization|datasets|eval/[a-z]+)/.*,\1,p;s,^eval/cli\.py$$,eval/cli,p
 IN ?= $(shell $(CHANGED) | sed -nE '$(PART)' | sort -u)
 quick: $(VENV)/.ready-dev
 	$(BIN)/ruff check . && $(BIN)/lint-imports

@@ -14,8 +14,8 @@ from typing import Annotated, Any, ClassVar, Final
 
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.detectors.catalog.architectures import WEIGHTS_SUFFIXES
-from crosscue.eval.fit.truth_check import check_truth
 from crosscue.detectors.catalog.cards import check_card
+from crosscue.eval.fit.truth_check import check_truth
 from crosscue.eval.logs.log import UnopenedLog
 from crosscue.eval.logs.seals import check_seal
 from crosscue.eval.pipeline.run import open_run

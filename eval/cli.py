@@ -2,8 +2,7 @@
 
 Only the module of the command that was asked for is imported, so ``crosscue --help`` answers at
 once. A command is a function of the package and one line in ``COMMANDS``; ``command_line`` makes
-its parser from the function's signature and docstring. A line with a pair is a command that is
-still written by hand, in ``commands``, with ``add_arguments(parser)`` and ``run(args) -> int``.
+its parser from the function's signature and docstring.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Final, NoReturn, Protocol, cast
+from typing import TYPE_CHECKING, Final, NoReturn
 
 # Not from crosscue.replay.base, which needs numpy: the list of commands is printed without it.
 from crosscue.replay.errors import CrosscueError, one_line, without_secrets
@@ -33,7 +32,9 @@ from crosscue.replay.versions import installed
 if TYPE_CHECKING:
     from typing_extensions import Buffer
 
-COMMANDS: Final[dict[str, str | tuple[str, str]]] = {
+    from crosscue.eval.command_line import Call
+
+COMMANDS: Final = {
     "info": "eval.logs.summary:info",
     "check": "eval.check:check",
     "convert": "eval.logs.convert:convert",
@@ -139,18 +140,6 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{visible(line)}\n")
 
 
-class Command(Protocol):
-    """Interface of a command: of ``VerbCommand``, and of a module in ``commands``."""
-
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Declare flags."""
-        ...
-
-    def run(self, args: argparse.Namespace) -> int:
-        """Do it; the exit status comes back."""
-        ...
-
-
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit status."""
     _prepare_streams()
@@ -239,51 +228,44 @@ def run(argv: Sequence[str]) -> int:
     name = _command_of(argv)
     if name is None:
         return _unknown(argv)
-    module, parser = parser_of(name)
+    call, parser = parser_of(name)
     try:
         args = parser.parse_args(list(argv[len(name.split()) :]))
     except SystemExit as stop:
         return int(stop.code or 0)
     with losses_heard() as losses:
-        status = _guarded(module, args, parser)
+        status = _guarded(call, args, parser)
     for loss in losses:
         print(visible(f"crosscue: dropped: {loss}"), file=sys.stderr)
     return 3 if losses and not status else status
 
 
-def parser_of(name: str) -> tuple[Command, argparse.ArgumentParser]:
-    """The module of one command and the parser of its options."""
+def parser_of(name: str) -> tuple[Call, argparse.ArgumentParser]:
+    """The call that one command makes, and the parser of its options."""
+    from crosscue.eval.command_line import fill
+
     parser = _Parser(
         prog=f"crosscue {name}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=EXIT_STATUS,
         allow_abbrev=False,
     )
-    where = COMMANDS[name]
-    module: Command
-    if isinstance(where, str):
-        from crosscue.eval.terminal import VerbCommand
-
-        path, _, function = where.partition(":")
-        module = VerbCommand(getattr(import_module(f"crosscue.{path}"), function))
-    else:
-        module = cast("Command", import_module(f"crosscue.eval.commands.{where[0]}"))
-        parser.description = str(cast("object", module).__doc__)
-    module.add_arguments(parser)
+    path, _, function = COMMANDS[name].partition(":")
+    call = fill(parser, getattr(import_module(f"crosscue.{path}"), function))
     talk = parser.add_mutually_exclusive_group()
     talk.add_argument("-q", "--quiet", action="store_true", help="print only errors")
     talk.add_argument("-v", "--verbose", action="store_true", help="print tracebacks with errors")
-    return module, parser
+    return call, parser
 
 
-def _guarded(module: Command, args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
+def _guarded(call: Call, args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
     from crosscue.eval.command_line import with_options
-    from crosscue.eval.terminal import watched
+    from crosscue.eval.terminal import print_found, watched
 
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
         with watched(args):
-            status = module.run(args)
+            status = print_found(call(args), args)
         sys.stdout.flush()
         return status
     except CrosscueError as error:
@@ -376,8 +358,6 @@ def summary_of(name: str) -> str:
     It is read from the source, because the list of commands is printed without any import.
     """
     where = COMMANDS[name]
-    if not isinstance(where, str):
-        return where[1]
     module, _, function = where.partition(":")
     path = Path(__file__).parents[1].joinpath(*module.split(".")).with_suffix(".py")
     text = path.read_text(encoding="utf-8")

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
-from crosscue.eval.command_line import Call, fill
 from crosscue.replay.errors import one_line
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.progress import Notice, watching
@@ -115,24 +114,6 @@ class ProgressLine:
 
     def __exit__(self, *failure: object) -> None:
         self.end()
-
-
-class VerbCommand:
-    """A command generated from a function."""
-
-    def __init__(self, verb: Callable[..., object]) -> None:
-        """Store the function."""
-        self._verb = verb
-        self._call: Call | None = None
-
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Add the function's parameters and its description to the parser."""
-        self._call = fill(parser, self._verb)
-
-    def run(self, args: argparse.Namespace) -> int:
-        """Call the function and print its result; return the exit status."""
-        assert self._call is not None
-        return print_found(self._call(args), args)
 
 
 @contextmanager

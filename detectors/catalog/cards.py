@@ -65,7 +65,7 @@ class CardDraft(Result):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class CardCheck(Result):
-    """A card that fits its network; its text is that of ``model check``.
+    """A card that fits its network; found by ``crosscue check``.
 
     Attributes:
         path: The card.
@@ -175,17 +175,12 @@ def draft_card(
 
 
 def check_card(
-    model: Annotated[Path | str, Option(metavar="MODEL")],
-    picture: Path | str | None = None,
-    output: Annotated[Path | str | None, Option(metavar="FILE.jpg")] = None,
+    model: Path | str, picture: Path | str | None = None, output: Path | str | None = None
 ) -> CardCheck:
     """Run a network with its card, and draw its detections in a picture.
 
-    Examples:
-        crosscue model check my.toml --picture street.jpg
-
     Args:
-        model: Name in the catalog, or model card, which ends in .toml.
+        model: Model card, or name in the catalog.
         picture: Run it on this JPEG, PNG or WebP file.
         output: Picture with detections to write (default: CARD.PICTURE.found.jpg, next to the card,
             or in the current folder for a model of the catalog).
@@ -197,7 +192,8 @@ def check_card(
         LogError: The picture cannot be read or decoded.
         OutputError: The drawing cannot be written.
     """
-    card = card_named(str(model))
+    is_file = Path(model).is_file()
+    card = Path(model) if is_file else card_named(str(model))
     detector = build(card=str(card))
     pixels = None if picture is None else _pixels_of(Path(picture))[0]
     fault = fault_seen(detector, pixels)
@@ -206,7 +202,7 @@ def check_card(
     if picture is None:
         return CardCheck(card, detector.identity)
     seen = Path(picture)
-    place = card if Path(str(model)).suffix == ".toml" else Path(card.name)
+    place = card if is_file else Path(card.name)
     drawing = _drawing(place, seen) if output is None else Path(output)
     found = _look(detector, seen, drawing)
     counts = None if found is None else dict(Counter(found.labels))

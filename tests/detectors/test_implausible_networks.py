@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 import crosscue
-from crosscue.detectors.catalog.recognise import guesses, read_interface
 from crosscue.detectors.catalog.cards import check_card
+from crosscue.detectors.catalog.recognise import guesses, read_interface
 from crosscue.replay.errors import VehicleError
 from support.onnx_models import constant_model
 

@@ -1,30 +1,49 @@
 """Errors of commands: one line, the documented exit status, no traceback without -v."""
 
-import argparse
+from __future__ import annotations
+
 import subprocess
 import sys
+from dataclasses import dataclass
 from types import ModuleType
 
 import pytest
 
 from crosscue.eval import cli
 from crosscue.replay.errors import CrosscueError, LogError, UsageError
+from crosscue.results import Result
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Counted(Result):
+    """A number that is the exit status."""
+
+    number: int
+
+    @property
+    def exit_status(self) -> int:
+        """The number."""
+        return self.number
 
 
 def _register_command(monkeypatch: pytest.MonkeyPatch, error: BaseException | None) -> None:
-    module = ModuleType("crosscue.eval.commands.fake", "A command for the test.")
+    module = ModuleType("crosscue.eval.fake")
 
-    def add_arguments(parser: argparse.ArgumentParser) -> None:
-        parser.add_argument("--number", type=int, default=0)
+    def fake(*, number: int = 0) -> Counted:
+        """Count for the test.
 
-    def run(args: argparse.Namespace) -> int:
+        Args:
+            number: The exit status.
+        """
         if error is not None:
             raise error
-        return int(args.number)
+        return Counted(number)
 
-    module.__dict__.update(add_arguments=add_arguments, run=run)
+    fake.__module__ = module.__name__
+    module.__dict__.update(fake=fake, Counted=Counted)
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setitem(cli.COMMANDS, "fake", ("fake", "for the test"))
+    monkeypatch.setitem(cli.COMMANDS, "fake", "eval.fake:fake")
+    monkeypatch.setattr(cli, "summary_of", lambda name: "count")
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import crosscue
-from crosscue.eval.cli import run
 from crosscue.detectors.catalog.cards import check_card
+from crosscue.eval.cli import run
 from support.onnx_models import bright_box_model
 
 

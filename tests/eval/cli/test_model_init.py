@@ -13,6 +13,7 @@ import pytest
 
 import crosscue
 from crosscue.detectors.catalog.card import read_card
+from crosscue.detectors.catalog.cards import check_card
 from crosscue.detectors.catalog.recognise import class_names
 from crosscue.detectors.decoders.detr import DetrOutput
 from crosscue.detectors.decoders.torchvision_export import TorchvisionOutput
@@ -20,7 +21,6 @@ from crosscue.detectors.networks.backends import load_network
 from crosscue.detectors.networks.openvino import import_openvino
 from crosscue.detectors.networks.weights import Weights
 from crosscue.eval.cli import run
-from crosscue.detectors.catalog.cards import check_card
 from support.data import shared
 from support.onnx_models import Array, bright_box_model, constant_model
 from support.pictures import picture

@@ -1,1 +1,0 @@
-"""Commands, one module each; ``crosscue.eval.cli.COMMANDS`` lists them."""

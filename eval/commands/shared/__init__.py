@@ -1,1 +1,0 @@
-"""Options and output functions that several commands share."""
