@@ -320,7 +320,7 @@ def _check_seal(file: str, together: Together) -> Result:
 
 def _check_run(file: str, together: Together) -> CheckedRun:
     run = open_run(file, without_images=True, limits=together.limits)
-    manifest = run.manifest
+    manifest = run.folder.drive_manifest()
     for table in run.tables:
         run[table]
     logs = tuple(str(log_location(run.folder, row)) for row in manifest.logs)

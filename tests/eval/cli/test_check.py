@@ -42,7 +42,7 @@ def test_files_are_recognised_by_content_whatever_their_names(drive: Path, tmp_p
 
     names = ("settings.txt", "card.txt", "truth.txt")
     assert kinds_of(*(tmp_path / name for name in names)) == ["vehicle file", "model card", "truth"]
-    log = shutil.copy(drive / "drive.mcap", tmp_path)
+    log = str(shutil.copy(drive / "drive.mcap", tmp_path))
     crosscue.seal(log)
     assert kinds_of(log, f"{log}.seal", drive / "run", drive, "nosuch-model") == [
         "log",
@@ -76,7 +76,7 @@ def test_truth_is_compared_with_the_log_that_is_named_with_it(drive: Path) -> No
 def test_exit_status_is_that_of_the_worst_file_and_the_others_are_still_checked(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = shutil.copy(drive / "drive.mcap", tmp_path)
+    log = str(shutil.copy(drive / "drive.mcap", tmp_path))
     crosscue.seal(log)
     raw = bytearray(Path(log).read_bytes())
     raw[len(raw) // 2] ^= 1
