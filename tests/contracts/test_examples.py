@@ -35,6 +35,7 @@ EXECUTED: Final = {
 }
 # Options of other programs that occur in inline code and messages, and those programs.
 OTHERS: Final = {
+    "--check": "seal had it; the answer names what replaces it",
     "--array": "SLURM",
     "--bind": "Rerun",
     "--min-s": "the example of a command in CONTRIBUTING.md",
