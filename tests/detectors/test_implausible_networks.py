@@ -114,4 +114,4 @@ def test_pixel_boxes_read_as_fractions_are_refused(tmp_path: Path) -> None:
     model = constant_model(SHAPE, pixel_boxes_and_scores())
 
     with pytest.raises(VehicleError, match=r"on noise, .* boxes are more than four times as large"):
-        crosscue.check_card(card(tmp_path, model, output))
+        check_card(card(tmp_path, model, output))

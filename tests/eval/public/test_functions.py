@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 import crosscue
-from crosscue.eval.fit.truth_check import check_truth
 from crosscue.replay.progress import Progress, watching
 from crosscue.replay.vehicle.vehicle import parse
 from support.gap_drive import Clock, write_drive

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import crosscue
 from crosscue.eval.cli import run
 from crosscue.eval.vehicle.check import Checked, _normalized, check_drive_signals
 from crosscue.eval.vehicle.drive_check import check_vehicle
