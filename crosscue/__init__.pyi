@@ -12,7 +12,6 @@ from crosscue.detectors.base import Frame as Frame
 from crosscue.detectors.base import View as View
 from crosscue.detectors.base import nothing_found as nothing_found
 from crosscue.detectors.box_detector import BoxDetector as BoxDetector
-from crosscue.detectors.catalog.cards import CardCheck as CardCheck
 from crosscue.detectors.catalog.cards import CardDraft as CardDraft
 from crosscue.detectors.catalog.cards import draft_card as draft_card
 from crosscue.detectors.catalog.known_models import FetchedModel as FetchedModel
