@@ -11,6 +11,7 @@ from typing import Annotated, ClassVar, Final
 
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.catalog.architectures import WEIGHTS_SUFFIXES
+from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.class_names import class_names_given
 from crosscue.detectors.catalog.draft import Draft, draft_card_text
 from crosscue.detectors.catalog.places import card_named
@@ -29,6 +30,12 @@ from crosscue.verb import Option, keywords
 # Supported tasks in the metadata of Ultralytics' exports.
 _TASKS: Final = ("detect", "segment")
 _MAX_TASK_CHARACTERS: Final = 40
+# The way to fit a picture that a network may be trained with instead of the assumed one.
+_OTHER_FIT: Final = {
+    "stretch": "letterbox",
+    "letterbox": "stretch",
+    "letterbox-center": "stretch",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -153,6 +160,7 @@ def draft_card(
         if class_names is not None:
             raise UsageError("--classes and --class-names: give one of the two")
         class_names = [name.strip() for name in settings.classes.split(",")]
+    names = () if class_names is None else class_names_given(class_names)
     size = _size(settings.size_px) if isinstance(settings.size_px, str) else settings.size_px
     if path.suffix.lower() in WEIGHTS_SUFFIXES:
         from crosscue.detectors.catalog.recognise_weights import recognise_weights
@@ -160,16 +168,19 @@ def draft_card(
         model, guess = recognise_weights(path, settings.kind, size)
     else:
         model = read_interface(path)
-        guess = _guess(path, closed(path, model, size), settings.kind)
-    written = draft_card_text(
-        path, model, guess, () if class_names is None else class_names_given(class_names), size
-    )
+        guess = _guess(path, closed(path, model, size), settings.kind, len(names))
+    written = draft_card_text(path, model, guess, names, size)
     if settings.picture is None:
         _try(place, written)
         return CardDraft(place, written)
     seen = Path(settings.picture)
     # Errors in the picture are reported before a card is written.
-    _try(place, written, _pixels_of(seen)[0])
+    pixels = _pixels_of(seen)[0]
+    _try(place, written, pixels)
+    # Ultralytics' metadata say how its networks are trained; other files do not.
+    if not model.metadata and (doubt := _other_fit(place, written, pixels)) is not None:
+        written = written.with_assumption(doubt)
+        write_text(place, written.text)
     found = _look(build(card=str(place)), seen, drawing := _drawing(place, seen))
     return CardDraft(place, written, drawing, None if found is None else len(found))
 
@@ -209,8 +220,14 @@ def check_card(
     return CardCheck(card, detector.identity, drawing, counts)
 
 
-def _guess(path: Path, model: Interface, kind: str | None) -> Guess:
+def _guess(path: Path, model: Interface, kind: str | None, names: int) -> Guess:
     """Return the requested layout of the outputs, or the only one that fits.
+
+    Args:
+        path: The model file.
+        model: The interface that it declares.
+        kind: The requested layout; None for the one that fits.
+        names: Number of class names that the user gave, 0 without names.
 
     Raises:
         UsageError: No layout or several fit; the message contains the file's declarations.
@@ -226,6 +243,7 @@ def _guess(path: Path, model: Interface, kind: str | None) -> Guess:
         found = [guess for guess in found if guess.settings["kind"] == kind]
     elif len(found) > 1:
         found = plausible(path, model, found)
+        found = [one for one in found if names and one.class_count == names] or found
     if len(found) == 1:
         return found[0]
     if not found:
@@ -280,6 +298,32 @@ def _try(place: Path, written: Draft, picture: Bytes | None = None) -> None:
         f"{place}: not written: {fault}, so {written.kind} is not its layout; choose another "
         "--kind, write a card by hand, or a detector (docs: Write a detector)"
     )
+
+
+def _other_fit(place: Path, written: Draft, pixels: Bytes) -> str | None:
+    """Return what the network finds in a picture that is fitted into its input otherwise.
+
+    None if that cannot matter, or the card's own fit is as well without detections.
+    """
+    given = read_card(place).input
+    if given.fit not in _OTHER_FIT:
+        return None
+    height, width = pixels.shape[:2]
+    if width * given.height_px == height * given.width_px:
+        return None
+    counts = []
+    trial = place.with_name(f".{place.stem}.trial.toml")
+    for fit in (given.fit, _OTHER_FIT[given.fit]):
+        write_text(trial, written.text.replace(f'fit = "{given.fit}"', f'fit = "{fit}"'))
+        try:
+            (found,) = build(card=str(trial))([Frame(0, "", pixels, (width, height))])
+        finally:
+            trial.unlink(missing_ok=True)
+        if not isinstance(found, Detections):
+            return None
+        best = f" with scores up to {found.scores.max():.2f}" if len(found) else ""
+        counts.append(f'{len(found)} boxes{best} with fit = "{fit}"')
+    return f"{counts[0]}, {counts[1]} in {width} x {height}: correct input.fit if it is the other"
 
 
 def _pixels_of(picture: Path) -> tuple[Bytes, tuple[int, int]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +18,8 @@ from .recognise import size_in
 from .segmentation import drivable
 
 _LINE: Final = 100
+_VERSION: Final = "version = 1"
+_ASSUMED: Final = "# Assumed, please check: {}."
 _DECODE: Final = 'decode = "full"  # as scripts around networks do; "reduced" is faster'
 # Number of classes for which a pose export without metadata is taken. Its columns are a box, a
 # score (in YOLOv7 also a class) and 17 points with x, y and visibility.
@@ -41,6 +43,11 @@ class Draft:
     kind: str
     certain: tuple[str, ...]
     assumed: tuple[str, ...]
+
+    def with_assumption(self, why: str) -> Draft:
+        """Return the draft with one more assumption, also in the card."""
+        text = self.text.replace(_VERSION, f"{_ASSUMED.format(why)}\n{_VERSION}", 1)
+        return replace(self, text=text, assumed=(*self.assumed, why))
 
 
 def draft_card_text(
@@ -77,8 +84,8 @@ def draft_card_text(
     lines = [
         f"# Written by crosscue model init for {path.name}.",
         *(f"# Found in the file: {reason}." for reason in certain),
-        *(f"# Assumed, please check: {one}." for one in assumed),
-        "version = 1",
+        *map(_ASSUMED.format, assumed),
+        _VERSION,
         f"weights = {_value(path.name)}",
         f'sha256 = "{hashlib.sha256(path.read_bytes()).hexdigest()}"',
     ]

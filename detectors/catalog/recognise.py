@@ -89,8 +89,10 @@ def _of_onnx(content: bytes, path: Path) -> Interface:
     model: Any = onnx.load_model_from_string(content)
     weights = {tensor.name for tensor in model.graph.initializer}
     metadata = {prop.key: prop.value for prop in model.metadata_props}
+    inputs = [_tensor(value) for value in model.graph.input if value.name not in weights]
     return Interface(
-        tuple(_tensor(value) for value in model.graph.input if value.name not in weights),
+        # The picture first: Paddle's exporter sorts the inputs by name.
+        tuple(sorted(inputs, key=lambda one: len(one.shape) < 3)),
         tuple(_tensor(value) for value in model.graph.output),
         metadata,
         class_names(metadata),

@@ -169,6 +169,11 @@ def output_rows(output: Array, columns: int, what: str) -> Floats:
     return np.asarray(output[0], np.float64)
 
 
+def is_called(model: Interface, *names: str) -> bool:
+    """Return whether a model file has outputs of all these names."""
+    return {*names} <= {out.name for out in model.outputs}
+
+
 def from_centers(table: Floats) -> Floats:
     """Convert boxes (N, 4) from center x, center y, width, height to corners."""
     center, half = table[:, :2], table[:, 2:4] / 2.0
@@ -201,6 +206,17 @@ def static(shape: tuple[int | str | None, ...], axis: int) -> int | None:
 
 # Second input of RT-DETR, D-FINE and others: width and height to which boxes are scaled.
 PICTURE_SIZE_INPUT: Final = "orig_target_sizes"
+# Inputs of Paddle's exports besides the picture: its factors of scale, its height and width.
+PADDLE_SCALE_INPUT: Final = "scale_factor"
+PADDLE_SIZE_INPUT: Final = "im_shape"
+# Input of networks trained from ImageNet's weights: mean and scale of red, green and blue, for
+# pixels from 0 to 255.
+IMAGENET: Final = {
+    "mean": (123.675, 116.28, 103.53),
+    "scale": (1 / 58.395, 1 / 57.12, 1 / 57.375),
+}
+# The same in the order of OpenCV, as in networks of OpenMMLab and NanoDet.
+IMAGENET_BGR: Final = {"colour": "bgr"} | {key: three[::-1] for key, three in IMAGENET.items()}
 # Strides of the grids of YOLO networks and of YOLOX.
 GRID_STRIDES: Final = (8, 16, 32)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
+    IMAGENET,
     BoxCandidates,
     BoxOutput,
     Guess,
@@ -30,11 +31,6 @@ _MAX_QUERIES: Final = 1000
 _SELECTED_COLUMNS: Final = 6
 _COCO_COLUMNS_OF_DETR: Final = 92
 _RF_DETR_NAMES: Final = ("dets", "labels")
-# Input of networks trained from ImageNet's weights: mean and scale of red, green and blue.
-_IMAGENET: Final = {
-    "mean": tuple(255 * mean for mean in (0.485, 0.456, 0.406)),
-    "scale": tuple(1 / (255 * deviation) for deviation in (0.229, 0.224, 0.225)),
-}
 # Name of RT-DETR's head in the metadata of Ultralytics' exports, since 8.4.
 ULTRALYTICS_HEAD: Final = "RTDETRDecoder"
 
@@ -108,7 +104,7 @@ class DetrOutput(BoxOutput):
                     "of the first DETR: softmax, and pixels with ImageNet's mean",
                     are_fractions,
                 ),
-                {**picture, **_IMAGENET},
+                {**picture, **IMAGENET},
                 is_decided=False,
             )
         is_rf_detr = (boxes.name, logits.name) == _RF_DETR_NAMES
@@ -124,7 +120,7 @@ class DetrOutput(BoxOutput):
                 if is_rf_detr
                 else "pixels are scaled to 0..1, without a mean",
             ),
-            {**picture, **_IMAGENET} if is_rf_detr else picture,
+            {**picture, **IMAGENET} if is_rf_detr else picture,
             is_decided=is_rf_detr,
         )
 

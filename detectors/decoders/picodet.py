@@ -1,16 +1,19 @@
-"""Decoder of PicoDet (GFL): class scores, and a distribution of each side's distance."""
+"""Decoder of PicoDet and NanoDet (GFL): class scores, and a distribution of each distance."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
+    IMAGENET,
+    IMAGENET_BGR,
     BoxCandidates,
     BoxOutput,
+    Floats,
     Guess,
     Interface,
     Outputs,
@@ -24,14 +27,14 @@ from .base import (
     static,
 )
 
-_STRIDES = (8, 16, 32, 64)
+STRIDES: Final = (8, 16, 32, 64)
 
 
 class PicodetOutput(BoxOutput):
     """Scores (1, cells, classes) and logits of distances (1, cells, 4 * bins) for each stride."""
 
     kind: Literal["picodet"]
-    strides: tuple[int, ...] = _STRIDES
+    strides: tuple[int, ...] = STRIDES
     scores: tuple[str, ...]
     """Names of the outputs with scores, in the order of strides."""
     distances: tuple[str, ...]
@@ -53,18 +56,7 @@ class PicodetOutput(BoxOutput):
                 for name in self.distances
             ]
         )
-        corner, stride = cell_grid(size_px, self.strides, round_up=True)
-        if not len(corner) == len(scores) == len(logits):
-            raise ValueError(
-                f"expected {len(corner)} cells at {size_px[0]} x {size_px[1]}, got {len(scores)} "
-                f"scores and {len(logits)} distances"
-            )
-        center = (corner + 0.5) * stride
-        sides = _expected(logits.reshape(-1, 4, self.bins)) * stride
-        best, numbers = best_class(scores)
-        return BoxCandidates(
-            np.hstack([center - sides[:, :2], center + sides[:, 2:]]), best, numbers
-        )
+        return distance_boxes(scores, logits, size_px, self.strides, 0.5)
 
     @override
     @classmethod
@@ -72,9 +64,10 @@ class PicodetOutput(BoxOutput):
         given = model.inputs[0].shape
         height, width = static(given, -2), static(given, -1)
         tables = [out for out in model.outputs if len(out.shape) == 3]
-        if width is None or height is None or len(tables) != 2 * len(_STRIDES):
+        strides = STRIDES[: len(tables) // 2]
+        if width is None or height is None or len(tables) not in (6, 8):
             return None
-        wanted = [cell_count((width, height), (s,), round_up=True) for s in _STRIDES]
+        wanted = [cell_count((width, height), (s,), round_up=True) for s in strides]
         by_cells = [[out for out in tables if static(out.shape, 1) == n] for n in wanted]
         if any(len(pair) != 2 for pair in by_cells):
             return None
@@ -82,22 +75,51 @@ class PicodetOutput(BoxOutput):
         if len(columns) != 2 or 32 not in columns:
             return None
         classes = next(n for n in columns if n != 32)
+        # NanoDet's exporter names its outputs so.
+        is_nanodet = all("_pred_stride_" in out.name for out in tables)
         return Guess(
             {
                 "kind": "picodet",
+                "strides": strides,
                 "scores": _with(by_cells, classes),
                 "distances": _with(by_cells, 32),
             },
             classes,
-            (f"four pairs of outputs over the cells of strides 8 to 64 at {width} x {height}",),
-            ("scores are final", "pixels are normalised with ImageNet's mean, in RGB"),
-            {
-                "colour": "rgb",
-                "fit": "stretch",
-                "mean": (123.675, 116.28, 103.53),
-                "scale": (1 / 58.395, 1 / 57.12, 1 / 57.375),
-            },
+            (f"{len(strides)} pairs of outputs over the cells of strides 8 to {strides[-1]}",),
+            (
+                "scores are final",
+                "pixels are normalised with ImageNet's mean, in "
+                + ("BGR, as NanoDet expects" if is_nanodet else "RGB"),
+            ),
+            {"fit": "stretch", **(IMAGENET_BGR if is_nanodet else {"colour": "rgb", **IMAGENET})},
         )
+
+
+def distance_boxes(
+    scores: Floats, logits: Floats, size_px: Size, strides: tuple[int, ...], center: float
+) -> BoxCandidates:
+    """Return boxes from the distances of a point of each cell to the four sides.
+
+    Args:
+        scores: Shape (cells, classes).
+        logits: Shape (cells, 4 * bins): of distances to left, top, right and bottom.
+        size_px: Width and height of the input.
+        strides: Strides of the grids, in the order of the rows.
+        center: Point of a cell that distances count from, in strides.
+
+    Raises:
+        ValueError: The number of rows is not that of the cells.
+    """
+    corner, stride = cell_grid(size_px, strides, round_up=True)
+    if not len(corner) == len(scores) == len(logits):
+        raise ValueError(
+            f"expected {len(corner)} cells at {size_px[0]} x {size_px[1]}, got {len(scores)} "
+            f"scores and {len(logits)} distances"
+        )
+    middle = (corner + center) * stride
+    sides = _expected(logits.reshape(len(logits), 4, -1)) * stride
+    best, numbers = best_class(scores)
+    return BoxCandidates(np.hstack([middle - sides[:, :2], middle + sides[:, 2:]]), best, numbers)
 
 
 def _expected(logits: NDArray[np.float64]) -> NDArray[np.float64]:

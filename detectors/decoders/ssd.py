@@ -45,7 +45,7 @@ class TensorflowSsdOutput(BoxOutput):
             )
         corners = boxes[0][:, [1, 0, 3, 2]] * np.tile(size_px, 2)
         # Rows after the detections are zeros, whose class may not exist.
-        kept = scores[0] > 0.0
+        kept = ~(scores[0] <= 0.0)
         numbers = class_numbers(labels[0][kept] - self.first_class, len(self.classes))
         return BoxCandidates(corners[kept], scores[0][kept], numbers)
 
@@ -56,6 +56,9 @@ class TensorflowSsdOutput(BoxOutput):
             return None
         names = {out.name.split(":")[0]: out.name for out in model.outputs}
         if not {"detection_classes", "detection_scores"} <= names.keys():
+            return None
+        # TensorRT's EfficientNMS has these names, too, with integers for classes.
+        if any(out.is_integer for out in model.outputs if out.name == names["detection_classes"]):
             return None
         return Guess(
             {
@@ -99,7 +102,7 @@ class DetectionOutput(BoxOutput):
     def recognise(cls, model: Interface, /) -> Guess | None:
         if len(model.outputs) != 1 or len(model.outputs[0].shape) != 4:
             return None
-        if static(model.outputs[0].shape, 3) != 7:
+        if static(model.outputs[0].shape, 3) != 7 or static(model.outputs[0].shape, 1) != 1:
             return None
         return Guess(
             {"kind": "ssd", "name": model.outputs[0].name, "overlap": 1.0},

@@ -5,12 +5,18 @@ from __future__ import annotations
 from typing import Final, TypeAlias, get_args
 
 from .base import BoxOutput
+from .darknet import DarknetOutput
 from .detr import DetrOutput
 from .end_to_end import EndToEndOutput
+from .fastestdet import FastestDetOutput
+from .nanodet import NanodetOutput
+from .nms_tables import EfficientNmsOutput, MmdeployOutput, YoloV7NmsOutput
+from .paddle import PaddleNmsOutput, PpYoloeOutput
 from .picodet import PicodetOutput
 from .ssd import DetectionOutput, TensorflowSsdOutput
 from .torchvision_export import TorchvisionOutput
 from .yolo import YoloV5Output, YoloV8Output, YoloV8SegOutput
+from .yolo_fastestv2 import YoloFastestV2Output
 from .yolo_nas import YoloNasOutput
 from .yolox import YoloxOutput
 
@@ -24,6 +30,15 @@ AnyBoxOutput: TypeAlias = (
     | YoloNasOutput
     | TorchvisionOutput
     | PicodetOutput
+    | NanodetOutput
+    | FastestDetOutput
+    | YoloFastestV2Output
+    | PpYoloeOutput
+    | PaddleNmsOutput
+    | YoloV7NmsOutput
+    | MmdeployOutput
+    | EfficientNmsOutput
+    | DarknetOutput
     | TensorflowSsdOutput
     | DetectionOutput
 )

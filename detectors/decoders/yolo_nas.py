@@ -1,4 +1,4 @@
-"""Decoder of YOLO-NAS as it is exported without suppression: boxes in pixels and final scores."""
+"""Decoder of YOLO-NAS and DAMO-YOLO, exported without suppression: boxes and final scores."""
 
 from __future__ import annotations
 
@@ -52,15 +52,19 @@ class YoloNasOutput(BoxOutput):
         rows = grid_cells(model)
         if rows is None or not static(boxes.shape, 1) == static(scores.shape, 1) == rows:
             return None
+        # DAMO-YOLO's exporter names the first of its outputs, the scores.
+        is_damo = scores is model.outputs[0] and scores.name == "output"
         return Guess(
             {"kind": "yolo-nas", "boxes": boxes.name, "scores": scores.name},
             static(scores.shape, 2),
             (f"a box and scores for each of the {rows} cells of strides 8, 16, 32",),
             (
                 "boxes are corners in input pixels, scores are final",
-                "pixels are RGB, scaled to 0..1, as YOLO-NAS expects; it is trained with a margin "
-                "of 2 pixels, which is left out",
+                "pixels are RGB, from 0 to 255, as DAMO-YOLO expects"
+                if is_damo
+                else "pixels are RGB, scaled to 0..1, as YOLO-NAS expects; it is trained with a "
+                "margin of 2 pixels, which is left out",
             ),
-            PICTURE,
+            {"colour": "rgb", "fit": "letterbox", "pad": 0} if is_damo else PICTURE,
             is_decided=False,
         )

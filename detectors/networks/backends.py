@@ -16,7 +16,11 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.decoders.base import PICTURE_SIZE_INPUT
+from crosscue.detectors.decoders.base import (
+    PADDLE_SCALE_INPUT,
+    PADDLE_SIZE_INPUT,
+    PICTURE_SIZE_INPUT,
+)
 from crosscue.replay.errors import VehicleError, one_line
 from crosscue.replay.versions import installed
 
@@ -110,13 +114,19 @@ def _in_onnxruntime(weights: Weights, threads: int, size_px: Size | None) -> Net
     content = weights.content if size_px is None else free_size(weights.content)
     session = ort.InferenceSession(content, options, providers=_ort_providers(ort))
     inputs = [one.name for one in session.get_inputs()]
+    # Paddle's exporter sorts the inputs by name.
+    picture = next((one.name for one in session.get_inputs() if len(one.shape) > 2), inputs[0])
     names = [out.name for out in session.get_outputs()]
 
     def call(batch: Array) -> Mapping[str, Array]:
-        feed: dict[str, Array] = {inputs[0]: batch}
-        if PICTURE_SIZE_INPUT in inputs[1:]:
-            # Boxes are in pixels of the batch, as in every other layout.
-            feed[PICTURE_SIZE_INPUT] = np.array([batch.shape[:-3:-1]] * len(batch), np.int64)
+        # Boxes are in pixels of the batch, as in every other layout.
+        sizes = np.array([batch.shape[-2:]] * len(batch))
+        others: dict[str, Array] = {
+            PICTURE_SIZE_INPUT: sizes[:, ::-1].astype(np.int64),
+            PADDLE_SIZE_INPUT: sizes.astype(np.float32),
+            PADDLE_SCALE_INPUT: np.ones(sizes.shape, np.float32),
+        }
+        feed = {picture: batch} | {name: others[name] for name in inputs if name in others}
         return dict(zip(names, session.run(names, feed), strict=True))
 
     return _Function(f"onnxruntime {ort.__version__} {session.get_providers()[0]}", call)

@@ -6,16 +6,13 @@ import json
 import re
 from pathlib import Path
 
-import numpy as np
-import onnx
 import pytest
 import torch
 
 from crosscue.datasets.truth.truth import CueTruth, Truth, save
 from crosscue.detectors.catalog.card import read_card
 from crosscue.eval import cli
-from support.decoder_samples import CLASSES, SAMPLES, SIZE
-from support.onnx_models import constant_model
+from support.decoder_samples import CLASSES, SAMPLES, export
 from support.pandaset_drive import START_S, pandaset_drive
 from support.pictures import picture
 from support.torchvision_files import network
@@ -50,21 +47,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def export(path: Path, kind: str) -> None:
-    """Write a network of one kind that finds a stop sign in every picture."""
-    sample = SAMPLES[kind]()
-    outputs = {
-        name: values if values.dtype.kind == "i" else values.astype(np.float32)
-        for name, values in sample.outputs.items()
-    }
-    is_bytes = kind == "ssd-tensorflow"
-    shape = (1, SIZE[1], SIZE[0], 3) if is_bytes else sample.input_shape
-    model = onnx.load_model_from_string(constant_model(shape, outputs))
-    if is_bytes:
-        model.graph.input[0].type.tensor_type.elem_type = onnx.TensorProto.UINT8
-    path.write_bytes(model.SerializeToString())
-
-
 def follow_page(
     place: Path,
     weights: str,
@@ -95,7 +77,7 @@ def follow_page(
 def test_exported_network_is_scored_with_commands_of_page(
     place: Path, kind: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    export(place / "my.onnx", kind)
+    (place / "my.onnx").write_bytes(export(SAMPLES[kind]()))
 
     scored = follow_page(place, "my.onnx", kind, capsys, monkeypatch)
 

@@ -71,10 +71,10 @@ def test_names_are_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     "outputs",
     [
         {"depth": np.zeros((1, 1, 32, 64), np.float32)},
-        {"cells": np.zeros((1, 85, 2, 4), np.float32)},
+        {"cells": np.zeros((1, 85, 1, 2), np.float32)},
         {"a": scores((64, 32), 4), "b": scores((16, 8), 4)},
     ],
-    ids=["one channel", "cells of stride 16", "maps of two sizes"],
+    ids=["one channel", "cells of stride 32", "maps of two sizes"],
 )
 def test_other_maps_are_not_taken_for_classes(
     tmp_path: Path, outputs: dict[str, NDArray[np.float32]]

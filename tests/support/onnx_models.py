@@ -13,8 +13,21 @@ Array = NDArray[np.generic]
 OPSET = 17
 
 
-def constant_model(shape: tuple[int, ...], outputs: Mapping[str, Array]) -> bytes:
-    """A network that returns the same outputs for every input of a shape."""
+def constant_model(
+    shape: tuple[int, ...],
+    outputs: Mapping[str, Array],
+    inputs: Mapping[str, tuple[int, ...]] | None = None,
+    *,
+    is_bytes: bool = False,
+) -> bytes:
+    """A network that returns the same outputs for every input of a shape.
+
+    Args:
+        shape: Shape of the input named images.
+        outputs: Outputs by name.
+        inputs: Shapes of all inputs by name, instead.
+        is_bytes: True for inputs of bytes.
+    """
     nodes = [
         helper.make_node("Constant", [], [name], value=numpy_helper.from_array(values))
         for name, values in outputs.items()
@@ -25,8 +38,12 @@ def constant_model(shape: tuple[int, ...], outputs: Mapping[str, Array]) -> byte
         )
         for name, values in outputs.items()
     ]
-    given = helper.make_tensor_value_info("images", TensorProto.FLOAT, shape)
-    return _file(helper.make_graph(nodes, "constant", [given], declared))
+    kind = TensorProto.UINT8 if is_bytes else TensorProto.FLOAT
+    given = [
+        helper.make_tensor_value_info(name, kind, sides)
+        for name, sides in (inputs or {"images": shape}).items()
+    ]
+    return _file(helper.make_graph(nodes, "constant", given, declared))
 
 
 def open_model(shape: tuple[int | str, ...], metadata: Mapping[str, str]) -> bytes:

@@ -11,7 +11,7 @@ import pytest
 
 from crosscue.detectors.decoders.base import BoxOutput, Interface, Tensor, decoder_name
 from crosscue.detectors.decoders.table import DECODERS
-from support.decoder_samples import BOX, CLASS, CLASSES, SAMPLES, SCORE, SIZE, Sample
+from support.decoder_samples import BOX, CLASS, CLASSES, SAMPLES, SCORE, SIZE, Sample, input_shape
 
 
 @pytest.fixture(params=DECODERS, ids=decoder_name)
@@ -67,8 +67,11 @@ def test_missing_output_is_refused(decoder: type[BoxOutput]) -> None:
 
 def interface(sample: Sample, names: tuple[str, ...] = CLASSES) -> Interface:
     return Interface(
-        (Tensor("images", sample.input_shape),),
-        tuple(Tensor(name, array.shape) for name, array in sample.outputs.items()),
+        tuple(Tensor(name, shape or input_shape(sample)) for name, shape in sample.inputs.items()),
+        tuple(
+            Tensor(name, array.shape, array.dtype.kind == "i")
+            for name, array in sample.outputs.items()
+        ),
         {},
         names,
     )

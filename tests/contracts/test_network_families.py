@@ -1,0 +1,127 @@
+"""Every family of networks: known boxes are exact at a wide and a tall size, nonsense refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+import onnx
+import pytest
+
+import crosscue
+from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.catalog.recognise import guesses, plausible, read_interface
+from crosscue.detectors.decoders.base import Size, decoder_name
+from crosscue.detectors.decoders.table import DECODERS
+from crosscue.detectors.networks.model_detector import build
+from crosscue.replay.errors import VehicleError
+from support.decoder_samples import BOX, CLASS, CLASSES, EVERY, SCORE, SIZE, TALL, export
+from support.onnx_models import bright_box_model
+
+SIZES: Final = pytest.mark.parametrize("size", [SIZE, TALL], ids=["wide", "tall"])
+# Families whose files another one can have as well: --kind, or the number of class names, decides.
+TWINS: Final = {"yolox": {"yolox", "yolov5"}, "pp-yoloe": {"pp-yoloe", "yolov5"}}
+
+
+def test_every_family_has_an_export() -> None:
+    kinds = {make(SIZE).settings["kind"] for make in EVERY.values()}
+
+    assert kinds == set(map(decoder_name, DECODERS))
+
+
+@SIZES
+@pytest.mark.parametrize("family", EVERY)
+def test_family_is_recognised_without_options(tmp_path: Path, family: str, size: Size) -> None:
+    net = tmp_path / "net.onnx"
+    sample = EVERY[family](size)
+    net.write_bytes(export(sample, size))
+
+    model = read_interface(net)
+    some = guesses(model)
+    kept = plausible(net, model, some) if len(some) > 1 else some
+    found = {guess.settings["kind"] for guess in kept}
+
+    kind = sample.settings["kind"]
+    assert found <= TWINS.get(kind, {kind})
+    assert kind in found
+
+
+@SIZES
+@pytest.mark.parametrize("family", EVERY)
+def test_known_box_is_exact(tmp_path: Path, family: str, size: Size) -> None:
+    """The picture is twice the input, so that it has no margin."""
+    net = tmp_path / "net.onnx"
+    sample = EVERY[family](size)
+    net.write_bytes(export(sample, size))
+
+    card = crosscue.draft_card(net, kind=sample.settings["kind"], class_names=CLASSES)
+    width, height = 2 * size[0], 2 * size[1]
+    frame = Frame(0, "", np.zeros((height, width, 3), np.uint8), (width, height))
+    (found,) = build(card=str(card.path))([frame])
+
+    assert isinstance(found, Detections)
+    # Outputs are float32.
+    np.testing.assert_allclose(found.boxes_px, [2.0 * BOX], atol=1e-3)
+    np.testing.assert_allclose(found.scores, [SCORE], atol=1e-6)
+    assert found.labels == (CLASSES[CLASS],)
+
+
+@pytest.mark.parametrize("family", EVERY)
+def test_family_with_numbers_that_are_not_finite_gets_no_card(tmp_path: Path, family: str) -> None:
+    net = tmp_path / "net.onnx"
+    sample = EVERY[family](SIZE)
+    for values in sample.outputs.values():
+        if values.dtype.kind == "f":
+            values[...] = np.nan
+    net.write_bytes(export(sample))
+
+    with pytest.raises(VehicleError, match=r"not written.*(finite|scores)"):
+        crosscue.draft_card(net, kind=sample.settings["kind"], class_names=CLASSES)
+
+    assert not net.with_suffix(".toml").exists()
+
+
+def test_number_of_class_names_decides_between_families(tmp_path: Path) -> None:
+    """4 + 3 columns of Paddle's export are 5 + 2 of YOLOX's."""
+    net = tmp_path / "net.onnx"
+    net.write_bytes(export(EVERY["pp-yoloe, one output"](SIZE)))
+
+    with pytest.raises(crosscue.UsageError, match=r"several kinds fit: yolov5 .*pp-yoloe"):
+        crosscue.draft_card(net)
+
+    assert crosscue.draft_card(net, class_names=CLASSES).draft.kind == "pp-yoloe"
+
+
+@pytest.mark.parametrize("shape", [(1000, 600), (600, 1000)], ids=["tall", "wide"])
+def test_doubt_about_fit_is_said_with_both_results(tmp_path: Path, shape: tuple[int, int]) -> None:
+    net, street = tmp_path / "net.onnx", tmp_path / "street.png"
+    model = onnx.load_model_from_string(bright_box_model())
+    # Pixels are scaled to 0..1 in such a network's card.
+    model.graph.node[0].attribute[0].t.CopyFrom(
+        onnx.numpy_helper.from_array(np.array(0.5, np.float32))
+    )
+    net.write_bytes(model.SerializeToString())
+    cv2.imwrite(str(street), np.full((*shape, 3), 255, np.uint8))
+
+    drafted = crosscue.draft_card(net, class_names=["bright"], size_px=(96, 64), picture=street)
+
+    (doubt,) = [line for line in drafted.draft.assumed if "input.fit" in line]
+    assert '1 boxes with scores up to 1.00 with fit = "letterbox-center"' in doubt
+    assert f'1 boxes with scores up to 1.00 with fit = "stretch" in {shape[1]} x' in doubt
+    assert f"# Assumed, please check: {doubt}." in drafted.path.read_text()
+
+
+def test_fit_is_not_in_doubt_where_metadata_or_proportions_decide(tmp_path: Path) -> None:
+    street = tmp_path / "street.png"
+    for name, metadata, shape in (("a", {}, (640, 960)), ("b", {"names": "['x']"}, (600, 1000))):
+        model = onnx.load_model_from_string(bright_box_model())
+        onnx.helper.set_model_props(model, metadata)
+        net = tmp_path / f"{name}.onnx"
+        net.write_bytes(model.SerializeToString())
+        cv2.imwrite(str(street), np.full((*shape, 3), 255, np.uint8))
+
+        drafted = crosscue.draft_card(net, class_names=["x"], size_px=(96, 64), picture=street)
+
+        assert not [line for line in drafted.draft.assumed if "input.fit" in line]
