@@ -37,7 +37,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS
 from crosscue.replay.readers.mcap.bytes import ByteFile
 from crosscue.replay.readers.mcap.channels import TopicBook
-from crosscue.replay.readers.mcap.reader import open_mcap
+from crosscue.replay.readers.mcap.reader import McapLog
 from crosscue.replay.readers.mcap.segments import find_segments
 from crosscue.replay.readers.mcap.walk import UnreadChunk, Walk
 
@@ -158,13 +158,13 @@ def write_log(path: Path, compression: CompressionType, minutes: int = 1) -> Non
 
 
 def ours(path: Path) -> int:
-    with open_mcap(path, DEFAULT_LIMITS) as log:
+    with McapLog(path, DEFAULT_LIMITS) as log:
         return sum(len(block) for block in log.read(Ledger(str(path))))
 
 
 def ours_decoded(path: Path) -> int:
     count, ledger = 0, Ledger(str(path))
-    with open_mcap(path, DEFAULT_LIMITS) as log:
+    with McapLog(path, DEFAULT_LIMITS) as log:
         decoders = {topic.name: decoder_for(topic) for topic in log.topics}
         for block in log.read(ledger):
             decode = decoders[block.topic]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .columns import Block, Int64s, Topic
 from .files.closing import Closing
-from .ledger import Ledger
+from .ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +45,28 @@ class Selection:
         if self.end_ns is not None:
             keep &= t_ns < self.end_ns
         return keep
+
+    @property
+    def is_timed(self) -> bool:
+        """True if the time range has a bound."""
+        return self.start_ns is not None or self.end_ns is not None
+
+    def account(self, topic: str, t_ns: Int64s, ledger: Ledger) -> NDArray[np.bool_] | None:
+        """Count rows found in a log, and return a mask of the selected ones; None for all."""
+        ledger.find(topic, len(t_ns))
+        if not self.wants(topic):
+            ledger.skip(topic, NOT_ASKED_TOPIC, len(t_ns))
+            return np.zeros(len(t_ns), np.bool_)
+        if not self.is_timed:
+            return None
+        keep = self.inside(t_ns)
+        ledger.skip(topic, NOT_ASKED_TIME, len(t_ns) - int(np.count_nonzero(keep)))
+        return keep
+
+    def leave(self, topic: str, count: int, ledger: Ledger) -> None:
+        """Count rows that are not read, because none of them is selected."""
+        ledger.find(topic, count)
+        ledger.skip(topic, NOT_ASKED_TIME if self.wants(topic) else NOT_ASKED_TOPIC, count)
 
 
 EVERYTHING: Final = Selection()

@@ -51,17 +51,17 @@ class DataSet:
 
 # Folders are matched in this order, so data sets come before folders of images.
 FORMATS: Final[dict[str, Format]] = {
-    "mcap": Format((".mcap",), (), "crosscue.replay.readers.mcap.reader:open_mcap", "MCAP"),
+    "mcap": Format((".mcap",), (), "crosscue.replay.readers.mcap.reader:McapLog", "MCAP"),
     "rosbag1": Format(
-        (".bag", ".active"), (), "crosscue.replay.readers.rosbag1.reader:open_bag", "ROS 1 bag"
+        (".bag", ".active"), (), "crosscue.replay.readers.rosbag1.reader:BagLog", "ROS 1 bag"
     ),
     "rosbag2-sqlite3": Format(
-        (".db3",), (), "crosscue.replay.readers.rosbag2.db3:open_db3", "ROS 2 bag (sqlite3)"
+        (".db3",), (), "crosscue.replay.readers.rosbag2.db3:Db3Log", "ROS 2 bag (sqlite3)"
     ),
     "rosbag2": Format(
         (),
         ("metadata.yaml", "*.db3", "*.mcap", "*.db3.zstd", "*.mcap.zstd"),
-        "crosscue.replay.readers.rosbag2.folder:open_folder",
+        "crosscue.replay.readers.rosbag2.folder:FolderLog",
         "ROS 2 bag folder",
     ),
     "candump": Format(
@@ -71,9 +71,9 @@ FORMATS: Final[dict[str, Format]] = {
         "candump log",
     ),
     "asc": Format((".asc",), (), "crosscue.replay.readers.can_text.asc:open_asc", "Vector ASC log"),
-    "blf": Format((".blf",), (), "crosscue.replay.readers.blf.reader:open_blf", "Vector BLF log"),
+    "blf": Format((".blf",), (), "crosscue.replay.readers.blf.reader:BlfLog", "Vector BLF log"),
     "trc": Format((".trc",), (), "crosscue.replay.readers.can_text.trc:open_trc", "PEAK TRC log"),
-    "mf4": Format((".mf4",), (), "crosscue.replay.readers.mf4.reader:open_mf4", "ASAM MDF 4"),
+    "mf4": Format((".mf4",), (), "crosscue.replay.readers.mf4.reader:Mf4Log", "ASAM MDF 4"),
     "comma2k19": Format(
         (),
         ("processed_log", "global_pose"),

@@ -305,10 +305,7 @@ def _block(source: _Source, part: slice, ledger: Ledger, selection: Selection) -
     wanted = block.log_ns != NO_TIME
     timeless = int(count - wanted.sum())
     ledger.spoil(name, "a row without a valid time", timeless)
-    if selection.start_ns is not None:
-        wanted &= block.log_ns >= selection.start_ns
-    if selection.end_ns is not None:
-        wanted &= block.log_ns < selection.end_ns
+    wanted &= selection.inside(block.log_ns)
     ledger.skip(name, NOT_ASKED_TIME, int(count - timeless - wanted.sum()))
     if wanted.all():
         yield block

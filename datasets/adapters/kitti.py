@@ -361,7 +361,7 @@ def _read_oxts(oxts: Oxts, ledger: Ledger, selection: Selection) -> Iterator[Blo
     missing = oxts.files.missing_ns[selection.inside(oxts.files.missing_ns)]
     for name in TOPICS:
         ledger.drop(name, "a time without its packet", len(missing))
-        if selection.start_ns is None and selection.end_ns is None:
+        if not selection.is_timed:
             ledger.settle(name)
 
 

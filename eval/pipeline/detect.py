@@ -317,8 +317,7 @@ def _timings(seconds: float, counts: FrameCounts) -> Timings:
 
 def _declared(topic: Topic, selection: Selection) -> int | None:
     """Return the number of frames that the log declares; None if a time span is selected."""
-    is_whole = selection.start_ns is None and selection.end_ns is None
-    return topic.declared if is_whole else None
+    return None if selection.is_timed else topic.declared
 
 
 def _no_frames(topic: Topic, ledger: Ledger) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crosscue.replay.base import Selection
 from crosscue.replay.columns import BLOCK_ROWS, Block, CanFrames, Int64s, Topic
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.ledger import Ledger
 
 # Maximum number of buses of a log; more names are a sign of damage.
 BUSES_MAX: Final = 256
@@ -93,11 +93,6 @@ NO_ROWS: Final = FrameRows(
         _NO_FLAGS,
     ),
 )
-
-
-def merge_two(first: FrameRows, second: FrameRows) -> FrameRows:
-    """Merge two groups of rows by place."""
-    return merge_rows((first, second))
 
 
 def merge_rows(all_rows: Sequence[FrameRows]) -> FrameRows:
@@ -182,28 +177,12 @@ def blocks_by_bus(
         if not bool(is_here.all()):
             at = np.flatnonzero(is_here)
             log_ns, frames = log_ns.take(at), frames.take(at)
-        ledger.find(name, len(log_ns))
-        if not selection.wants(name):
-            ledger.skip(name, NOT_ASKED_TOPIC, len(log_ns))
-            continue
-        inside = in_time(log_ns, selection)
-        if inside is not None:
-            ledger.skip(name, NOT_ASKED_TIME, len(log_ns) - int(np.count_nonzero(inside)))
-            log_ns, frames = log_ns[inside], frames.take(inside)
+        kept = selection.account(name, log_ns, ledger)
+        if kept is not None:
+            log_ns, frames = log_ns[kept], frames.take(kept)
         for k in range(0, len(log_ns), BLOCK_ROWS):
             part = slice(k, k + BLOCK_ROWS)
             yield Block(name, log_ns[part], narrowed(frames.take(part)))
-
-
-def in_time(log_ns: Int64s, selection: Selection) -> NDArray[np.bool_] | None:
-    """Return a mask of the times in the selected range; None if all are selected."""
-    inside: NDArray[np.bool_] | None = None
-    if selection.start_ns is not None:
-        inside = log_ns >= selection.start_ns
-    if selection.end_ns is not None:
-        before = log_ns < selection.end_ns
-        inside = before if inside is None else inside & before
-    return inside
 
 
 def narrowed(frames: CanFrames) -> CanFrames:

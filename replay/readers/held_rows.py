@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, Protocol
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block, Int64s, Table, Topic
 from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.images.files import PictureFiles
 from crosscue.replay.seal.touched import Touched
@@ -50,19 +50,15 @@ class HeldRows:
 
     def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
         """Yield the selected rows and account for them."""
-        name, n = self.topic.name, len(self.t_ns)
+        name = self.topic.name
         ledger.declare(name, self.topic.declared)
-        ledger.find(name, n)
+        kept = selection.account(name, self.t_ns, ledger)
         for loss in self.losses:
             ledger.drop(name, *loss)
-        if not selection.wants(name):
-            ledger.skip(name, NOT_ASKED_TOPIC, n)
-        else:
-            wanted = selection.inside(self.t_ns)
-            ledger.skip(name, NOT_ASKED_TIME, n - int(wanted.sum()))
-            if wanted.any():
-                yield Block(name, self.t_ns, self.table).take(wanted)
-        if selection.start_ns is None and selection.end_ns is None:
+        if len(self.t_ns) and (kept is None or kept.any()):
+            block = Block(name, self.t_ns, self.table)
+            yield block if kept is None else block.take(kept)
+        if not selection.is_timed:
             ledger.settle(name, NO_PARTNER)
 
     def report_missing(self, ledger: Ledger) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crosscue.replay.base import Selection
 from crosscue.replay.columns import BLOCK_ROWS, Block, Bytes, Int64s, Messages
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 
 TOO_LARGE: Final = "message over the size limit"
@@ -70,32 +70,17 @@ def _one_topic(
     limits: Limits,
     ledger: Ledger,
 ) -> Iterator[Block]:
-    ledger.find(name, len(picked))
-    if not selection.wants(name):
-        ledger.skip(name, NOT_ASKED_TOPIC, len(picked))
-        return
-    picked = _within_time(rows, picked, name, selection, ledger)
+    log_ns = rows.log_ns[picked]
+    kept = selection.account(name, log_ns, ledger)
+    if kept is not None:
+        picked, log_ns = picked[kept], log_ns[kept]
     length = rows.stop[picked] - rows.start[picked]
     if len(length) and length.max() > limits.message_bytes:
         large = length > limits.message_bytes
         detail = f"{int(length.max())} bytes, limit {limits.message_bytes}"
-        ledger.skip(name, TOO_LARGE, int(large.sum()), detail, int(rows.log_ns[picked][large][0]))
-        picked = picked[~large]
+        ledger.skip(name, TOO_LARGE, int(large.sum()), detail, int(log_ns[large][0]))
+        picked, log_ns = picked[~large], log_ns[~large]
     for first in range(0, len(picked), BLOCK_ROWS):
-        part = picked[first : first + BLOCK_ROWS]
-        messages = Messages(rows.buffer, rows.start[part], rows.stop[part])
-        yield Block(name, rows.log_ns[part], messages)
-
-
-def _within_time(
-    rows: MixedRows,
-    picked: NDArray[np.intp],
-    name: str,
-    selection: Selection,
-    ledger: Ledger,
-) -> NDArray[np.intp]:
-    if selection.start_ns is None and selection.end_ns is None:
-        return picked
-    inside = selection.inside(rows.log_ns[picked])
-    ledger.skip(name, NOT_ASKED_TIME, int(len(picked) - inside.sum()))
-    return picked[inside]
+        part = slice(first, first + BLOCK_ROWS)
+        messages = Messages(rows.buffer, rows.start[picked[part]], rows.stop[picked[part]])
+        yield Block(name, log_ns[part], messages)

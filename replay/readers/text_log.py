@@ -13,7 +13,7 @@ import numpy as np
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import BLOCK_ROWS, Block, Table, Topic
 from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.ledger import Ledger
 
 # Maximum length of a line, which bounds memory; a longer line is not a row of numbers.
 MAX_LINE: Final = 4096
@@ -52,13 +52,11 @@ class TextLog(Closing):
             whole = _lines(file)
             while lines := list(islice(whole, BLOCK_ROWS)):
                 block = self._block_of(lines, ledger)
-                ledger.find(self.topic, len(block))
-                if not selection.wants(self.topic):
-                    ledger.skip(self.topic, NOT_ASKED_TOPIC, len(block))
-                    continue
-                wanted = block.take(selection.inside(block.log_ns))
-                ledger.skip(self.topic, NOT_ASKED_TIME, len(block) - len(wanted))
-                yield wanted
+                kept = selection.account(self.topic, block.log_ns, ledger)
+                if kept is None:
+                    yield block
+                elif kept.any():
+                    yield block.take(kept)
 
     def _block_of(self, lines: Sequence[str | None], ledger: Ledger) -> Block:
         t_ns: list[np.int64] = []

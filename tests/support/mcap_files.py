@@ -16,7 +16,7 @@ from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Messages
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
-from crosscue.replay.readers.mcap.reader import open_mcap
+from crosscue.replay.readers.mcap.reader import McapLog
 
 MAGIC = b"\x89MCAP0\r\n"
 # Log time, publish time, payload.
@@ -239,7 +239,7 @@ def read_back(
     """Read a file to its end, as plain tuples."""
     messages: dict[str, list[Message]] = {}
     ledger = Ledger(str(path))
-    with open_mcap(path, limits) as log:
+    with McapLog(path, limits) as log:
         names = tuple(topic.name for topic in log.topics)
         for block in log.read(ledger, selection):
             assert isinstance(block.rows, Messages)

@@ -10,16 +10,23 @@ occurrences do not form a chain (a payload that contains ``LOBJ``, or damage).
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import DATA, ERROR, REMOTE, Bytes, CanFrames, Int64s
-from crosscue.replay.readers.can_rows import FD_LENGTHS, IS_FD_LENGTH, FrameRows, merge_two, widened
-from crosscue.replay.readers.can_text.dialect import NO_ROWS
+from crosscue.replay.readers.can_rows import (
+    FD_LENGTHS,
+    IS_FD_LENGTH,
+    NO_ROWS,
+    FrameRows,
+    merge_rows,
+    widened,
+)
 
 MAGIC: Final = b"LOBJ"
 PADDING_MAX: Final = 8
@@ -222,15 +229,17 @@ _ERROR_EXT: Final = np.dtype(
 _ERROR_PLAIN: Final = np.dtype([("bus", "<u2"), ("length", "<u2")])
 _ERROR_FD64: Final = np.dtype([("bus", "u1"), ("code", "u1"), ("count", "u1"), ("ecc", "u1")])
 
-_KINDS: Final = (
-    ((1, 86), _CLASSIC),
-    ((100,), _FD),
-    ((101,), _FD64),
-    ((73,), _ERROR_EXT),
-    ((2,), _ERROR_PLAIN),
-    ((104,), _ERROR_FD64),
-)
-FRAME_TYPES: Final = frozenset(type_ for types, _ in _KINDS for type_ in types)
+
+class _Objects(NamedTuple):
+    """N objects of one kind: the stream with padding, their offsets and headers, and the counts."""
+
+    stream: Bytes
+    start: Int64s
+    header: NDArray[np.void]
+    tally: ObjectCounts
+
+
+_Parsed: TypeAlias = tuple[CanFrames, NDArray[np.bool_]]
 
 
 def parse_frames(
@@ -253,12 +262,13 @@ def parse_frames(
     tally.counted += len(start) - int(np.count_nonzero(type_ == RESTORE_POINT))
     rows = NO_ROWS
     is_frame = np.zeros(len(start), np.bool_)
-    for types, body in _KINDS:
+    for types, body, parse in _KINDS:
         is_kind = np.isin(type_, types)
         if bool(is_kind.any()):
             is_frame |= is_kind
-            found = _kind_rows(padded, start[is_kind], body, types, start_ns, tally, place)
-            rows = merge_two(rows, found)
+            at = start[is_kind]
+            objects = _Objects(padded, at, _records(padded, at, _TIMED), tally)
+            rows = merge_rows((rows, _kind_rows(objects, body, parse, start_ns, place)))
     for kind, count in zip(*np.unique(type_[~is_frame], return_counts=True), strict=True):
         if not 0 < kind <= TYPE_MAX:
             tally.damage("object of impossible type", f"{place}, type {kind}")
@@ -269,15 +279,13 @@ def parse_frames(
 
 
 def _kind_rows(
-    stream: Bytes,
-    start: Int64s,
+    objects: _Objects,
     body: np.dtype[np.void],
-    types: tuple[int, ...],
+    parse: Callable[[NDArray[np.void], _Objects], _Parsed],
     start_ns: int,
-    tally: ObjectCounts,
     place: str,
 ) -> FrameRows:
-    header = _records(stream, start, _TIMED)
+    stream, start, header, tally = objects
     is_known = ((header["version"] == 1) & (header["header"] == 32)) | (
         (header["version"] == 2) & (header["header"] == 40)
     )
@@ -288,7 +296,7 @@ def _kind_rows(
     ok = is_known & inside & is_timed
     tick_ns = np.where(ok, ticks, 0).astype(np.int64) * step
     record = _records(stream, np.where(ok, start + header["header"], 0), body)
-    frames, frame_ok = _FRAMES[types](stream, start, header, record, tally)
+    frames, frame_ok = parse(record, objects)
     ok &= frame_ok & (record["bus"] > 0)
     for k in np.flatnonzero(~ok).tolist():
         tally.damage("object that cannot be a frame", f"{place}, offset {start[k]}")
@@ -305,28 +313,14 @@ def _records(stream: Bytes, start: Int64s, layout: np.dtype[np.void]) -> NDArray
     return np.ascontiguousarray(rows).view(layout)[:, 0]
 
 
-def _classic(
-    stream: Bytes,
-    start: Int64s,
-    header: NDArray[np.void],
-    record: NDArray[np.void],
-    tally: ObjectCounts,
-) -> tuple[CanFrames, NDArray[np.bool_]]:
-    del stream, start, header, tally
+def _classic(record: NDArray[np.void], _: _Objects) -> _Parsed:
     kind = np.where(record["flags"] & 0x80, REMOTE, DATA)
     length = np.where(kind == REMOTE, 0, np.minimum(record["code"] & 15, 8)).astype(np.int64)
     frames, ok = _frames(record["id"], kind, length, record["payload"], np.zeros(len(kind), bool))
     return frames, ok & (record["code"] <= 15)
 
 
-def _fd(
-    stream: Bytes,
-    start: Int64s,
-    header: NDArray[np.void],
-    record: NDArray[np.void],
-    tally: ObjectCounts,
-) -> tuple[CanFrames, NDArray[np.bool_]]:
-    del stream, start, header, tally
+def _fd(record: NDArray[np.void], _: _Objects) -> _Parsed:
     is_fd = (record["fd"] & 1) != 0
     kind = np.where(record["flags"] & 0x80, REMOTE, DATA)
     length = np.where(kind == REMOTE, 0, record["count"]).astype(np.int64)
@@ -334,24 +328,18 @@ def _fd(
     return frames, ok & _fits_code(record["code"], length, is_fd, kind)
 
 
-def _fd64(
-    stream: Bytes,
-    start: Int64s,
-    header: NDArray[np.void],
-    record: NDArray[np.void],
-    tally: ObjectCounts,
-) -> tuple[CanFrames, NDArray[np.bool_]]:
+def _fd64(record: NDArray[np.void], of: _Objects) -> _Parsed:
     is_fd = (record["flags"] & 0x1000) != 0
     kind = np.where(record["flags"] & 0x10, REMOTE, DATA)
     length = np.where(kind == REMOTE, 0, record["count"]).astype(np.int64)
-    before = header["header"].astype(np.int64) + _FD64.itemsize
-    limit = np.where(record["extra"] > 0, record["extra"], header["size"]).astype(np.int64)
+    before = of.header["header"].astype(np.int64) + _FD64.itemsize
+    limit = np.where(record["extra"] > 0, record["extra"], of.header["size"]).astype(np.int64)
     stored = np.clip(limit - before, 0, np.minimum(length, 64))
-    text = sliding_window_view(stream, 64)[np.minimum(start + before, len(stream) - 64)]
+    text = sliding_window_view(of.stream, 64)[np.minimum(of.start + before, len(of.stream) - 64)]
     payload = np.where(np.arange(64) < stored[:, None], text, np.uint8(0))
     frames, ok = _frames(record["id"], kind, length, payload, is_fd)
     ok &= _fits_code(record["code"], length, is_fd, kind)
-    tally.padded += int(np.count_nonzero(ok & (stored < length)))
+    of.tally.padded += int(np.count_nonzero(ok & (stored < length)))
     return frames, ok
 
 
@@ -369,41 +357,30 @@ def _fits_code(
     return fits
 
 
-def _error_ext(
-    stream: Bytes,
-    start: Int64s,
-    header: NDArray[np.void],
-    record: NDArray[np.void],
-    tally: ObjectCounts,
-) -> tuple[CanFrames, NDArray[np.bool_]]:
-    del stream, start, header, tally
-    kind = np.full(len(record), ERROR)
+def _error_ext(record: NDArray[np.void], _: _Objects) -> _Parsed:
     length = np.minimum(record["code"] & 15, 8).astype(np.int64)
-    return _frames(record["id"], kind, length, record["payload"], np.zeros(len(kind), bool))
+    return _errors(record["id"], length, record["payload"])
 
 
-def _error(
-    stream: Bytes,
-    start: Int64s,
-    header: NDArray[np.void],
-    record: NDArray[np.void],
-    tally: ObjectCounts,
-) -> tuple[CanFrames, NDArray[np.bool_]]:
-    del stream, start, header, tally
-    n = len(record)
-    nothing = np.zeros(n, np.int64)
-    payload = np.zeros((n, 8), np.uint8)
-    return _frames(nothing, np.full(n, ERROR), nothing, payload, np.zeros(n, bool))
+def _error(record: NDArray[np.void], _: _Objects) -> _Parsed:
+    nothing = np.zeros(len(record), np.int64)
+    return _errors(nothing, nothing, np.zeros((len(record), 8), np.uint8))
 
 
-_FRAMES: Final = {
-    (1, 86): _classic,
-    (100,): _fd,
-    (101,): _fd64,
-    (73,): _error_ext,
-    (2,): _error,
-    (104,): _error,
-}
+def _errors(identifier: NDArray[np.integer], length: Int64s, payload: Bytes) -> _Parsed:
+    n = len(length)
+    return _frames(identifier, np.full(n, ERROR), length, payload, np.zeros(n, bool))
+
+
+_KINDS: Final = (
+    ((1, 86), _CLASSIC, _classic),
+    ((100,), _FD, _fd),
+    ((101,), _FD64, _fd64),
+    ((73,), _ERROR_EXT, _error_ext),
+    ((2,), _ERROR_PLAIN, _error),
+    ((104,), _ERROR_FD64, _error),
+)
+FRAME_TYPES: Final = frozenset(type_ for types, _, _ in _KINDS for type_ in types)
 
 
 def _frames(
@@ -412,7 +389,7 @@ def _frames(
     length: Int64s,
     payload: Bytes,
     is_fd: NDArray[np.bool_],
-) -> tuple[CanFrames, NDArray[np.bool_]]:
+) -> _Parsed:
     """Return frames with the bytes beyond their length cleared, and a mask of the valid frames."""
     is_extended = (identifier & _EXTENDED) != 0
     number = identifier & _ID_MASK

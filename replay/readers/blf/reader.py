@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.replay.base import EVERYTHING, Log, Selection
+from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.closing import Closing
@@ -83,17 +83,10 @@ class FileHeader:
     stop_ns: int | None
 
 
-def open_blf(path: Path, limits: Limits) -> Log:
-    """Open a BLF log.
-
-    Raises:
-        LogFormatError: It does not start with a BLF header.
-    """
-    return BlfLog(path, limits)
-
-
 class BlfLog(Closing):
     """An open BLF log (``Log``)."""
+
+    format: Final = "blf"
 
     def __init__(self, path: Path, limits: Limits) -> None:
         """Read the header and search the first containers for bus names.
@@ -101,25 +94,16 @@ class BlfLog(Closing):
         Raises:
             LogFormatError: The file does not start with a BLF header.
         """
-        self._path, self._limits = path, limits
+        self.path: Final = path
+        self._limits = limits
         self.touched: Final = Touched()
         with open_noted(path, self.touched) as file:
             self._header = _header_of(file, path)
         self._names: dict[str, int] = {}
-        first = _Pass(self._path, self._header, limits, self._names, self.touched)
+        first = _Pass(self.path, self._header, limits, self._names, self.touched)
         for n, rows in enumerate(first.rows()):
             if len(rows) or n >= _PEEKED:
                 break
-
-    @property
-    def path(self) -> Path:
-        """Path of the file."""
-        return self._path
-
-    @property
-    def format(self) -> str:
-        """Short name of the format."""
-        return "blf"
 
     @property
     def topics(self) -> tuple[Topic, ...]:
@@ -131,7 +115,7 @@ class BlfLog(Closing):
 
     def report_missing(self, ledger: Ledger) -> None:
         """Report that the file is shorter than the header declares; see ``KnowsItsEnd``."""
-        declared, size = self._header.file_bytes, self._path.stat().st_size
+        declared, size = self._header.file_bytes, self.path.stat().st_size
         if not self._header.objects:
             if self._names:
                 ledger.drop("", NOT_CLOSED, None, _UNCLOSED)
@@ -142,9 +126,7 @@ class BlfLog(Closing):
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """Yield all frames, several containers at a time; see ``Log.read``."""
         keep_memory()
-        reading = _Pass(
-            self._path, self._header, self._limits, self._names, self.touched, selection
-        )
+        reading = _Pass(self.path, self._header, self._limits, self._names, self.touched, selection)
         try:
             for rows in reading.rows():
                 yield from blocks_by_bus(rows, tuple(self._names), ledger, selection)

@@ -55,7 +55,7 @@ def unwanted(
     Returns:
         The end of each sequence by its start.
     """
-    if selection.start_ns is None and selection.end_ns is None:
+    if not selection.is_timed:
         return {}
     containers = _containers(file, position, size, start_ns)
     skips: dict[int, int] = {}

@@ -24,13 +24,14 @@ from crosscue.replay.files.closing import Closing
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import (
+    NO_ROWS,
     FrameRows,
     blocks_by_bus,
     bus_name,
     bus_number,
     bus_topic,
     keep_memory,
-    merge_two,
+    merge_rows,
     widened,
 )
 
@@ -164,8 +165,7 @@ class Dialect(ABC):
             Lines, ascending, whose frames contradict the counters. These frames are not yielded,
             and ``finish`` reports them.
         """
-        del chunk
-        return _NO_INTS
+        return chunk.rows.place[:0]
 
     def unended(self, head: bytes, tail: bytes) -> str:
         """Describe what the first and last bytes lack compared with a complete log, or empty."""
@@ -175,18 +175,6 @@ class Dialect(ABC):
     def finish(self, ledger: Ledger) -> None:
         """Report losses and notices after the complete file has been read."""
         del ledger
-
-
-_NO_INTS: Final = np.zeros(0, np.int64)
-NO_FRAMES: Final = CanFrames(
-    np.zeros(0, np.uint32),
-    np.zeros(0, np.bool_),
-    np.zeros(0, np.uint8),
-    np.zeros(0, np.uint8),
-    np.zeros((0, 8), np.uint8),
-    np.zeros(0, np.bool_),
-)
-NO_ROWS: Final = FrameRows(_NO_INTS, _NO_INTS, _NO_INTS, NO_FRAMES)
 
 
 class TextCanLog(Closing):
@@ -199,21 +187,12 @@ class TextCanLog(Closing):
             LogFormatError: The file is empty, or its first chunk contains no line of this format.
         """
         del limits  # the chunk size bounds all memory here
-        self._path, self._dialect = path, dialect
+        self.path: Final = path
+        self._dialect = dialect
         self._names: dict[str, int] = {}
         one = dialect()
-        self._format = one.format
+        self.format: Final = one.format
         self._peek(one)
-
-    @property
-    def path(self) -> Path:
-        """Path of the file."""
-        return self._path
-
-    @property
-    def format(self) -> str:
-        """Short name of the format."""
-        return self._format
 
     @property
     def topics(self) -> tuple[Topic, ...]:
@@ -227,9 +206,9 @@ class TextCanLog(Closing):
         """Yield all frames, chunk by chunk; see ``Log.read``."""
         keep_memory()
         scribe = _ChunkParser(self._dialect(), self._names, ledger)
-        size = self._path.stat().st_size
+        size = self.path.stat().st_size
         try:
-            for piece in read_lines(self._path):
+            for piece in read_lines(self.path):
                 rows = scribe.rows(piece)
                 yield from blocks_by_bus(rows, tuple(self._names), ledger, selection)
                 if scribe.stopped:
@@ -238,16 +217,16 @@ class TextCanLog(Closing):
             ledger.drop("", "reading the file failed", None, error.strerror or str(error))
         for name in self._names:
             ledger.topic(name)
-        if self._path.stat().st_size != size:
+        if self.path.stat().st_size != size:
             ledger.drop("", "file changed while it was read", None, f"had {size} bytes before")
         scribe.dialect.finish(ledger)
         ledger.integrity = scribe.dialect.integrity
 
     def report_missing(self, ledger: Ledger) -> None:
         """Report a truncated end, from the last 64 KiB; see ``KnowsItsEnd``."""
-        head, dialect = head_of(self._path), self._dialect()
-        with self._path.open("rb") as file:
-            file.seek(max(0, self._path.stat().st_size - HEAD_BYTES))
+        head, dialect = head_of(self.path), self._dialect()
+        with self.path.open("rb") as file:
+            file.seek(max(0, self.path.stat().st_size - HEAD_BYTES))
             tail = file.read(HEAD_BYTES)
         last = tail[tail.rfind(b"\n") + 1 :]
         if last not in (b"", _DOS_END):
@@ -259,16 +238,16 @@ class TextCanLog(Closing):
             ledger.drop("", missing, None)
 
     def _peek(self, dialect: Dialect) -> None:
-        ledger = Ledger(str(self._path))
+        ledger = Ledger(str(self.path))
         scribe = _ChunkParser(dialect, self._names, ledger)
-        for piece in read_lines(self._path, HEAD_BYTES):
+        for piece in read_lines(self.path, HEAD_BYTES):
             found = len(scribe.rows(piece))
             if isinstance(piece, Lines) or found or scribe.is_recognised:
                 break
         if not self._names and not scribe.is_recognised:
             why = next((f"{d.reason}: {d.detail}" for d in ledger.drops()), "it is empty")
             raise LogFormatError(
-                f"{self._path}: no frame of a {dialect.says} at its start ({why}); "
+                f"{self.path}: no frame of a {dialect.says} at its start ({why}); "
                 "check that it is a complete log of this format"
             )
 
@@ -389,7 +368,7 @@ class _ChunkParser:
             topic = bus and bus_name(bus)
             self._ledger.find(topic, len(numbers))
             self._ledger.skip(topic, reason, len(numbers), f"from line {numbers[0]} on")
-        rows = merge_two(rows, odd.rows())
+        rows = merge_rows((rows, odd.rows()))
         place, t_ns = rows.place, rows.log_ns
         if odd.times:
             at, values = (np.array(column, np.int64) for column in zip(*odd.times, strict=True))

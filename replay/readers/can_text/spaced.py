@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.columns import DATA, CanFrames, Int64s
-from crosscue.replay.readers.can_rows import merge_two
+from crosscue.replay.readers.can_rows import NO_ROWS, merge_rows
 
-from .dialect import NO_ROWS, Fast, payloads, picked
+from .dialect import Fast, payloads, picked
 from .digits import LABEL_MAX, Bools, hexadecimal, labels
 from .lines import SPACE, Lines, WordRanges
 
@@ -97,9 +97,9 @@ def is_direction(lines: Lines, word: WordRanges) -> Bools:
 
 def joined_fast(parts: Sequence[Fast]) -> Fast:
     """Merge the frames of a chunk by line; each part has its own bus names."""
-    rows = NO_ROWS
+    rows = [NO_ROWS]
     names: tuple[str, ...] = ()
     for part in parts:
-        shifted = replace(part.rows, bus=part.rows.bus + len(names))
-        rows, names = merge_two(rows, shifted), (*names, *part.names)
-    return Fast(rows, names)
+        rows.append(replace(part.rows, bus=part.rows.bus + len(names)))
+        names += part.names
+    return Fast(merge_rows(rows), names)

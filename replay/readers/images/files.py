@@ -13,7 +13,7 @@ import numpy as np
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import BLOCK_BYTES, Block, Images, Messages, Topic
 from crosscue.replay.decode.coding import IMAGE_SUFFIXES, MAGIC_BYTES, coding_of
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.timed_files import TimedFiles, list_files
 from crosscue.replay.seal.touched import Touched, open_noted
@@ -47,14 +47,13 @@ class PictureFiles:
         name = self.topic.name
         ledger.declare(name, self.topic.declared)
         if not selection.wants(name):
-            ledger.find(name, len(self.files.paths))
-            ledger.skip(name, NOT_ASKED_TOPIC, len(self.files.paths))
+            selection.leave(name, len(self.files.paths), ledger)
         else:
             for sentence in self.files.notices:
                 ledger.notice(sentence)
             yield from self._blocks(ledger, selection, limits)
         self._drop_missing(ledger, selection)
-        if selection.start_ns is None and selection.end_ns is None:
+        if not selection.is_timed:
             ledger.settle(name)
 
     def report_missing(self, ledger: Ledger) -> None:
@@ -81,8 +80,7 @@ class PictureFiles:
         without = self._drop_timeless(ledger)
         wanted = selection.inside(self.files.t_ns) & (self.files.t_ns >= 0)
         outside = len(self.files.paths) - without - int(np.count_nonzero(wanted))
-        ledger.find(name, outside)
-        ledger.skip(name, NOT_ASKED_TIME, outside)
+        selection.leave(name, outside, ledger)
         batch = _Batch(name)
         for i in np.flatnonzero(wanted):
             t_ns = int(self.files.t_ns[i])

@@ -26,7 +26,7 @@ from crosscue.replay.columns import BLOCK_BYTES, Block, Images, Int64s, Messages
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.closing import Closing
 from crosscue.replay.files.time_file_names import time_file_of_video
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.ledger import NOT_ASKED_TIME, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.time_file import SECOND_NS, TimeFile, read_time_file
 
@@ -113,8 +113,7 @@ class Video(Closing):
         ledger.declare(topic.name, topic.declared)
         index = self._index()
         if not selection.wants(topic.name):
-            ledger.find(topic.name, len(index.t_ns))
-            ledger.skip(topic.name, NOT_ASKED_TOPIC, len(index.t_ns))
+            selection.leave(topic.name, len(index.t_ns), ledger)
         else:
             for sentence in index.notices:
                 ledger.notice(sentence)

@@ -43,6 +43,8 @@ SUMMARY_GUESS: Final = 64 << 10
 class McapLog(Closing):
     """An open MCAP file; see ``crosscue.replay.base.Log``."""
 
+    format: Final = "mcap"
+
     def __init__(self, path: Path, limits: Limits, file: ByteFile | None = None) -> None:
         """Open the file and find its topics.
 
@@ -55,7 +57,7 @@ class McapLog(Closing):
             LogFormatError: The file is not MCAP, or has no readable record.
             OSError: The file cannot be opened.
         """
-        self._path = path
+        self.path: Final = path
         self._limits = limits
         self._book = TopicBook(limits)
         self._file = ByteFile(path) if file is None else file
@@ -64,16 +66,6 @@ class McapLog(Closing):
         except BaseException:
             self._file.close()
             raise
-
-    @property
-    def path(self) -> Path:
-        """Path of the file."""
-        return self._path
-
-    @property
-    def format(self) -> str:
-        """Short name of the format."""
-        return "mcap"
 
     @property
     def topics(self) -> tuple[Topic, ...]:
@@ -134,16 +126,6 @@ def declared_counts(segments: tuple[RecordingSegment, ...], book: TopicBook) -> 
         for channel_id, topic in segment.declarations(book).topics():
             counts[topic] += summary.statistics.by_channel.get(channel_id, 0)
     return dict(counts)
-
-
-def open_mcap(path: Path, limits: Limits) -> McapLog:
-    """Open an MCAP file.
-
-    Raises:
-        LogFormatError: The file is not MCAP, or has no readable record.
-        OSError: The file cannot be opened.
-    """
-    return McapLog(path, limits)
 
 
 def open_remote_mcap(name: Path, ranged: RangedFile, limits: Limits) -> McapLog | None:

@@ -118,7 +118,7 @@ def find_window(
     if summary.is_verified:
         is_asked &= chunks.is_unnamed | chunks.naming(_wanted(declarations, selection))
     else:
-        if selection.start_ns is None and selection.end_ns is None:
+        if not selection.is_timed:
             return "its index of chunks has no checksum"
         if not (_is_rising(chunks.start) and _is_rising(chunks.end)):
             return "its index of chunks has no checksum, and is not in order of time"

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import EVERYTHING, Log, Selection
+from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import BLOCK_ROWS, Block, Int64s, Table, Topic
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.closing import Closing
@@ -29,7 +29,6 @@ from crosscue.replay.readers.can_rows import (
     blocks_by_bus,
     bus_number,
     bus_topic,
-    in_time,
     keep_memory,
     merge_rows,
     merged_by_time,
@@ -109,17 +108,10 @@ class _Stored:
     values: Mapping[int, VariableValues]
 
 
-def open_mf4(path: Path, limits: Limits) -> Log:
-    """Open an MDF 4 log.
-
-    Raises:
-        LogFormatError: The file is not MDF 4, or its header or all its groups are damaged.
-    """
-    return Mf4Log(path, limits)
-
-
 class Mf4Log(Closing):
     """An open MDF 4 log (``Log``)."""
+
+    format: Final = "mf4"
 
     def __init__(self, path: Path, limits: Limits) -> None:
         """Read the structure, and the first records of bus groups to find the buses' names.
@@ -127,7 +119,8 @@ class Mf4Log(Closing):
         Raises:
             LogFormatError: The file is not MDF 4, or its header or all its groups are damaged.
         """
-        self._path, self._limits = path, limits
+        self.path: Final = path
+        self._limits = limits
         keep_memory()
         self.touched: Final = Touched()
         self._file = path.open("rb")
@@ -144,16 +137,6 @@ class Mf4Log(Closing):
         except BaseException:
             self._file.close()
             raise
-
-    @property
-    def path(self) -> Path:
-        """Path of the file."""
-        return self._path
-
-    @property
-    def format(self) -> str:
-        """Short name of the format."""
-        return "mf4"
 
     @property
     def topics(self) -> tuple[Topic, ...]:
@@ -378,7 +361,7 @@ class Mf4Log(Closing):
         The first records of chunks are found by bisection, because times ascend in MDF.
         """
         size, start_ns, end_ns = source.group.record_bytes, selection.start_ns, selection.end_ns
-        if not size or (start_ns is None and end_ns is None) or stored.stream.broken:
+        if not size or not selection.is_timed or stored.stream.broken:
             return 0, None
         total = stored.stream.size // size
         rows = max(_CHUNK_BYTES // size, 1)
@@ -464,21 +447,21 @@ class Mf4Log(Closing):
     def _table(
         self, source: _Source, records: Records, ledger: Ledger, selection: Selection
     ) -> Iterator[Block]:
-        count = len(records.rows)
         log_ns = self._times(source, Words(records.rows, records.first))
         if log_ns is None:
-            ledger.drop(source.topic, "time out of range", count, f"from record {records.first} on")
+            ledger.drop(
+                source.topic,
+                "time out of range",
+                len(records.rows),
+                f"from record {records.first} on",
+            )
             return
-        ledger.find(source.topic, count)
-        inside = in_time(log_ns, selection)
-        rows = records.rows
-        if inside is not None:
-            ledger.skip(source.topic, NOT_ASKED_TIME, count - int(np.count_nonzero(inside)))
-            if not bool(inside.any()):
-                return
-        table = self._columns(source, Words(rows, records.first), ledger)
-        if inside is not None:
-            log_ns, table = log_ns[inside], table.take(inside)
+        kept = selection.account(source.topic, log_ns, ledger)
+        if kept is not None and not bool(kept.any()):
+            return
+        table = self._columns(source, Words(records.rows, records.first), ledger)
+        if kept is not None:
+            log_ns, table = log_ns[kept], table.take(kept)
         for k in range(0, len(log_ns), BLOCK_ROWS):
             part = slice(k, k + BLOCK_ROWS)
             yield Block(source.topic, log_ns[part], table.take(part))

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, cast
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import BLOCK_ROWS, Bytes, Int64s
+from crosscue.replay.compiled import kept
 
 from .blocks import VLSD_GROUP, ChannelGroup, DataGroup
 from .stream import LinkedData
@@ -375,7 +376,7 @@ class _Finder:
         room = len(content) // smallest + 1
         groups, starts = np.empty(room, np.int64), np.empty(room, np.int64)
         buffer = np.frombuffer(content, np.uint8)
-        count, at, is_unknown = _walker()(
+        count, at, is_unknown = kept(_walk)(
             buffer, self._id_bytes, self._ids, self._order, self.sizes, groups, starts
         )
         unknown = _number(content, at, at + self._id_bytes) if is_unknown else -1
@@ -386,19 +387,47 @@ def _number(content: bytes, start: int, stop: int) -> int:
     return int.from_bytes(content[start:stop], "little")
 
 
-_Walker = Callable[
-    [Bytes, int, NDArray[np.uint64], Int64s, Int64s, Int64s, Int64s], tuple[int, int, bool]
-]
-_walk: _Walker | None = None
+def _walk(
+    buffer: Bytes,
+    id_bytes: int,
+    ids: NDArray[np.uint64],
+    order: Int64s,
+    sizes: Int64s,
+    groups: Int64s,
+    starts: Int64s,
+) -> tuple[int, int, bool]:
+    """Find the records of ``buffer``; slow unless compiled, see ``_Finder``.
 
-
-def _walker() -> _Walker:
-    global _walk
-    if _walk is None:
-        from .records_numba import walk
-
-        _walk = cast("_Walker", walk)
-    return _walk
+    Returns:
+        Number of records, start of the first incomplete one, and whether its identifier is unknown.
+    """
+    at = 0
+    count = 0
+    end = len(buffer)
+    while at + id_bytes <= end and count < len(groups):
+        identifier = np.uint64(0)
+        for i in range(id_bytes - 1, -1, -1):
+            identifier = (identifier << np.uint64(8)) | np.uint64(buffer[at + i])
+        low = np.searchsorted(ids, identifier)
+        if low == len(ids) or ids[low] != identifier:
+            return count, at, True
+        group = order[low]
+        start = at + id_bytes
+        size = sizes[group]
+        if size < 0:
+            if start + 4 > end:
+                break
+            size = 0
+            for i in range(3, -1, -1):
+                size = size * 256 + np.int64(buffer[start + i])
+            start += 4
+        if size > end - start:
+            break
+        groups[count] = group
+        starts[count] = start
+        count += 1
+        at = start + size
+    return count, at, False
 
 
 def _lengths(content: Bytes, start: Int64s) -> Int64s:

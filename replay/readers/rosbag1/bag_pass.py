@@ -11,7 +11,7 @@ import numpy as np
 
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Block, Bytes, Int64s, Topic
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mixed import MixedRows, blocks_of
 
@@ -252,7 +252,7 @@ class Pass:
             return
         for info in window.left:
             self._checked.left += 1
-            self._pass_over(info, self._selection)
+            self._pass_over(info)
 
     def _taken(
         self, found: Iterator[ChunkUnit | BagRecord | BytesBetween], index_at: int
@@ -274,13 +274,10 @@ class Pass:
                 self._batch.add(*taken)
         self._settle_owed()
 
-    def _pass_over(self, info: ChunkInfo, asked: Selection) -> None:
+    def _pass_over(self, info: ChunkInfo) -> None:
         """Account for a chunk of unselected messages without reading them."""
         for conn, count in info.counts.items():
-            name = self._roster.topic_of(conn)
-            self._ledger.find(name, count)
-            reason = NOT_ASKED_TIME if asked.wants(name) else NOT_ASKED_TOPIC
-            self._ledger.skip(name, reason, count)
+            self._selection.leave(self._roster.topic_of(conn), count, self._ledger)
 
     def _record(self, record: BagRecord) -> tuple[bytes, ChunkRows] | None:
         """Process a record outside chunks; return a message as a separate chunk."""
@@ -468,7 +465,7 @@ class Pass:
         if not is_outside and any(asked.wants(name) for name in names.values()):
             return False
         self._checked.left += 1
-        self._pass_over(info, asked)
+        self._pass_over(info)
         return True
 
     def _flush(self) -> Iterator[Block]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block, Topic
@@ -30,7 +31,11 @@ from .window import find_bag_window
 class BagLog(Closing):
     """An open ROS 1 bag; see ``crosscue.replay.base.Log``."""
 
-    def __init__(self, path: Path, limits: Limits, file: BagFile | None = None) -> None:
+    format: Final = "rosbag1"
+
+    def __init__(
+        self, path: Path, limits: Limits = DEFAULT_LIMITS, file: BagFile | None = None
+    ) -> None:
         """Open the bag and find its topics.
 
         Args:
@@ -42,7 +47,7 @@ class BagLog(Closing):
             LogFormatError: Not a ROS 1 bag of format 2.0, encrypted, or without readable records.
             OSError: The file cannot be opened.
         """
-        self._path = path
+        self.path: Final = path
         self._limits = limits
         self._notices: list[str] = []
         self._losses: list[tuple[str, str]] = []
@@ -55,16 +60,6 @@ class BagLog(Closing):
             self.close()
             raise
         self._roster = Roster(self._contents)
-
-    @property
-    def path(self) -> Path:
-        """Path of the file."""
-        return self._path
-
-    @property
-    def format(self) -> str:
-        """Short name of the format."""
-        return "rosbag1"
 
     @property
     def topics(self) -> tuple[Topic, ...]:
@@ -129,7 +124,7 @@ class BagLog(Closing):
         start = self._file.bytes_at(0, len(MAGIC))
         if start != MAGIC:
             raise LogFormatError(
-                f"{self._path}: begins with {start!r}, expected {MAGIC!r} (ROS 1 bag format 2.0); "
+                f"{self.path}: begins with {start!r}, expected {MAGIC!r} (ROS 1 bag format 2.0); "
                 "migrate older bags with 'rosbag fix', or check the file"
             )
         record = self._file.whole_record(len(MAGIC))
@@ -140,7 +135,7 @@ class BagLog(Closing):
         if encryptor:
             name = encryptor.decode("utf-8", "backslashreplace")
             raise LogError(
-                f"{self._path}: encrypted by {name!r}; decrypt it first with 'rosbag decrypt'"
+                f"{self.path}: encrypted by {name!r}; decrypt it first with 'rosbag decrypt'"
             )
         return record.end, record
 
@@ -157,7 +152,7 @@ class BagLog(Closing):
         self._say_why_walked(header, contents)
         if not contents.connections and header is None:
             raise LogFormatError(
-                f"{self._path}: no readable record in {self._file.size} bytes; expected a ROS 1 bag"
+                f"{self.path}: no readable record in {self._file.size} bytes; expected a ROS 1 bag"
             )
         return contents
 
@@ -186,16 +181,6 @@ class BagLog(Closing):
         else:
             detail = f"index declared at byte {self._index_at}, file ends at {self._file.size}"
             self._losses.append(("file is cut", detail))
-
-
-def open_bag(path: Path, limits: Limits = DEFAULT_LIMITS) -> BagLog:
-    """Open a ROS 1 bag.
-
-    Raises:
-        LogError: Not a ROS 1 bag of format 2.0, encrypted, or without readable records.
-        OSError: The file cannot be opened.
-    """
-    return BagLog(path, limits)
 
 
 def open_remote_bag(name: Path, ranged: RangedFile, limits: Limits) -> BagLog | None:

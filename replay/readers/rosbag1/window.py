@@ -82,7 +82,7 @@ def find_bag_window(
     infos = tuple(contents.infos[at] for at in sorted(contents.infos))
     if not contents.is_complete or not infos:
         return "it has no usable index of chunks"
-    if selection.start_ns is None and selection.end_ns is None:
+    if not selection.is_timed:
         return "its index of chunks has no checksum"
     if chunk_count != len(infos):
         return f"its index lists {len(infos)} chunks, its header states {chunk_count}"

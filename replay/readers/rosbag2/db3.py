@@ -17,7 +17,7 @@ import numpy as np
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block, Int64s, Messages, Topic
 from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.can_rows import keep_memory
 from crosscue.replay.readers.mixed import MixedRows, blocks_of
@@ -43,7 +43,9 @@ INDEX_DIFFERS: Final = "row and time index disagree"
 class Db3Log(Closing):
     """An open ROS 2 SQLite bag; see ``crosscue.replay.base.Log``."""
 
-    def __init__(self, path: Path, limits: Limits) -> None:
+    format: Final = "rosbag2-sqlite3"
+
+    def __init__(self, path: Path, limits: Limits = DEFAULT_LIMITS) -> None:
         """Open the file and find its topics.
 
         Raises:
@@ -51,7 +53,7 @@ class Db3Log(Closing):
             LogError: SQLite cannot open the file.
             OSError: The file cannot be read.
         """
-        self._path = path
+        self.path: Final = path
         self._limits = limits
         self._stamp = _stamp(path)
         self._database = open_database(path, limits)
@@ -60,16 +62,6 @@ class Db3Log(Closing):
         except BaseException:
             self.close()
             raise
-
-    @property
-    def path(self) -> Path:
-        """Path of the file."""
-        return self._path
-
-    @property
-    def format(self) -> str:
-        """Short name of the format."""
-        return "rosbag2-sqlite3"
 
     @property
     def topics(self) -> tuple[Topic, ...]:
@@ -90,7 +82,7 @@ class Db3Log(Closing):
         """Yield blocks of messages in the order of their row ids; see ``Log.read``."""
         one = _Pass(self._database, self._tables, self._limits, ledger, selection)
         yield from one.blocks()
-        if _stamp(self._path) != self._stamp:
+        if _stamp(self.path) != self._stamp:
             ledger.drop("", "file changed while it was read", None, "read it again")
 
     def report_missing(self, ledger: Ledger) -> None:
@@ -166,7 +158,7 @@ class _Pass:
     def _narrow(self) -> None:
         """Restrict the scan to the row ids of the selected times, if the index is complete."""
         asked, index = self._selection, self._tables.index
-        if index is None or (asked.start_ns is None and asked.end_ns is None):
+        if index is None or not asked.is_timed:
             return
         counts = self._tables.counts(self._database)
         if counts is None:
@@ -350,9 +342,7 @@ class _Pass:
                 continue
             rest = declared - self._ledger.topic(name).in_file
             if rest > 0:
-                reason = NOT_ASKED_TIME if self._selection.wants(name) else NOT_ASKED_TOPIC
-                self._ledger.find(name, rest)
-                self._ledger.skip(name, reason, rest)
+                self._selection.leave(name, rest, self._ledger)
 
 
 def _place_table(places: Mapping[int, int]) -> Int64s:
@@ -383,13 +373,3 @@ def _lock(database: Database) -> Iterator[bool]:
 def _stamp(path: Path) -> tuple[int, int, int]:
     at = path.stat()
     return at.st_ino, at.st_size, at.st_mtime_ns
-
-
-def open_db3(path: Path, limits: Limits = DEFAULT_LIMITS) -> Db3Log:
-    """Open a ROS 2 SQLite bag.
-
-    Raises:
-        LogError: Not a ROS 2 bag, damaged in its first pages, or locked.
-        OSError: The file cannot be read.
-    """
-    return Db3Log(path, limits)

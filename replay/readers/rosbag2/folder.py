@@ -36,14 +36,16 @@ OTHER_TYPE: Final = "another message type on the same topic"
 class FolderLog(Closing):
     """An open ROS 2 bag folder; see ``crosscue.replay.base.Log``."""
 
-    def __init__(self, path: Path, limits: Limits) -> None:
+    format: Final = "rosbag2"
+
+    def __init__(self, path: Path, limits: Limits = DEFAULT_LIMITS) -> None:
         """Find the storage files and their topics.
 
         Raises:
             LogError: No storage file can be opened.
             OSError: The folder cannot be listed.
         """
-        self._path = path
+        self.path: Final = path
         self._limits = limits
         self._notices: list[str] = []
         self._metadata = read_metadata(path / "metadata.yaml")
@@ -60,16 +62,6 @@ class FolderLog(Closing):
                 "readable storage file"
             )
         self._topics = _union(self._splits)
-
-    @property
-    def path(self) -> Path:
-        """Path of the folder."""
-        return self._path
-
-    @property
-    def format(self) -> str:
-        """Short name of the format."""
-        return "rosbag2"
 
     @property
     def topics(self) -> tuple[Topic, ...]:
@@ -252,13 +244,3 @@ def _absorb(ledger: Ledger, own: Ledger, name: str) -> None:
     )
     for sentence in own.notices:
         ledger.notice(f"{name}: {sentence}")
-
-
-def open_folder(path: Path, limits: Limits = DEFAULT_LIMITS) -> FolderLog:
-    """Open a ROS 2 bag folder.
-
-    Raises:
-        LogError: No storage file can be opened.
-        OSError: The folder cannot be listed.
-    """
-    return FolderLog(path, limits)

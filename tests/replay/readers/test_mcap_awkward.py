@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from crosscue.replay.limits import Limits
-from crosscue.replay.readers.mcap.reader import open_mcap
+from crosscue.replay.readers.mcap.reader import McapLog
 from support.mcap_files import (
     ChunkOf,
     McapFile,
@@ -71,7 +71,7 @@ def test_one_name_with_two_types_becomes_separate_topics_with_notice(tmp_path: P
     ]
     path = stored(tmp_path / "x.mcap", McapFile([ChunkOf(records)]))
 
-    with open_mcap(path, Limits()) as log:
+    with McapLog(path, Limits()) as log:
         types = {topic.name: (topic.type_name, topic.declared) for topic in log.topics}
     reading = read_back(path)
 

@@ -15,7 +15,7 @@ import zstandard
 
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
-from crosscue.replay.readers.mcap.reader import open_mcap
+from crosscue.replay.readers.mcap.reader import McapLog
 from support.mcap_damage import Kind, copies, judge, sound_files, sound_parts
 from support.mcap_files import (
     MAGIC,
@@ -186,7 +186,7 @@ def test_unreadable_file_is_refused_in_one_line(tmp_path: Path, content: bytes, 
     path = tmp_path / "log.mcap"
     path.write_bytes(content)
     with pytest.raises(LogFormatError, match=what) as refusal:
-        open_mcap(path, DEFAULT_LIMITS)
+        McapLog(path, DEFAULT_LIMITS)
 
     assert "\n" not in str(refusal.value)
     assert str(path) in str(refusal.value)
@@ -254,7 +254,7 @@ def test_schema_over_size_limit_is_omitted(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     path.write_bytes(McapFile([ChunkOf(records)]).coded())
 
-    with open_mcap(path, Limits(schema_bytes=1_000)) as log:
+    with McapLog(path, Limits(schema_bytes=1_000)) as log:
         (topic,) = log.topics
     reading = read_back(path, limits=Limits(schema_bytes=1_000))
 
@@ -333,7 +333,7 @@ def test_file_truncated_while_open_is_reported(tmp_path: Path) -> None:
     coded = McapFile(sound_parts("zstd", is_chunked=True)).coded()
     path.write_bytes(coded)
     ledger = Ledger(str(path))
-    with open_mcap(path, DEFAULT_LIMITS) as log:
+    with McapLog(path, DEFAULT_LIMITS) as log:
         with path.open("r+b") as stream:
             stream.truncate(len(coded) // 2)
         given = sum(len(block) for block in log.read(ledger))

@@ -14,7 +14,7 @@ from rosbags.rosbag1 import Reader
 from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.limits import Limits
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.readers.rosbag1.reader import open_bag
+from crosscue.replay.readers.rosbag1.reader import BagLog
 from support.data import shared
 from support.rosbag_files import (
     START_NS,
@@ -274,7 +274,7 @@ def test_chunk_with_too_many_records_is_not_read_completely(tmp_path: Path) -> N
     from crosscue.replay.ledger import Ledger
 
     ledger = Ledger("a")
-    with open_bag(path, limits) as log:
+    with BagLog(path, limits) as log:
         rows = sum(len(block) for block in log.read(ledger))
 
     assert rows < 3000

@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Reader
 
 from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.readers.rosbag2.db3 import open_db3
+from crosscue.replay.readers.rosbag2.db3 import Db3Log
 from support.data import shared
 from support.rosbag_files import (
     Row,
@@ -200,7 +200,7 @@ def test_locked_database_is_refused(tmp_path: Path) -> None:
     writer.execute("BEGIN EXCLUSIVE")
     try:
         with pytest.raises(LogError, match="locked by another program"):
-            open_db3(path)
+            Db3Log(path)
     finally:
         writer.close()
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS
-from crosscue.replay.readers.rosbag2.db3 import open_db3
+from crosscue.replay.readers.rosbag2.db3 import Db3Log
 from crosscue.replay.readers.rosbag2.pages import PageRows, page_rows
 from crosscue.replay.readers.rosbag2.sqlite import open_database
 from support.rosbag_files import read_rows
@@ -205,7 +205,7 @@ def test_file_truncated_during_reading_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     fill(empty(path, 512, 0), 9, 150, 3000, has_index=True)
     ledger = Ledger("a")
-    with open_db3(path) as log:
+    with Db3Log(path) as log:
         blocks = log.read(ledger)
         next(blocks)
         os.truncate(path, 2048)

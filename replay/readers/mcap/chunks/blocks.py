@@ -45,7 +45,7 @@ class BlockBuilder:
         self._ledger = ledger
         self._selection = selection
         self._limits = limits
-        self._is_timeless = selection.start_ns is None and selection.end_ns is None
+        self._is_timeless = not selection.is_timed
 
     def build(self, rows: Rows, checks: Checks, at: int) -> Iterator[Block]:
         """Yield the messages of ``rows``, one block per topic, by the channels valid there.
@@ -95,11 +95,8 @@ class BlockBuilder:
 
     def skip_counted(self, channel_id: int, count: int) -> None:
         """Account for messages in unread chunks, by the counts of the statistics."""
-        topic = self.declarations.topic(channel_id)
         self.met[channel_id] += count
-        self._ledger.find(topic, count)
-        is_wanted = self._selection.wants(topic)
-        self._ledger.skip(topic, NOT_ASKED_TIME if is_wanted else NOT_ASKED_TOPIC, count)
+        self._selection.leave(self.declarations.topic(channel_id), count, self._ledger)
 
     def skip_oversized(self, channel_id: int, log: int, size: int, at: int) -> None:
         """Account for a message outside chunks that exceeds the size limit."""
