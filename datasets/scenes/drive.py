@@ -342,6 +342,7 @@ class _Record:
                 log_sha256=sha256_of(folder / "drive.mcap"),
                 start_ns=start_ns,
                 end_ns=int(motion.t_ns[-1]) + step,
+                place=layout.name,
                 pose="pose.tum",
                 mounting=Mounting(),
                 mounting_source=SOURCE,

@@ -132,6 +132,10 @@ class Truth(TruthSection):
     start_ns: int
     end_ns: int
     """End of the half-open range of log times that the truth covers."""
+    place: str = ""
+    """Name of the place. Drives of one place are not independent, so scores and comparisons
+    resample places. Default: positions within 50 m of each other where the truth has an origin and
+    a trajectory, else the names of the intersections."""
     pose: str | None = None
     """TUM trajectory, a file in the same folder: seconds on the log clock, metres, quaternion."""
     pose_point: Literal["rear_axle", "camera", "antenna", "imu"] = "rear_axle"

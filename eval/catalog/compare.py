@@ -25,6 +25,7 @@ from crosscue.eval.scoring.by_drive import (
     direction,
     no_longer_scored,
 )
+from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.replay.errors import UnreadableRunError, UsageError
 from crosscue.replay.files import door
@@ -33,7 +34,7 @@ from crosscue.replay.limits import MIB
 from crosscue.replay.safe_text import visible
 from crosscue.results import HIDDEN, Result
 
-from .paired import FALSE_ALARMS, MIN_DRIVES, PairedMetric, Verdict, compare_drives
+from .paired import FALSE_ALARMS, MIN_PLACES, PairedMetric, Verdict, compare_drives
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -66,7 +67,7 @@ class Tolerance(NamedTuple):
         return self.by * abs(before) if self.is_fraction else self.by
 
 
-ORDER: Final[tuple[Verdict, ...]] = ("worse", "better", "undecided")
+ORDER: Final[tuple[Verdict, ...]] = ("worse", "better", "undecided", "too few places")
 NONE: Final = Tolerance("*", 0.0, False)
 
 
@@ -267,7 +268,10 @@ def run_contributions(run: RunFolder) -> list[DriveMetric] | None:
     folder = run if _is_pooled(run.path) else RunFolder(run.file(FOLDER))
     if not folder.file(f"{BY_DRIVE}.parquet").exists():
         return None
-    return [DriveMetric(**row) for row in folder.table(BY_DRIVE).to_pylist()]
+    table = folder.table(BY_DRIVE)
+    if "places" not in table.column_names:
+        return None
+    return [DriveMetric(**row) for row in table.to_pylist()]
 
 
 def open_scored(path: Path) -> RunFolder:
@@ -440,7 +444,7 @@ def _failure(one: PairedMetric) -> str:
         return ""
     return (
         f"{_value(one.before)} -> {_value(one.after)}, 95 % {one.low:+.3g} to {one.high:+.3g} "
-        f"over {one.drives} drives"
+        f"over {one.places} places"
     )
 
 
@@ -450,7 +454,8 @@ def _markdown_lines(found: Comparison) -> Iterator[str]:
     differing = [one for one in found.judged if one.before != one.after]
     undecided = [one for one in differing if one.verdict == "undecided"]
     yield (
-        f"**{counts[0]} worse, {counts[1]} better, {len(undecided)} undecided**, "
+        f"**{counts[0]} worse, {counts[1]} better, {len(undecided)} undecided"
+        f"{_few_text(found)}**, "
         f"{len(found.judged) - len(differing)} equal, over {both} drives"
     )
     notes = [
@@ -465,20 +470,20 @@ def _markdown_lines(found: Comparison) -> Iterator[str]:
     yield from (f"\n{note}." for note in notes if note)
     shown = sorted(differing, key=lambda one: (ORDER.index(one.verdict), one.p, one.path))
     if shown or found.no_longer_scored:
-        yield "\n| metric | before | after | difference (95 %) | drives | verdict |"
+        yield "\n| metric | before | after | difference (95 %) | places | verdict |"
         yield "|---|---|---|---|---|---|"
     for path in found.no_longer_scored:
         yield f"| {_cell(path)} | | | | | **worse**: no longer scored |"
     kept = max(MAX_LINES, sum(counts))
     for one in shown[:kept]:
-        ends = "too few drives"
+        ends = TOO_FEW
         if not math.isnan(one.low):
             ends = f"{one.low:+.3g} to {one.high:+.3g}"
         verdict = "**worse**" if one.verdict == "worse" else one.verdict
-        more = f"; {one.more_drives:,} more drives would decide" if one.more_drives else ""
+        more = _more_text(one)
         yield (
             f"| {_cell(one.path)} | {one.before:.4g} | {one.after:.4g} | "
-            f"{one.after - one.before:+.3g} ({ends}) | {one.drives} | {verdict}{more} |"
+            f"{one.after - one.before:+.3g} ({ends}) | {one.places} | {verdict}{more} |"
         )
     if len(shown) > kept:
         yield f"\n{len(shown) - kept} more are undecided."
@@ -494,19 +499,33 @@ def _verdict_lines(found: Comparison, differing: int) -> Iterator[str]:
     left_out = f"; {only_first} only in the first, {only_second} only in the second"
     where = "on both sides" if found.is_many else "in both runs"
     yield f"drives     {both} {where}" + (left_out if only_first or only_second else "")
-    if differing and both < MIN_DRIVES:
-        yield f"           too few to judge: below {MIN_DRIVES} drives every metric is undecided"
+    places = max((one.places for one in found.judged), default=0)
+    if differing and places < MIN_PLACES:
+        yield f"           too few places: {places}, {MIN_PLACES} wanted for a verdict"
     elif differing:
         yield (
             f"           a metric that did not change gets a verdict in at most "
             f"{100 * FALSE_ALARMS:.0f} % of comparisons, over all metrics"
         )
     worse, better = len(found.worse), len(found.of("better"))
-    undecided = differing - worse - better + len(found.no_longer_scored)
+    undecided = sum(one.verdict == "undecided" and one.before != one.after for one in found.judged)
     yield (
         f"worse      {worse or 'nothing is worse'}; better {better or 'nothing'}; "
-        f"undecided {undecided or 'nothing'}"
+        f"undecided {undecided or 'nothing'}{_few_text(found)}"
     )
+
+
+def _few_text(found: Comparison) -> str:
+    """Return the number of metrics that differ at too few places, as a suffix."""
+    few = sum(one.verdict == "too few places" and one.before != one.after for one in found.judged)
+    return f", {few} at too few places" if few else ""
+
+
+def _more_text(one: PairedMetric) -> str:
+    if not one.more_places:
+        return ""
+    wanted = "are wanted" if one.verdict == "too few places" else "would decide"
+    return f"; {one.more_places:,} more places {wanted}"
 
 
 def _first_of(things: tuple[T, ...], what: str) -> Iterator[T | str]:
@@ -529,14 +548,15 @@ def _table_lines(one: TableChange) -> Iterator[str]:
 
 
 def _judged_lines(one: PairedMetric) -> Iterator[str]:
-    label = "WORSE" if one.verdict == "worse" else one.verdict
+    label = {"worse": "WORSE", "too few places": "too few"}.get(one.verdict, one.verdict)
     yield f"{label:11}{visible(one.path)}: {_value(one.before)} -> {_value(one.after)}"
-    ends = "too few drives" if math.isnan(one.low) else f"95 % {one.low:+.3g} to {one.high:+.3g}"
+    ends = TOO_FEW if math.isnan(one.low) else f"95 % {one.low:+.3g} to {one.high:+.3g}"
     seen = "" if not math.isfinite(one.could_see) else f"; detectable: {one.could_see:.3g}"
     allowed = f"; allowed {one.allowed:.3g}" if one.allowed else ""
     drives = f"{one.drives} drive" + ("s" if one.drives != 1 else "")
-    more = f"; {one.more_drives:,} more would decide" if one.more_drives else ""
-    yield f"{'':11}{one.after - one.before:+.3g} ({ends}) over {drives}{seen}{more}{allowed}"
+    places = f"{one.places} place" + ("s" if one.places != 1 else "")
+    over = f"over {drives} at {places}{seen}{_more_text(one)}{allowed}"
+    yield f"{'':11}{one.after - one.before:+.3g} ({ends}) {over}"
 
 
 def _metric_line(one: MetricChange) -> str:

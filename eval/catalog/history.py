@@ -14,16 +14,18 @@ from numpy.typing import NDArray
 from crosscue.eval.scoring.by_drive import DriveMetric, Kind, direction
 from crosscue.eval.scoring.change_points import (
     FALSE_ALARMS,
-    MIN_DRIVES,
+    MIN_PLACES,
     SHUFFLES,
     ChangePoint,
     Results,
     change_points,
 )
+from crosscue.eval.scoring.places import group_drives
+from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import EmptyResultError
 from crosscue.results import Result
 
-from .paired import pooled
+from .paired import by_place, pooled
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -46,7 +48,7 @@ class VersionPoint:
 
     Attributes:
         value: Value pooled over the version's drives; NaN if no drive has the metric.
-        low: Lower end of the 95 % interval over drives; NaN below four drives.
+        low: Lower end of the 95 % interval over places; NaN below four places.
         high: Upper end of the interval.
         drives: Number of drives pooled.
     """
@@ -169,7 +171,7 @@ def limits() -> dict[str, object]:
     return {
         "shuffles": SHUFFLES,
         "alarms": round(100.0 * FALSE_ALARMS),
-        "min_drives": MIN_DRIVES,
+        "min_places": MIN_PLACES,
     }
 
 
@@ -190,7 +192,8 @@ def _parts(
     """Return each drive's contribution with the index of its version, by metric."""
     found: dict[str, list[tuple[int, DriveMetric]]] = {}
     table = catalog.query(
-        "select s.run, coalesce(r.identity, r.run) as log, metric, kind, total, rows "
+        "select s.run, coalesce(r.identity, r.run) as log, metric, kind, total, rows, "
+        "coalesce(places, []) as places "
         "from scores s join runs r on s.run = r.run order by metric, s.run"
     )
     wanted: dict[str, bool] = {}
@@ -208,6 +211,11 @@ def _metrics(
     parts: Mapping[str, Sequence[tuple[int, DriveMetric]]], versions: int
 ) -> tuple[MetricHistory, ...]:
     logs = {log: i for i, log in enumerate(sorted({m.log for of in parts.values() for _, m in of}))}
+    places: list[set[str]] = [set() for _ in logs]
+    for _, one in (pair for of in parts.values() for pair in of):
+        places[logs[one.log]].update(one.places)
+    names = [sorted(some) or [f"log {log}"] for log, some in zip(logs, places, strict=True)]
+    where = group_drives(names)
     sums = {}
     for path, of in parts.items():
         total, rows = np.zeros((len(logs), versions)), np.zeros((len(logs), versions))
@@ -215,22 +223,26 @@ def _metrics(
             total[logs[one.log], at] += one.total
             rows[logs[one.log], at] += one.rows
         sums[path] = (of[0][1].kind, total, rows)
-    changes = change_points({path: _results(*one) for path, one in sums.items()})
+    changes = change_points({path: _results(*one, where) for path, one in sums.items()})
     found = []
     for path, (kind, total, rows) in sums.items():
-        points = tuple(_point(kind, total[:, at], rows[:, at]) for at in range(versions))
+        points = tuple(_point(kind, total[:, at], rows[:, at], where) for at in range(versions))
         found.append(MetricHistory(path, str(direction(path)), points, changes[path]))
     return tuple(sorted(found, key=lambda one: (not one.changes, one.path)))
 
 
-def _results(kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64]) -> Results:
+def _results(
+    kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64], where: Int64s
+) -> Results:
     is_known = rows > 0.0
     values = np.divide(total, rows, out=np.full(total.shape, math.nan), where=is_known)
     known = is_known.sum(axis=1)
     weights = np.divide(rows.sum(axis=1), known, out=np.zeros(len(rows)), where=known > 0)
-    return Results(total if kind == "sum" else values, weights)
+    return Results(total if kind == "sum" else values, weights, where)
 
 
-def _point(kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64]) -> VersionPoint:
-    value, half, drives = pooled(kind, total, rows)
-    return VersionPoint(value, value - half, value + half, drives)
+def _point(
+    kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64], where: Int64s
+) -> VersionPoint:
+    value, half = pooled(kind, by_place(total, where), by_place(rows, where))
+    return VersionPoint(value, value - half, value + half, int((rows > 0.0).sum()))

@@ -61,7 +61,10 @@ def score_reader(catalog: Queryable) -> Callable[[Path | str], Scored]:
     outcomes = catalog.query("select run, outcome from runs").to_pydict()
     is_whole = {run: outcome == "whole" for run, outcome in zip(*outcomes.values(), strict=True)}
     found: dict[str, list[DriveMetric]] = {}
-    table = catalog.query("select run, log, metric, kind, total, rows from scores order by all")
+    columns = "run, log, metric, kind, total, rows, places"
+    table = catalog.query(
+        f"select {columns} from scores where places is not null order by all"  # noqa: S608
+    )
     for row in table.to_pylist():
         found.setdefault(row.pop("run"), []).append(DriveMetric(**row))
     return lambda run: (found.get(str(run)), is_whole[str(run)])

@@ -1,8 +1,9 @@
 """Paired comparison of two runs' metrics over drives: better, worse or undecided.
 
 If both runs are equally good, it is arbitrary which of a drive's two results came from which run.
-Swapping them at random, drive by drive, shows how far metrics differ by chance (a permutation test;
-Good, *Permutation, Parametric and Bootstrap Tests of Hypotheses*, chapter 3).
+Swapping them at random shows how far metrics differ by chance (a permutation test; Good,
+*Permutation, Parametric and Bootstrap Tests of Hypotheses*, chapter 3). Drives of one place are not
+independent: what helps in one drive there helps in the next. They are therefore swapped together.
 
 Many cues under many conditions are many chances for a false alarm. They are corrected by Holm's
 procedure (*Scandinavian Journal of Statistics* 6, 1979) with the joint distribution of the swaps in
@@ -26,21 +27,24 @@ from numpy.typing import NDArray
 
 from crosscue.eval.scoring.by_drive import Direction, DriveMetric, Kind, direction
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS
+from crosscue.eval.scoring.places import group_drives
+from crosscue.replay.columns import Int64s
+
+from .power import Effects, detectable
 
 # Max fraction of comparisons in which any unchanged metric gets a verdict.
 FALSE_ALARMS: Final = 0.05
-# With five drives, no p value is below 2 / 32, so nothing would ever be decided.
-MIN_DRIVES: Final = 6
-# Standard normal quantile of the power: the detectable difference is found with about 80 %.
-POWER_QUANTILE: Final = 0.841621
-# Above this, the number of drives that would decide is not printed.
-MAX_DRIVES: Final = 1_000_000
-EXACT_DRIVES: Final = 12
-SWAPS: Final = 1 << EXACT_DRIVES
+# With five places, no p value is below 2 / 32, so nothing would ever be decided.
+MIN_PLACES: Final = 6
+# Above this, the number of places that would decide is not printed.
+MAX_PLACES: Final = 1_000_000
+FIXED_POINT_STEPS: Final = 6
+EXACT_PLACES: Final = 12
+SWAPS: Final = 1 << EXACT_PLACES
 SEED: Final = 0
 ROUNDING: Final = 1e-9
 
-Verdict = Literal["better", "worse", "undecided"]
+Verdict = Literal["better", "worse", "undecided", "too few places"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,15 +57,15 @@ class PairedMetric:
         after: Value in the second run.
         better: Good direction of the metric.
         drives: Number of drives with rows in at least one run.
-        low: Lower end of the 95 % interval of after minus before, over drives; NaN below four
-            drives.
+        places: Number of their places.
+        low: Lower end of the 95 % interval of after minus before, over places; NaN below four
+            places.
         high: Upper end of the interval.
         p: p value, corrected for all metrics.
-        could_see: The smallest difference that 80 % of comparisons would detect; infinite below
-            six drives.
-        more_drives: Number of additional drives, as varied as these, with which 80 % of
-            comparisons would detect a difference of this size; 0 if it is decided or zero, None if
-            unknown.
+        could_see: The smallest loss that 80 % of simulated repetitions find (``power``); infinite
+            below six places.
+        more_places: Number of additional places, as varied as these, with which 80 % of comparisons
+            would detect a difference of this size; 0 if it is decided or zero, None if unknown.
         allowed: Allowed loss.
         verdict: Verdict on the second run.
     """
@@ -71,17 +75,18 @@ class PairedMetric:
     after: float
     better: Direction
     drives: int
+    places: int
     low: float
     high: float
     p: float
     could_see: float
-    more_drives: int | None
+    more_places: int | None
     allowed: float
     verdict: Verdict
 
 
 class _Sums(NamedTuple):
-    """Totals and numbers of rows by drive in the first and in the second run, shapes (G,)."""
+    """Totals and numbers of rows by drive or place in the first and second run, shapes (G,)."""
 
     total: NDArray[np.float64]
     rows: NDArray[np.float64]
@@ -106,37 +111,67 @@ def compare_drives(
     known = {one.metric for one in first} & {one.metric for one in second}
     paths = [path for path in kinds if path in known and direction(path) is not None]
     found = _sums(logs, first, second)
-    sums = {path: found[path] for path in paths if path in found}
-    sums = {path: one for path, one in sums.items() if one.rows.any() and one.other_rows.any()}
-    swaps = _swaps(len(logs))
+    drives = {path: found[path] for path in paths if path in found}
+    drives = {path: one for path, one in drives.items() if one.rows.any() and one.other_rows.any()}
+    at = _places(logs, first, second)
+    sums = {path: _Sums(*(by_place(column, at) for column in one)) for path, one in drives.items()}
+    swaps = _swaps(len(np.unique(at)))
     spread = {path: _swapped(kinds[path], one, swaps) for path, one in sums.items()}
     units = {path: float(np.sqrt(np.mean(one**2))) for path, one in spread.items()}
     differing = [path for path in sums if units[path] > 0.0]
     scaled = np.array([np.abs(spread[path]) / units[path] for path in differing])
-    p, critical = step_down(scaled.reshape(len(differing), len(swaps)))
+    p = step_down(scaled.reshape(len(differing), len(swaps)))
     p_of = dict(zip(differing, map(float, p), strict=True))
+    effects = {path: _effects(path, kinds[path], one) for path, one in sums.items()}
+    enough = {
+        path: one
+        for path, one in effects.items()
+        if one.residuals.any() and np.count_nonzero(one.weights) >= MIN_PLACES
+    }
+    could_see = detectable(enough, swaps, FALSE_ALARMS)
     return tuple(
-        _judged(path, kinds[path], sums[path], p_of.get(path, 1.0), critical, allowed_of)
-        for path in sums
+        _judged(
+            path,
+            kinds[path],
+            sums[path],
+            effects[path],
+            int(((one.rows > 0.0) | (one.other_rows > 0.0)).sum()),
+            p_of.get(path, 1.0),
+            could_see.get(path, math.inf),
+            allowed_of,
+        )
+        for path, one in drives.items()
     )
 
 
-def step_down(
-    statistics: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], float]:
-    """Return corrected p values and the critical value over all metrics.
+def _places(
+    logs: Sequence[str], first: Sequence[DriveMetric], second: Sequence[DriveMetric]
+) -> Int64s:
+    """Return the number of the place of each log; an unknown place is the log's own."""
+    found: dict[str, set[str]] = {log: set() for log in logs}
+    for one in (*first, *second):
+        if one.log in found:
+            found[one.log].update(one.places)
+    return group_drives([sorted(found[log]) or [f"log {log}"] for log in logs])
+
+
+def by_place(values: NDArray[np.float64], at: Int64s) -> NDArray[np.float64]:
+    """Return the sums of the drives' values, shape (N, ...), at each place, shape (places, ...)."""
+    found = np.zeros((int(at.max()) + 1 if len(at) else 0, *values.shape[1:]))
+    np.add.at(found, at, values)
+    return found
+
+
+def step_down(statistics: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return p values corrected for all metrics, shape (M,).
 
     Args:
         statistics: Shape (M, S), of M metrics under S swaps, each in units of its own spread. The
             first column is the observation.
-
-    Returns:
-        The p values, shape (M,), and the critical value; infinite if there are too few swaps for
-        any verdict.
     """
     metrics = len(statistics)
     if not metrics:
-        return np.ones(0), math.inf
+        return np.ones(0)
     order = np.argsort(-statistics[:, 0], kind="stable")
     ordered = statistics[order]
     # Maximum over each metric and all metrics that differ less.
@@ -144,7 +179,7 @@ def step_down(
     corrected = np.empty(metrics)
     is_reached = largest >= ordered[:, :1] - ROUNDING
     corrected[order] = np.maximum.accumulate(is_reached.mean(axis=1))
-    return corrected, _critical(largest[0])
+    return corrected
 
 
 def _sums(
@@ -161,12 +196,12 @@ def _sums(
     return {path: _Sums(*found) for path, found in columns.items()}
 
 
-def _swaps(drives: int) -> NDArray[np.float64]:
-    """Return swaps, shape (S, G): 1 if a drive's results are swapped; the first row swaps none."""
-    if drives <= EXACT_DRIVES:
-        rows = np.arange(1 << drives)[:, None]
-        return (rows >> np.arange(drives) & 1).astype(np.float64)
-    drawn = np.random.default_rng(SEED).integers(0, 2, (SWAPS, drives)).astype(np.float64)
+def _swaps(places: int) -> NDArray[np.float64]:
+    """Return swaps, shape (S, G): 1 if a place's results are swapped; the first row swaps none."""
+    if places <= EXACT_PLACES:
+        rows = np.arange(1 << places)[:, None]
+        return (rows >> np.arange(places) & 1).astype(np.float64)
+    drawn = np.random.default_rng(SEED).integers(0, 2, (SWAPS, places)).astype(np.float64)
     drawn[0] = 0.0
     return drawn
 
@@ -190,106 +225,116 @@ def _value(
     return np.sqrt(np.maximum(mean, 0.0)) if kind == "rms" else mean
 
 
-def _critical(largest: NDArray[np.float64]) -> float:
-    """Return the critical value of the largest difference; infinite if there are too few swaps."""
-    ordered = np.sort(largest)[::-1]
-    rank = math.floor(FALSE_ALARMS * len(ordered) + ROUNDING)
-    if rank < 1 or len(ordered) < 1 << MIN_DRIVES:
-        return math.inf
-    return float(ordered[rank - 1])
-
-
 def _judged(
     path: str,
     kind: Kind,
     sums: _Sums,
+    effects: Effects,
+    drives: int,
     p: float,
-    critical: float,
+    could_see: float,
     allowed_of: Callable[[str, float], float],
 ) -> PairedMetric:
     better = direction(path)
     assert better is not None
-    before, after = (
-        float(_value(kind, np.array(total.sum()), np.array(rows.sum())))
-        for total, rows in ((sums.total, sums.rows), (sums.other_total, sums.other_rows))
-    )
+    before, after = _value_of(kind, sums.total, sums.rows), _value_of(kind, *sums[2:])
     difference = after - before
-    sd, drives = _jackknife(kind, sums)
-    half = _t(drives - 1, 0.95) * sd if drives >= MIN_CLUSTERS else math.nan
+    places = int(np.count_nonzero(effects.weights))
+    half = math.nan
+    if places >= MIN_CLUSTERS:
+        squares = float((effects.residuals**2).sum())
+        half = effects.half * math.sqrt(places / (places - 1) * squares)
     allowed = allowed_of(path, before)
-    sign = 1.0 if better == "higher" else -1.0
-    verdict: Verdict = "undecided"
-    if p <= FALSE_ALARMS and drives >= MIN_DRIVES and half < abs(difference):
-        if sign * difference > 0.0:
+    verdict: Verdict = "undecided" if places >= MIN_PLACES else "too few places"
+    if p <= FALSE_ALARMS and places >= MIN_PLACES and half < abs(difference):
+        if effects.sign * difference < 0.0:
             verdict = "better"
         elif abs(difference) - half > allowed:
             verdict = "worse"
-    could_see = (critical + POWER_QUANTILE) * sd if sd else math.nan
-    could_see = could_see if drives >= MIN_DRIVES else math.inf
-    is_open = verdict == "undecided" and difference != 0.0
+    more: int | None = 0
+    if difference != 0.0 and verdict not in ("better", "worse"):
+        more = _more_places(could_see, difference, places)
     return PairedMetric(
         path=path,
         before=before,
         after=after,
         better=better,
         drives=drives,
+        places=places,
         low=difference - half,
         high=difference + half,
         p=p,
         could_see=could_see,
-        more_drives=_more_drives(could_see, difference, drives) if is_open else 0,
+        more_places=more,
         allowed=allowed,
         verdict=verdict,
     )
 
 
-def _more_drives(could_see: float, difference: float, drives: int) -> int | None:
-    """Return the additional drives needed; the detectable difference falls as 1 / sqrt(drives)."""
+def _more_places(could_see: float, difference: float, places: int) -> int | None:
+    """Return the additional places needed.
+
+    The detectable difference falls as 1 / sqrt(places), and with the quantiles of Student's t.
+    """
+    if places < MIN_PLACES:
+        return MIN_PLACES - places
     if not math.isfinite(could_see):
         return None
-    enough = drives * (could_see / difference) ** 2
-    return max(math.ceil(enough) - drives, 1) if enough < MAX_DRIVES else None
+    enough = float(places)
+    for _ in range(FIXED_POINT_STEPS):
+        if enough > MAX_PLACES:
+            return None
+        quantiles = [_t(n - 1, 0.95) + _t(n - 1, 0.6) for n in (max(enough, MIN_PLACES), places)]
+        enough = places * (could_see * quantiles[0] / quantiles[1] / difference) ** 2
+    return max(math.ceil(enough) - places, 1)
 
 
-def _jackknife(kind: Kind, sums: _Sums) -> tuple[float, int]:
-    """Return the jackknife standard deviation of the difference, and the number of drives used."""
+def _effects(path: str, kind: Kind, sums: _Sums) -> Effects:
+    """Return the effect of each place on the difference, by the jackknife."""
     mine = (sums.rows > 0.0) | (sums.other_rows > 0.0)
-    some = _Sums(*(column[mine] for column in sums))
     n = int(mine.sum())
-    if n < 2:
-        return math.nan, n
-    differences = _value(
-        kind, some.other_total.sum() - some.other_total, some.other_rows.sum() - some.other_rows
-    ) - _value(kind, some.total.sum() - some.total, some.rows.sum() - some.rows)
-    if kind == "sum":
-        differences = differences * n / (n - 1)
-    known = differences[np.isfinite(differences)]
-    return math.sqrt((n - 1) / n * float(((known - known.mean()) ** 2).sum())), n
+    rows = np.where(mine, 0.5 * (sums.rows + sums.other_rows), 0.0)
+    sign = -1.0 if direction(path) == "higher" else 1.0
+    weights = mine / n if kind == "sum" else rows / rows.sum()
+    if n < MIN_CLUSTERS:
+        return Effects(np.zeros(len(mine)), weights, sign, math.nan)
+    without = _value(
+        kind, sums.other_total.sum() - sums.other_total, sums.other_rows.sum() - sums.other_rows
+    ) - _value(kind, sums.total.sum() - sums.total, sums.rows.sum() - sums.rows)
+    scale = 1.0 if kind == "sum" else (n - 1) / n
+    is_known = mine & np.isfinite(without)
+    middle = without[is_known].mean() if is_known.any() else 0.0
+    residuals = np.where(is_known, scale * (middle - without), 0.0)
+    return Effects(residuals, weights, sign, _t(n - 1, 0.95))
+
+
+def _value_of(kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64]) -> float:
+    return float(_value(kind, np.array(total.sum()), np.array(rows.sum())))
 
 
 def pooled(
     kind: Kind, total: NDArray[np.float64], rows: NDArray[np.float64]
-) -> tuple[float, float, int]:
-    """Return a metric pooled over drives, half its 95 % jackknife interval, and the drives used.
+) -> tuple[float, float]:
+    """Return a metric pooled over places, and half its 95 % jackknife interval.
 
     Args:
         kind: Kind of the metric.
-        total: Sum by drive, shape (G,).
-        rows: Number of rows by drive, shape (G,); 0 for drives without the metric.
+        total: Sum by place, shape (G,).
+        rows: Number of rows by place, shape (G,); 0 for places without the metric.
     """
     mine = rows > 0.0
     total, rows, n = total[mine], rows[mine], int(mine.sum())
-    value = float(_value(kind, np.array(total.sum()), np.array(rows.sum())))
+    value = _value_of(kind, total, rows)
     if n < MIN_CLUSTERS:
-        return (value if n else math.nan), math.nan, n
+        return (value if n else math.nan), math.nan
     without = _value(kind, total.sum() - total, rows.sum() - rows)
     if kind == "sum":
         without = without * n / (n - 1)
     sd = math.sqrt((n - 1) / n * float(((without - without.mean()) ** 2).sum()))
-    return value, _t(n - 1, 0.95) * sd, n
+    return value, _t(n - 1, 0.95) * sd
 
 
-def _t(freedom: int, confidence: float) -> float:
+def _t(freedom: float, confidence: float) -> float:
     from scipy.special import stdtrit
 
     return float(stdtrit(freedom, 0.5 + 0.5 * confidence))

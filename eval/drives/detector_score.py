@@ -20,7 +20,7 @@ from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
 from crosscue.eval.scoring.boxes.reliability import Reliability, class_calibration
 from crosscue.eval.scoring.boxes.scores import SEED, IntervalEstimate, PartScore, score_parts
-from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW
+from crosscue.eval.scoring.intervals import MIN_CLUSTERS
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
@@ -148,7 +148,7 @@ class DetectorScore(Result):
         unit = f"blocks of {self.block_s:g} s" if self.block_s > 0.0 else "single images"
         yield f"intervals  95 %, bootstrap over {unit}, seed {SEED}"
         if any(np.isnan(one.ap50.low) and one.labels for one in self.scores):
-            yield f"{TOO_FEW}: no intervals below {MIN_CLUSTERS} blocks or images"
+            yield f"no intervals below {MIN_CLUSTERS} blocks or images"
         yield f"written to {self.report}"
 
 

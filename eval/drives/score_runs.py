@@ -25,7 +25,13 @@ from crosscue.eval.scoring.files import FOLDER
 from crosscue.eval.scoring.gates import GateResult, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.pose.smoother import smoother_text
-from crosscue.eval.scoring.runs import RunScored, account_of_scores, metrics_of, pooled_scores
+from crosscue.eval.scoring.runs import (
+    RunScored,
+    account_of_scores,
+    metrics_of,
+    places_of_drives,
+    pooled_scores,
+)
 from crosscue.eval.studies.attribution import (
     AttributedDrive,
     Attribution,
@@ -148,8 +154,11 @@ def _lines_together(found: ScoredRuns) -> list[str]:
     ones = _ones(found)
     why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
     lines += [*_account(found), "", *_scores(found, why)]
-    poses = [one.pose for one in ones if one.pose is not None]
-    return [*lines, "", poses_summary(poses)] if poses else lines
+    posed = [one for one in ones if one.pose is not None]
+    if not posed:
+        return lines
+    poses = [one.pose for one in posed if one.pose is not None]
+    return [*lines, "", poses_summary(poses, places_of_drives(posed))]
 
 
 def _account(found: ScoredRuns) -> list[str]:

@@ -91,22 +91,23 @@ def compare_command(
 ) -> compare.Comparison:
     """Compare two runs, with tolerances.
 
-    Two runs, or two sets of runs, are compared: each metric is better, worse or undecided. It is
-    judged drive by drive, over the drives that both sides have (six or more). A metric that did not
-    change gets a verdict in at most 5 % of comparisons, over all cues and conditions together. Each
-    line shows the 95 % interval of the difference, the smallest difference that these drives can
-    detect, and the number of further drives needed for a decision.
+    Two runs, or two sets of runs, are compared: each metric is better, worse or undecided. Drives
+    are paired, and grouped by place: the truth's place, else positions within 50 m, else the
+    intersection. Fewer than six places decide nothing; the number wanted is stated. A metric that
+    did not change gets a verdict in at most 5 % of comparisons, over all cues and conditions
+    together. Each line shows the 95 % interval of the difference, the smallest loss that four of
+    five simulated repetitions of this comparison find, and the number of further places needed for
+    a decision.
 
     With --runs and --against, two queries on a folder of runs select the runs to judge and the runs
     to compare them with, one run per drive.
 
     The exit status is 1 when a metric is worse by more than its tolerance (default: 0), or is no
     longer scored. Noise alone made a metric worse in 14 of 1,000 simulated comparisons of equal
-    runs over eight independent drives; it does so more often if drives share places. A tolerance is
-    a number in the metric's unit or a fraction of the first value (2%), for all metrics or for
-    those of a pattern. The last tolerance that matches a metric applies. If the two runs are not
-    scored, the exit status is 1 when a table differs. Folders that crosscue score -o wrote for
-    several runs can be compared as well.
+    runs over eight places. A tolerance is a number in the metric's unit or a fraction of the first
+    value (2%), for all metrics or for those of a pattern. The last tolerance that matches a metric
+    applies. If the two runs are not scored, the exit status is 1 when a table differs. Folders that
+    crosscue score -o wrote for several runs can be compared as well.
 
     Examples:
         crosscue compare runs/before runs/after

@@ -18,6 +18,7 @@ from crosscue.eval.scoring.scene.approaches import ApproachScore
 from crosscue.eval.scoring.scene.belief import BeliefScore
 from crosscue.eval.scoring.scene.cues import CueScore
 from crosscue.eval.scoring.scene.ranges import RangeScore
+from crosscue.replay.columns import Int64s
 from crosscue.replay.safe_text import visible
 
 WIDTH: Final = 80
@@ -102,7 +103,7 @@ def _cues(cues: Mapping[str, CueScore]) -> list[str]:
     if any(not one.is_sources_reading for one in shown.values()):
         lines.append("* judged by the feature or object that the source does not judge it by")
     if any(math.isnan(one.precision.clusters_low) for one in shown.values() if one.positives):
-        lines.append(f"{TOO_FEW}: under {MIN_CLUSTERS} approaches, intervals count frames only")
+        lines.append(f"{TOO_FEW}: under {MIN_CLUSTERS}, intervals count frames only")
     return [*lines, *_left_out(cues)]
 
 
@@ -260,9 +261,8 @@ def pose_summary(result: PoseScore) -> str:
     return "\n".join(lines)
 
 
-def poses_summary(poses: Sequence[PoseScore]) -> str:
-    """Return the pose scores of several drives, with intervals over drives; NEES if defined."""
-    drives = np.arange(len(poses))
+def poses_summary(poses: Sequence[PoseScore], places: Int64s) -> str:
+    """Return the pose scores of several drives, with intervals over places; NEES if defined."""
     lost = sum(one.lost_at_m is not None for one in poses)
     lines = [_line("pose", f"{len(poses)} drives, {lost} lost; means over drives (95 %)")]
     for name, unit, values in (
@@ -270,7 +270,7 @@ def poses_summary(poses: Sequence[PoseScore]) -> str:
         ("NEES of x, y", ", 2 is consistent", [one.nees_xy.mean for one in poses]),
         ("NEES of x, y, heading", ", 3 is consistent", [one.nees_xyh.mean for one in poses]),
     ):
-        found = mean(np.array(values), drives)
+        found = mean(np.array(values), places)
         ends = TOO_FEW if math.isnan(found.low) else f"{found.low:.2f} to {found.high:.2f}"
         if found.of:
             lines.append(_line("", f"{name:22} {found.value:.2f} ({ends}){unit}"))

@@ -74,6 +74,7 @@ class DriveMetric(NamedTuple):
         kind: How contributions are combined: mean over rows, its root, or sum.
         total: Sum over rows; of squares for ``rms``.
         rows: Number of rows; 0 if the drive has none.
+        places: Places of the drive; empty if unknown, when it is a place of its own.
     """
 
     log: str
@@ -81,6 +82,7 @@ class DriveMetric(NamedTuple):
     kind: Kind
     total: float
     rows: int
+    places: Sequence[str] = ()
 
 
 def direction(path: str) -> Direction | None:
@@ -180,6 +182,7 @@ def by_drive_table(parts: Iterator[DriveMetric]) -> pa.Table:
             "kind": pa.string(),
             "total": pa.float64(),
             "rows": pa.int64(),
+            "places": pa.list_(pa.string()),
         }
     )
     return pa.Table.from_pylist([one._asdict() for one in parts], schema)

@@ -1,16 +1,16 @@
 """Change points of metrics in a history of versions, judged drive by drive.
 
 If nothing changed, the assignment of a drive's results to versions is arbitrary. Shuffling the
-results of each drive among its versions therefore yields the distribution, under chance alone, of
-the difference between the versions before and after a split. This is the permutation test of
-``crosscue compare``, for more than two versions. The difference at a split is the mean over drives,
-weighted by their rows, in units of its standard deviation. The test uses the largest difference
-over all splits and metrics (Westfall, Young, *Resampling-Based Multiple Testing*, 1993). If it
-exceeds that of 95 % of the shuffles, the split is a change point, and the parts before and after it
-are searched together in the same way (binary segmentation; Vostrikova, *Soviet Mathematics Doklady*
-24, 1981). Hence a history without changes shows a change point in at most 5 % of cases, and so does
-each further round of the search. Finally, each change point is tested again between its neighbors,
-and dropped if they explain it.
+results of each drive among its versions, alike for all drives of a place, therefore yields the
+distribution, under chance alone, of the difference between the versions before and after a split.
+This is the permutation test of ``crosscue compare``, for more than two versions. The difference at
+a split is the mean over drives, weighted by their rows, in units of its standard deviation. The
+test uses the largest difference over all splits and metrics (Westfall, Young, *Resampling-Based
+Multiple Testing*, 1993). If it exceeds that of 95 % of the shuffles, the split is a change point,
+and the parts before and after it are searched together in the same way (binary segmentation;
+Vostrikova, *Soviet Mathematics Doklady* 24, 1981). Hence a history without changes shows a change
+point in at most 5 % of cases, and so does each further round of the search. Finally, each change
+point is tested again between its neighbors, and dropped if they explain it.
 """
 
 from __future__ import annotations
@@ -23,9 +23,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.columns import Int64s
+
 FALSE_ALARMS: Final = 0.05
-# Min number of drives with results on both sides of a split, as in a comparison.
-MIN_DRIVES: Final = 6
+# Min number of places with results on both sides of a split, as in a comparison.
+MIN_PLACES: Final = 6
 SHUFFLES: Final = 1000
 SEED: Final = 0
 ROUNDING: Final = 1e-9
@@ -38,10 +40,12 @@ class Results:
     Attributes:
         values: Shape (G, V); NaN where a drive has no result.
         weights: Shape (G,): numbers of rows behind a drive's values.
+        places: Shape (G,): number of each drive's place.
     """
 
     values: NDArray[np.float64]
     weights: NDArray[np.float64]
+    places: Int64s
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -89,7 +93,7 @@ def _confirmed(points: Sequence[ChangePoint], one: Results) -> tuple[ChangePoint
     kept = []
     for i, point in enumerate(points):
         first, end = edges[i], edges[i + 2]
-        differences = _differences(one.values[:, first:end], one.weights)
+        differences = _differences(one.values[:, first:end], one)
         if differences is None:
             continue
         of_split = differences[:, point.at - first - 1]
@@ -115,7 +119,7 @@ def _found_in(
     statistics = {}
     for span in spans:
         one = results[span.name]
-        scaled = _statistics(one.values[:, span.first : span.end], one.weights)
+        scaled = _statistics(one.values[:, span.first : span.end], one)
         if scaled is not None:
             statistics[span] = scaled
     if not statistics:
@@ -128,14 +132,13 @@ def _found_in(
             yield span, ChangePoint(span.first + split + 1, p, math.nan)
 
 
-def _statistics(
-    values: NDArray[np.float64], weights: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
+def _statistics(values: NDArray[np.float64], of: Results) -> NDArray[np.float64] | None:
     """Return the difference at each split in standard deviations, for each shuffle.
 
-    Shape (S, V - 1), the first row unshuffled; None if there are too few drives, or none differs.
+    Shape (S, V - 1), the first row unshuffled; None if there are too few places, or
+    no drive differs.
     """
-    signed = _differences(values, weights)
+    signed = _differences(values, of)
     if signed is None:
         return None
     differences = np.abs(signed)
@@ -149,24 +152,20 @@ def _statistics(
     return found
 
 
-def _differences(
-    values: NDArray[np.float64], weights: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
+def _differences(values: NDArray[np.float64], of: Results) -> NDArray[np.float64] | None:
     """Return the value after minus the value before each split, for each shuffle, (S, V - 1)."""
     is_known = np.isfinite(values)
-    weight = _split_weights(is_known, weights)
+    weight = _split_weights(is_known, of)
     if weight is None:
         return None
-    shuffled = _shuffled(np.where(is_known, values, 0.0), is_known)
+    shuffled = _shuffled(np.where(is_known, values, 0.0), is_known, of.places)
     found: NDArray[np.float64] = np.tensordot(shuffled, weight, axes=([1, 2], [1, 2]))
     return found
 
 
-def _split_weights(
-    is_known: NDArray[np.bool_], weights: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
+def _split_weights(is_known: NDArray[np.bool_], of: Results) -> NDArray[np.float64] | None:
     """Return the weight of each value in the difference at each split, shape (V - 1, G, V)."""
-    versions = is_known.shape[1]
+    versions, weights = is_known.shape[1], of.weights
     if versions < 2:
         return None
     place = np.arange(versions)
@@ -175,7 +174,7 @@ def _split_weights(
         sides = [is_known & (place < split), is_known & (place >= split)]
         counts = [side.sum(axis=1) for side in sides]
         both = (counts[0] > 0) & (counts[1] > 0) & (weights > 0.0)
-        if both.sum() < MIN_DRIVES:
+        if len(np.unique(of.places[both])) < MIN_PLACES:
             continue
         fraction = np.where(both, weights, 0.0) / weights[both].sum()
         before, after = (
@@ -186,13 +185,15 @@ def _split_weights(
     return whole if whole.any() else None
 
 
-def _shuffled(values: NDArray[np.float64], is_known: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _shuffled(
+    values: NDArray[np.float64], is_known: NDArray[np.bool_], places: Int64s
+) -> NDArray[np.float64]:
     """Shuffle each drive's values among its versions, shape (S, G, V), the first unshuffled.
 
-    All metrics of a drive are shuffled alike, to keep their dependence.
+    All metrics of all drives of a place are shuffled alike, to keep their dependence.
     """
     chance = np.random.default_rng(SEED)
-    keys = chance.random((SHUFFLES, *values.shape))
+    keys = chance.random((SHUFFLES, int(places.max()) + 1, values.shape[1]))[:, places]
     place = np.arange(values.shape[1])
     keys[0] = place
     # The keys of missing versions sort them to their own places.

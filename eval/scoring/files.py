@@ -50,7 +50,9 @@ def _parts(one: RunScored) -> Iterator[DriveMetric]:
     logs = "+".join(sorted(log.identity.digest for log in one.run.drive_manifest().logs))
     rmse_m = None if one.pose is None else one.pose.ape["none"].translation_m.rmse
     is_lost = one.pose is not None and one.pose.lost_at_m is not None
-    return drive_contributions(logs, as_metrics(score([one.judged])), rmse_m, is_lost)
+    places = sorted(set(one.truth.places.values()))
+    for part in drive_contributions(logs, as_metrics(score([one.judged])), rmse_m, is_lost):
+        yield part._replace(places=places)
 
 
 def curve_table(judged: Sequence[DriveJudged]) -> pa.Table:

@@ -1,8 +1,9 @@
 """Confidence intervals of fractions and means.
 
 Wilson's interval (E. B. Wilson, JASA 22, 1927) assumes that counts are independent. Frames of one
-drive are not: a sign missed in one frame is missed in the next. Therefore, where several drives or
-approaches are pooled, an interval over clusters is shown as well. Trust the wider one.
+drive are not: a sign missed in one frame is missed in the next. Drives of
+one place are not, either. Therefore, an interval over clusters, which are places (``places``), is
+shown as well. Trust the wider one.
 
 Bootstrap intervals over few clusters are too narrow: with five to eight clusters, intervals of
 nominally 95 % cover 82 to 88 %. Here the variance is that of the jackknife over clusters
@@ -28,8 +29,8 @@ CONFIDENCE: Final = 0.95
 MIN_CLUSTERS: Final = 4
 # Minimum number of clusters whose kurtosis is estimated.
 KURTOSIS_CLUSTERS: Final = 8
-# Text in place of an interval over too few drives or approaches.
-TOO_FEW: Final = "too few clusters"
+# Text in place of an interval over too few places.
+TOO_FEW: Final = "too few places"
 
 
 class Interval(NamedTuple):
@@ -50,7 +51,7 @@ class Proportion:
         value: Fraction; NaN for 0 out of 0.
         low: Lower end of Wilson's interval, which assumes independent counts.
         high: Upper end of Wilson's interval.
-        clusters: Number of drives or approaches that the counts come from.
+        clusters: Number of places that the counts come from.
         clusters_low: Lower end of the interval over clusters; NaN for fewer than four.
         clusters_high: Upper end of the interval over clusters.
     """
@@ -74,7 +75,7 @@ class Mean:
         low: Lower end; NaN for fewer than four clusters.
         high: Upper end; NaN for fewer than four clusters.
         of: Number of rows.
-        clusters: Number of drives or approaches.
+        clusters: Number of places.
     """
 
     value: float
@@ -116,7 +117,7 @@ def fraction(is_right: np.typing.NDArray[np.bool_], clusters: NDArray[np.int64])
 
     Args:
         is_right: Shape (N,).
-        clusters: Shape (N,): index of the drive or approach of each row.
+        clusters: Shape (N,): number of the place of each row.
     """
     right, of = int(is_right.sum()), len(is_right)
     ends = wilson(right, of)

@@ -13,29 +13,6 @@ from numpy.typing import NDArray
 BINS_M: Final = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
 
 
-def cluster_numbers(
-    drives: Sequence[str], approaches: Sequence[NDArray[np.int64]]
-) -> NDArray[np.int64]:
-    """Return the number of each row's cluster, which is an approach of a drive.
-
-    Args:
-        drives: Names of the drives.
-        approaches: For each drive, shape (N,): the approach of each row.
-    """
-    numbers = [np.empty(0, np.int64)]
-    drive_of: dict[str, dict[int, int]] = {}
-    count = 0
-    for drive, rows in zip(drives, approaches, strict=True):
-        known = drive_of.setdefault(drive, {})
-        own, which = np.unique(rows, return_inverse=True)
-        for one in own.tolist():
-            if one not in known:
-                known[one] = count
-                count += 1
-        numbers.append(np.array([known[one] for one in own.tolist()], np.int64)[which])
-    return np.concatenate(numbers)
-
-
 def sum_counts(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     """Return the sums of counts by reason."""
     total: dict[str, int] = {}

@@ -23,6 +23,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.logs import log_location
 from crosscue.eval.runs.manifest import LogRow
 from crosscue.eval.runs.tables.travelled import odometer_of
+from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import RunError, SchemaError, UsageError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree, spelled, strict_json
@@ -31,7 +32,7 @@ from crosscue.replay.remote.address import is_remote
 
 from . import intervals
 from . import truth as score_truth
-from .columns import AMBIGUOUS, RunTables
+from .columns import AMBIGUOUS, NONE, RunTables
 from .drives import (
     DEFAULTS,
     DriveJudged,
@@ -43,6 +44,7 @@ from .drives import (
     score_drive,
     score_smoothed,
 )
+from .places import group_places
 from .pose import score as score_pose
 from .pose.score import PoseScore, ScoredPoses
 from .run_tables import in_log_time
@@ -291,7 +293,8 @@ def metrics_of(scored: Sequence[RunScored], scores: PooledScores) -> dict[str, A
     """
     tree = as_metrics(scores)
     tree["account"] = account_of_scores(scored).as_json()
-    poses = {spelled(str(one.run.path)): one.pose for one in scored if one.pose is not None}
+    named = {spelled(str(one.run.path)): one for one in scored if one.pose is not None}
+    poses = {name: one.pose for name, one in named.items() if one.pose is not None}
     if not poses:
         tree["coverage"]["not_scored"]["pose"] = scored[0].why_no_pose
     if len(scored) == 1:
@@ -300,8 +303,13 @@ def metrics_of(scored: Sequence[RunScored], scores: PooledScores) -> dict[str, A
         tree["pose"] = None if only.pose is None else asdict(only.pose)
     else:
         tree["coverage"]["same_log"] = same_logs(scored)
-        tree["pose"] = _poses(poses)
+        tree["pose"] = _poses(poses, places_of_drives(tuple(named.values())))
     return tree
+
+
+def places_of_drives(scored: Sequence[RunScored]) -> Int64s:
+    """Return the number of each drive's place, shape (N,)."""
+    return group_places([one.truth.places.get(NONE, str(one.run.path)) for one in scored])
 
 
 def account_of_scores(scored: Sequence[RunScored]) -> ScoredAccount | SummedAccount:
@@ -365,8 +373,7 @@ def _digests(log: LogRow) -> Iterator[str]:
     yield log.identity.digest
 
 
-def _poses(poses: Mapping[str, PoseScore]) -> dict[str, Any]:
-    drives = np.arange(len(poses))
+def _poses(poses: Mapping[str, PoseScore], places: Int64s) -> dict[str, Any]:
     rmse = np.array([one.ape["none"].translation_m.rmse for one in poses.values()], np.float64)
     nees = {
         name: np.array([getattr(one, name).mean for one in poses.values()], np.float64)
@@ -374,8 +381,8 @@ def _poses(poses: Mapping[str, PoseScore]) -> dict[str, Any]:
     }
     return {
         "drives": len(poses),
-        "ape_rmse_m": asdict(intervals.mean(rmse, drives)),
-        **{name: asdict(intervals.mean(values, drives)) for name, values in nees.items()},
+        "ape_rmse_m": asdict(intervals.mean(rmse, places)),
+        **{name: asdict(intervals.mean(values, places)) for name, values in nees.items()},
         "lost": sum(one.lost_at_m is not None for one in poses.values()),
         "by_drive": {name: asdict(one) for name, one in poses.items()},
     }

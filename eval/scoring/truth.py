@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +19,7 @@ from crosscue.replay.errors import AnnotationError
 from crosscue.replay.limits import MIB
 
 from .columns import NONE
+from .places import places_of
 
 COLUMNS: Final = ("t_ns", "approach", "start_m", "end_m")
 MAX_BYTES: Final = 256 * MIB
@@ -83,11 +85,13 @@ class DriveTruth:
         drive: Name of the drive in results.
         truth: Contents of the truth file.
         ranges: True ranges; None if the truth has neither ranges nor a track.
+        places: Place by id of the approach, and of the drive by ``NONE``, where known.
     """
 
     drive: str
     truth: Truth
     ranges: TrueRanges | None
+    places: Mapping[int, str] = field(default_factory=dict)
 
     def approach_at(self, t_ns: Int64s) -> Int64s:
         """Return the ids of the current approaches, shape (N,); ``NONE`` outside approaches."""
@@ -135,7 +139,7 @@ def read_scored_truth(path: Path, drive: str) -> DriveTruth:
         ranges = _read_ranges(folder / truth.ranges, truth)
     elif truth.pose is not None and truth.approaches:
         ranges = _ranges_along(folder / truth.pose, truth)
-    return DriveTruth(drive, truth, ranges)
+    return DriveTruth(drive, truth, ranges, places_of(truth, folder))
 
 
 def _read_ranges(path: Path, truth: Truth) -> TrueRanges:

@@ -25,9 +25,10 @@ from crosscue.eval.scoring.drives import (
 )
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.metric_values import metric_values
-from crosscue.eval.scoring.scene.approaches import ApproachResult
+from crosscue.eval.scoring.scene.approaches import ApproachResult, places_of_results
 from crosscue.eval.scoring.scene.belief import BeliefDifference, compare_belief
 from crosscue.eval.scoring.truth import DriveTruth
+from crosscue.replay.columns import Int64s
 from crosscue.replay.vehicle import cue_table
 
 SHOWN: Final = ("approaches", "belief", "range")
@@ -120,12 +121,13 @@ def _without(
     pairs = _pairs(whole, scores)
     detected = [(a.detected_m, b.detected_m) for a, b in pairs]
     full = [(a.full_m, b.full_m) for a, b in pairs]
+    at = places_of_results([a for a, _ in pairs])
     return Attribution(
         cues=cues,
         scores=scores,
         measures=_changed(whole, scores),
-        detected_m=_gain(detected),
-        full_m=_gain(full),
+        detected_m=_gain(detected, at),
+        full_m=_gain(full, at),
         detected_only_with=_only(detected, 0),
         detected_only_without=_only(detected, 1),
         full_only_with=_only(full, 0),
@@ -146,9 +148,9 @@ def _pairs(
     return [(one, others[one.drive, one.approach]) for one in whole.approaches.results]
 
 
-def _gain(pairs: Sequence[tuple[float | None, float | None]]) -> Mean:
+def _gain(pairs: Sequence[tuple[float | None, float | None]], at: Int64s) -> Mean:
     gains = [math.nan if a is None or b is None else a - b for a, b in pairs]
-    return mean(np.array(gains, np.float64), np.arange(len(gains)))
+    return mean(np.array(gains, np.float64), at)
 
 
 def _only(pairs: Sequence[tuple[float | None, float | None]], side: int) -> int:

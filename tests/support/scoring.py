@@ -232,7 +232,7 @@ def run_folder(
     return run
 
 
-def truth_folder(path: Path, drive_truth: DriveTruth | None = None) -> Path:
+def truth_folder(path: Path, drive_truth: DriveTruth | None = None, place: str = "") -> Path:
     """Write the truth of the made-up drive, and return the path of ``truth.json``."""
     path.mkdir(parents=True, exist_ok=True)
     one = good_truth() if drive_truth is None else drive_truth
@@ -244,4 +244,4 @@ def truth_folder(path: Path, drive_truth: DriveTruth | None = None) -> Path:
         lines = ["t_ns,approach,start_m,end_m", *(f"{t},{a},{s},{e}" for t, a, s, e in rows), ""]
         write_text(path / "ranges.csv", "\n".join(lines))
         reported = reported.model_copy(update={"ranges": "ranges.csv"})
-    return save(reported, path)
+    return save(reported.model_copy(update={"place": place}), path)

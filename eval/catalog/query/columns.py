@@ -126,6 +126,7 @@ OWN: Final[Mapping[str, Mapping[str, Column]]] = {
         "kind": Column("VARCHAR", "pooling over drives: mean, rms or sum"),
         "total": Column("DOUBLE", "sum over the drive's rows; of squares for rms"),
         "rows": Column("BIGINT", "number of rows"),
+        "places": Column("VARCHAR[]", "places of the drive, which comparisons resample"),
         "value": Column("DOUBLE", "value of this drive alone"),
     },
     "belief": {
@@ -187,7 +188,7 @@ FILES: Final[Mapping[str, str]] = {
 }
 # SQL of the tables that are computed from a file.
 VIEWS: Final[Mapping[str, str]] = {
-    "scores": "select run, log, metric, kind, total, rows, case kind when 'sum' then total "
+    "scores": "select run, log, metric, kind, total, rows, places, case kind when 'sum' then total "
     "when 'rms' then sqrt(total / nullif(rows, 0)) else total / nullif(rows, 0) end as value "
     "from {table}",
 }

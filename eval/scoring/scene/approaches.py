@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from crosscue.datasets.truth.truth import Approach
 from crosscue.eval.scoring.columns import NONE, BeliefRows, RunTables
 from crosscue.eval.scoring.intervals import Mean, Proportion, fraction, mean
+from crosscue.eval.scoring.places import group_places
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
 
 from .detection import CONFIRM_FRAMES, RULES, Definition, Rule, held, is_range_right
@@ -65,6 +66,7 @@ class ApproachResult:
         features_m: True distance at which each present feature first exceeded the threshold.
         false_features: Absent features that exceeded the threshold at any time before entering.
         at_entering: Last probabilities before entering.
+        place: Place of the intersection, as scores resample it.
     """
 
     drive: str
@@ -86,6 +88,7 @@ class ApproachResult:
     features_m: dict[str, float | None]
     false_features: tuple[str, ...]
     at_entering: dict[str, float]
+    place: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,8 +146,8 @@ class ApproachScore:
         detected: Fraction of approaches that were detected.
         full: Fraction of approaches that were fully detected.
         full_from_8_m: Fraction of approaches with full detection at least 8 m away.
-        detected_m: Mean distance at detection, with its interval over approaches.
-        full_m: Mean distance at full detection, with its interval over approaches.
+        detected_m: Mean distance at detection, with its interval over places.
+        full_m: Mean distance at full detection, with its interval over places.
         spurious: Number of approaches with a detection as published that was not confirmed.
         false_features: Fraction of approaches with an absent feature above the threshold.
         false_by_feature: Number of those approaches by feature.
@@ -336,6 +339,7 @@ def _result(
         at_entering={
             name: float(values[-1]) for name, values in steps.features.items() if len(values)
         },
+        place=truth.places.get(one.id, f"{truth.drive}, approach {one.id}"),
     )
 
 
@@ -440,21 +444,22 @@ def score_approaches(judged: Sequence[ApproachesJudged]) -> ApproachScore | None
     results = tuple(result for one in judged for result in one.results)
     if not results:
         return None
+    at = places_of_results(results)
+    known = np.array([not _is_unknown(one.full_m) for one in results], np.bool_)
+    near = np.array([(one.full_m or 0.0) >= NEAR_M for one in results], np.bool_)
     return ApproachScore(
         approaches=len(results),
         matched=sum(one.run_approach is not None for one in results),
         without_range=sum(
             _is_unknown(one.detected_m) or _is_unknown(one.full_m) for one in results
         ),
-        detected=_fraction([one.detected_m is not None for one in results]),
-        full=_fraction([one.full_m is not None for one in results]),
-        full_from_8_m=_fraction(
-            [(one.full_m or 0.0) >= NEAR_M for one in results if not _is_unknown(one.full_m)]
-        ),
-        detected_m=_mean([one.detected_m for one in results]),
-        full_m=_mean([one.full_m for one in results]),
+        detected=_fraction([one.detected_m is not None for one in results], at),
+        full=_fraction([one.full_m is not None for one in results], at),
+        full_from_8_m=fraction(near[known], at[known]),
+        detected_m=_mean([one.detected_m for one in results], at),
+        full_m=_mean([one.full_m for one in results], at),
         spurious=sum(one.spurious_m is not None for one in results),
-        false_features=_fraction([bool(one.false_features) for one in results]),
+        false_features=_fraction([bool(one.false_features) for one in results], at),
         false_by_feature=_counts([name for one in results for name in one.false_features]),
         extra=sum(one.extra for one in judged),
         extra_detected=sum(one.extra_detected for one in judged),
@@ -483,14 +488,17 @@ def _is_unknown(distance_m: float | None) -> bool:
     return distance_m is not None and math.isnan(distance_m)
 
 
-def _fraction(values: Sequence[bool]) -> Proportion:
-    # Approaches are the clusters, so Wilson's interval applies.
-    return fraction(np.array(values, np.bool_), np.arange(len(values)))
+def places_of_results(results: Sequence[ApproachResult]) -> NDArray[np.int64]:
+    """Return the number of each result's place, shape (N,)."""
+    return group_places([one.place or f"{one.drive}, approach {one.approach}" for one in results])
 
 
-def _mean(values: Sequence[float | None]) -> Mean:
-    known = np.array([math.nan if value is None else value for value in values], np.float64)
-    return mean(known, np.arange(len(known)))
+def _fraction(values: Sequence[bool], at: NDArray[np.int64]) -> Proportion:
+    return fraction(np.array(values, np.bool_), at)
+
+
+def _mean(values: Sequence[float | None], at: NDArray[np.int64]) -> Mean:
+    return mean(np.array([math.nan if one is None else one for one in values], np.float64), at)
 
 
 def _counts(names: Sequence[str]) -> dict[str, int]:
@@ -505,11 +513,12 @@ def _groups(
     groups: dict[str, ApproachGroup] = {}
     for name in sorted(names):
         mine = [one for one in results if belongs(name, one)]
+        at = np.arange(len(mine))
         groups[name] = ApproachGroup(
             approaches=len(mine),
             detected=sum(one.detected_m is not None for one in mine),
             full=sum(one.full_m is not None for one in mine),
-            detected_m=_mean([one.detected_m for one in mine]).value,
-            full_m=_mean([one.full_m for one in mine]).value,
+            detected_m=_mean([one.detected_m for one in mine], at).value,
+            full_m=_mean([one.full_m for one in mine], at).value,
         )
     return groups

@@ -1,15 +1,15 @@
 """Scores of beliefs as probabilities: Brier score, log score, reliability.
 
 A step within a true approach is compared with the features of that intersection. Where the truth
-states that there is no intersection ahead, the step is compared with its absence. Steps of one
-approach are correlated, so intervals are over approaches.
+states that there is no intersection ahead, the step is compared with its absence. Steps at one
+place are correlated, so intervals are over places.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from crosscue.eval.scoring.columns import AMBIGUOUS, NONE, RunTables
 from crosscue.eval.scoring.intervals import Mean, Proportion, fraction, mean
-from crosscue.eval.scoring.pooling import cluster_numbers, first_reasons, sum_counts
+from crosscue.eval.scoring.places import cluster_numbers
+from crosscue.eval.scoring.pooling import first_reasons, sum_counts
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
 
 # Probabilities are clipped to this and one minus this for the log score.
@@ -38,6 +39,7 @@ class BeliefJudged:
         probability: Shape (N,).
         is_there: Shape (N,): True where the feature is present.
         left_out: Numbers by reason of steps that could not be judged, and of frames without a step.
+        places: Place by id of the approach.
     """
 
     drive: str
@@ -47,6 +49,7 @@ class BeliefJudged:
     probability: NDArray[np.float64]
     is_there: NDArray[np.bool_]
     left_out: dict[str, int]
+    places: Mapping[int, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +158,7 @@ def judge_belief(tables: RunTables, truth: DriveTruth) -> list[BeliefJudged]:
                 values[left],
                 label[left] == 1,
                 left_out,
+                truth.places,
             )
         )
     return judged
@@ -200,7 +204,7 @@ def _pooled(
     return (
         np.concatenate([one.probability for one in rows]),
         np.concatenate([one.is_there for one in rows]),
-        cluster_numbers([one.drive for one in rows], [one.approach for one in rows]),
+        cluster_numbers(rows),
     )
 
 
@@ -268,7 +272,7 @@ def _difference(first: Sequence[BeliefJudged], second: Sequence[BeliefJudged]) -
     there = np.concatenate([np.empty(0, np.bool_), *(a.is_there for a, _ in pairs)])
     p = np.concatenate([np.empty(0), *(a.probability for a, _ in pairs)])
     q = np.concatenate([np.empty(0), *(b.probability for _, b in pairs)])
-    clusters = cluster_numbers([a.drive for a, _ in pairs], [a.approach for a, _ in pairs])
+    clusters = cluster_numbers([a for a, _ in pairs])
     log = mean(log_score(q, there) - log_score(p, there), clusters)
     return BeliefDifference(
         steps=len(there),

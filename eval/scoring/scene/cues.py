@@ -25,13 +25,8 @@ from numpy.typing import NDArray
 
 from crosscue.eval.scoring.columns import AMBIGUOUS, NONE, CueRows, RunTables
 from crosscue.eval.scoring.intervals import Proportion, fraction
-from crosscue.eval.scoring.pooling import (
-    BINS_M,
-    cluster_numbers,
-    distance_bins,
-    first_reasons,
-    sum_counts,
-)
+from crosscue.eval.scoring.places import cluster_numbers
+from crosscue.eval.scoring.pooling import BINS_M, distance_bins, first_reasons, sum_counts
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, cue_at, has_feature
 from crosscue.replay.vehicle.vehicle import CUES, Scoring
 
@@ -63,6 +58,7 @@ class CueFrames:
         left_out: Numbers of unscored frames by criterion and reason.
         conditions: Tags by id of the approach.
         is_open: True if the truth has other objects but not this one.
+        places: Place by id of the approach.
     """
 
     drive: str
@@ -80,6 +76,7 @@ class CueFrames:
     left_out: Mapping[Reading, Mapping[str, int]]
     conditions: Mapping[int, tuple[str, ...]]
     is_open: bool = False
+    places: Mapping[int, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,6 +225,7 @@ def _judge(
         },
         conditions={one.id: one.conditions for one in truth.truth.approaches},
         is_open=bool(truth.truth.cues) and not spans and is_object,
+        places=truth.places,
     )
 
 
@@ -283,31 +281,25 @@ def is_wrong(cue: CueFrames) -> NDArray[np.bool_]:
 
 @dataclass(slots=True)
 class _Pooled:
-    """Rows of one cue of all drives, with a cluster number for each approach of each drive."""
+    """Rows of one cue of all drives, with the number of the place of each row."""
 
     rows: Sequence[CueFrames]
     cluster: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.cluster = cluster_numbers(
-            [one.drive for one in self.rows], [one.approach for one in self.rows]
-        )
+        self.cluster = cluster_numbers(self.rows)
 
     def tag_masks(self) -> dict[str, NDArray[np.bool_]]:
         """Return masks of the rows by tag of the approach; ``no tag`` for the others."""
-        tags: dict[int, tuple[str, ...]] = {}
-        first = 0
-        for one in self.rows:
-            cluster = self.cluster[first : first + len(one.approach)]
-            first += len(one.approach)
-            for place in np.unique(cluster, return_index=True)[1].tolist():
-                approach = int(one.approach[place])
-                tags[int(cluster[place])] = one.conditions.get(approach, ())
-        by_cluster = [tags[number] for number in range(len(tags))]
-        names = sorted({name for one in by_cluster for name in one})
-        has = {name: [name in one for one in by_cluster] for name in names}
-        has["no tag"] = [not one for one in by_cluster]
-        return {name: np.array(holds, np.bool_)[self.cluster] for name, holds in has.items()}
+        tags = [
+            one.conditions.get(approach, ())
+            for one in self.rows
+            for approach in one.approach.tolist()
+        ]
+        names = sorted({name for some in tags for name in some})
+        has = {name: [name in some for some in tags] for name in names}
+        has["no tag"] = [not some for some in tags]
+        return {name: np.array(holds, np.bool_) for name, holds in has.items()}
 
     def ints(self, name: str) -> NDArray[np.int64]:
         return np.concatenate([getattr(one, name) for one in self.rows]).astype(np.int64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Final, Protocol
 
@@ -13,13 +13,8 @@ from numpy.typing import NDArray
 
 from crosscue.eval.scoring.columns import AMBIGUOUS, RangeRows, RunTables
 from crosscue.eval.scoring.intervals import Mean, mean
-from crosscue.eval.scoring.pooling import (
-    BINS_M,
-    cluster_numbers,
-    distance_bins,
-    first_reasons,
-    sum_counts,
-)
+from crosscue.eval.scoring.places import cluster_numbers
+from crosscue.eval.scoring.pooling import BINS_M, distance_bins, first_reasons, sum_counts
 from crosscue.eval.scoring.pose.errors import FilterAndSmoother as FilterAndSmoother
 from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
 from crosscue.eval.scoring.truth import DriveTruth
@@ -43,6 +38,7 @@ class RangeJudged:
         var_m2: Variance of the filter.
         left_out: Number of rows that could not be judged, by reason.
         controls: Control of the intersection in the truth, by id of the approach.
+        places: Place by id of the approach.
     """
 
     drive: str
@@ -54,6 +50,7 @@ class RangeJudged:
     var_m2: NDArray[np.float64]
     left_out: dict[str, int]
     controls: Mapping[int, str]
+    places: Mapping[int, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +72,10 @@ class RangeScore:
         rows: Number of rows.
         scored: Number of rows with a true range.
         left_out: Number of rows by reason.
-        bias_m: Mean error, with its interval over approaches.
+        bias_m: Mean error, with its interval over places.
         rmse_m: Root mean square error.
         p95_m: 95th percentile of absolute errors.
-        nees: NEES; its band counts each approach as one independent error.
+        nees: NEES; its band counts each place as one independent error.
         by_distance: Errors by true range.
         by_control: Errors by control of the intersection. A range to the end without a light comes
             from a false detection of a light.
@@ -151,6 +148,7 @@ def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
                 rows.var_m2[mine],
                 left_out,
                 controls,
+                truth.places,
             )
         )
     return judged
@@ -235,7 +233,7 @@ def _score(rows: Sequence[RangeJudged], bins_m: Sequence[float]) -> RangeScore:
     error = np.concatenate([one.error_m for one in rows])
     nees = error**2 / np.concatenate([one.var_m2 for one in rows])
     true_m = np.concatenate([one.true_m for one in rows])
-    clusters = cluster_numbers([one.drive for one in rows], [one.approach for one in rows])
+    clusters = cluster_numbers(rows)
     left_out = sum_counts(one.left_out for one in rows)
     return RangeScore(
         rows=len(error) + sum(left_out.values()),

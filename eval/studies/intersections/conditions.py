@@ -10,7 +10,7 @@ import numpy as np
 
 from crosscue.eval.failures.causes import GOOD
 from crosscue.eval.scoring.intervals import Mean, mean
-from crosscue.eval.scoring.scene.approaches import ApproachResult
+from crosscue.eval.scoring.scene.approaches import ApproachResult, places_of_results
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +73,12 @@ def _cost(
     pairs = [(one, good[one.intersection]) for one in bad]
     detected = [_less(one.detected_m, [g.detected_m for g in some]) for one, some in pairs]
     full = [_less(one.full_m, [g.full_m for g in some]) for one, some in pairs]
+    at = places_of_results(bad)
     return ConditionCost(
         tag,
         len(bad),
-        mean(np.array(detected), np.arange(len(bad))),
-        mean(np.array(full), np.arange(len(bad))),
+        mean(np.array(detected), at),
+        mean(np.array(full), at),
         sum(
             one.detected_m is None and any(g.detected_m is not None for g in some)
             for one, some in pairs

@@ -35,7 +35,9 @@ def _settings(established: float) -> Vehicle:
     return Vehicle(version=1, fusion=Fusion(established=established))
 
 
-def _pair(tmp_path: Path, *, scored: bool = True, drives: int = 1) -> tuple[Path, Path]:
+def _pair(
+    tmp_path: Path, *, scored: bool = True, drives: int = 1, places: int = 6
+) -> tuple[Path, Path]:
     """Good drives, and the same drives with seven false stop signs each."""
     false_signs = {
         "frames": frame_table(50),
@@ -46,7 +48,7 @@ def _pair(tmp_path: Path, *, scored: bool = True, drives: int = 1) -> tuple[Path
     runs: dict[str, list[str]] = {"a": [], "b": []}
     for number in range(drives):
         folder = tmp_path / str(number)
-        truth_folder(folder)
+        truth_folder(folder, place=f"place {number % places}")
         (folder / "drive.mcap").write_text(f"drive {number}")
         for name, tables, established in (("a", None, 0.9), ("b", false_signs, 0.3)):
             run = run_folder(folder / name, tables, settings=_settings(established))
@@ -59,6 +61,17 @@ def _pair(tmp_path: Path, *, scored: bool = True, drives: int = 1) -> tuple[Path
     if drives == 1:
         return Path(runs["a"][0]), Path(runs["b"][0])
     return tmp_path / "scores-a", tmp_path / "scores-b"
+
+
+@pytest.mark.slow
+def test_drives_of_one_place_count_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good, worse = _pair(tmp_path, drives=6, places=2)
+
+    assert cli.run(["compare", str(good), str(worse), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    (one,) = (one for one in found["judged"] if one["path"] == "cues.stop_sign.precision")
+    assert (one["verdict"], one["drives"], one["places"]) == ("too few places", 6, 2)
+    assert one["more_places"] == 4
 
 
 @pytest.mark.slow

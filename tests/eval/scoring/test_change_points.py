@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring import change_points as module
-from crosscue.eval.scoring.change_points import FALSE_ALARMS, MIN_DRIVES, Results, change_points
+from crosscue.eval.scoring.change_points import FALSE_ALARMS, MIN_PLACES, Results, change_points
 
 DRIVES, VERSIONS = 8, 6
 
@@ -24,7 +24,9 @@ def history(
 
 
 def results(*values: NDArray[np.float64]) -> dict[str, Results]:
-    return {str(i): Results(one, np.ones(len(one))) for i, one in enumerate(values)}
+    return {
+        str(i): Results(one, np.ones(len(one)), np.arange(len(one))) for i, one in enumerate(values)
+    }
 
 
 def places(found: dict[str, Results]) -> list[list[int]]:
@@ -81,7 +83,7 @@ def test_added_drives_are_not_reported_as_change() -> None:
     assert places(results(values)) == [[4]]
 
 
-@pytest.mark.parametrize("drives", [1, MIN_DRIVES - 1])
+@pytest.mark.parametrize("drives", [1, MIN_PLACES - 1])
 def test_too_few_drives_yield_no_change_points(drives: int) -> None:
     assert places(results(history(np.random.default_rng(5), {3: 9.0}, drives))) == [[]]
 
