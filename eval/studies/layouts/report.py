@@ -48,7 +48,8 @@ def write_layout_study(
     """
     flags = (
         f"--perception {settings.perception} --blocks {settings.blocks} --runs {settings.runs} "
-        f"--folds {settings.folds} --seed {settings.seed} --width {settings.width_px}"
+        f"--folds {settings.folds} --seed {settings.seed} --layouts-from {settings.layouts_from} "
+        f"--width {settings.width_px}"
     )
     tree: dict[str, Any] = {
         "is_simulated": True,

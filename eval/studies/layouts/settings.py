@@ -27,7 +27,8 @@ class LayoutStudy:
         blocks: Blocks of thirteen layouts.
         runs: Drives per layout.
         folds: Folds, by layout.
-        seed: Random seed.
+        seed: Random seed of the drives. The layouts stay the same.
+        layouts_from: Number of the first layout; another one draws layouts never seen before.
         width_px: Image width in pixels; height is 9/16.
     """
 
@@ -36,6 +37,7 @@ class LayoutStudy:
     runs: Annotated[int, Option(metavar="N")] = 2
     folds: int = 4
     seed: int = 0
+    layouts_from: Annotated[int, Option(metavar="N")] = 0
     width_px: Annotated[int, Option("--width")] = 960
 
     def __post_init__(self) -> None:
@@ -53,20 +55,22 @@ class LayoutStudy:
                 f"folds {self.folds}, blocks {self.blocks}: expected {MIN_FOLDS} folds or more, "
                 "and at least as many blocks"
             )
-        if self.runs < 1 or self.seed < 0:
+        if self.runs < 1 or min(self.seed, self.layouts_from) < 0:
             raise UsageError(
-                f"runs {self.runs}, seed {self.seed}: expected 1 or more runs, a seed of 0 or more"
+                f"runs {self.runs}, seed {self.seed}, layouts_from {self.layouts_from}: expected 1 "
+                "or more runs, the others 0 or more"
             )
         camera_of_width(self.width_px)
 
     @property
     def layouts(self) -> tuple[str, ...]:
         """Names of all layouts."""
-        return tuple(f"M{number}" for number in range(self.blocks * len(KINDS)))
+        numbers = range(self.layouts_from, self.layouts_from + self.blocks * len(KINDS))
+        return tuple(f"M{number}" for number in numbers)
 
     def fold_of(self, layout: str) -> int:
         """Return the fold that a layout is tested in."""
-        return int(layout[1:]) // len(KINDS) % self.folds
+        return (int(layout[1:]) - self.layouts_from) // len(KINDS) % self.folds
 
     def features_of(self, layout: str) -> dict[str, bool]:
         """Return the true features of a layout, where known."""

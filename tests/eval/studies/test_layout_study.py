@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from crosscue.datasets.scenes.layout import layout_named
+from crosscue.datasets.scenes.layout import KINDS, layout_named, mixed_kind
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval.scoring.truth import FEATURES
 from crosscue.eval.studies import simulated_drives
@@ -34,6 +34,23 @@ def test_every_fold_has_layouts_with_and_without_each_feature(fold: int, feature
     assert {True, False} <= set(known)
 
 
+def test_layouts_from_draws_layouts_never_seen_before_in_whole_folds() -> None:
+    fresh = LayoutStudy(layouts_from=2600)
+
+    assert not {*fresh.layouts} & {*STUDY.layouts}
+    assert {layout_named(name).seed for name in fresh.layouts}.isdisjoint(
+        layout_named(name).seed for name in STUDY.layouts
+    )
+    assert {scene.layout for scene in fresh.scenes()} == {*fresh.layouts}
+    # Another seed draws other drives of the same layouts.
+    assert LayoutStudy(seed=1).layouts == STUDY.layouts
+    kinds = [
+        {mixed_kind(int(name[1:])) for name in fresh.layouts if fresh.fold_of(name) == fold}
+        for fold in range(fresh.folds)
+    ]
+    assert kinds == [set(KINDS)] * fresh.folds
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -43,6 +60,7 @@ def test_every_fold_has_layouts_with_and_without_each_feature(fold: int, feature
         {"perception": "none"},
         {"width_px": 100},
         {"seed": -1},
+        {"layouts_from": -1},
     ],
 )
 def test_invalid_layout_study_is_refused(changes: dict[str, Any]) -> None:
