@@ -43,12 +43,14 @@ class Result:
         also: Paths of attributes that are in JSON besides the fields, by key.
         formats: Methods that return another text, by name of the option, with its help.
         is_printed_in_parts: True if the command prints only the parts, unless as JSON.
+        max_lines: Number of lines that the command prints without ``--verbose``; 0 for all.
     """
 
     __slots__ = ()
     also: ClassVar[Mapping[str, str]] = {}
     formats: ClassVar[Mapping[str, str]] = {}
     is_printed_in_parts: ClassVar[bool] = False
+    max_lines: ClassVar[int] = 0
 
     @property
     def exit_status(self) -> int:
@@ -75,11 +77,27 @@ class Result:
         """Yield lines that the command prints on stderr after the text."""
         return iter(())
 
+    def closing(self) -> Iterator[str]:
+        """Yield the last lines, which are always printed, such as files to open."""
+        return iter(())
+
+    def brief(self) -> str:
+        """Return the text of the command without ``--verbose``: at most ``max_lines`` lines."""
+        lines, last = _split(self.lines()), _split(self.closing())
+        kept = self.max_lines - len(last) - 1
+        if 0 < kept < len(lines) - 1:
+            lines[kept:] = [f"... and {len(lines) - kept} lines more: add -v"]
+        return "\n".join([*lines, *last])
+
     def __repr__(self) -> str:
-        return "\n".join(visible(line) for text in self.lines() for line in text.split("\n"))
+        return "\n".join([*_split(self.lines()), *_split(self.closing())])
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(repr(self))}</pre>"
+
+
+def _split(texts: Iterator[str]) -> list[str]:
+    return [visible(line) for text in texts for line in text.split("\n")]
 
 
 class Listing(Result, Sequence[T]):

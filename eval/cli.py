@@ -254,7 +254,9 @@ def parser_of(name: str) -> tuple[Call, argparse.ArgumentParser]:
     call = fill(parser, getattr(import_module(f"crosscue.{path}"), function))
     talk = parser.add_mutually_exclusive_group()
     talk.add_argument("-q", "--quiet", action="store_true", help="print only errors")
-    talk.add_argument("-v", "--verbose", action="store_true", help="print tracebacks with errors")
+    talk.add_argument(
+        "-v", "--verbose", action="store_true", help="print all lines, and tracebacks"
+    )
     return call, parser
 
 

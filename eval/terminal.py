@@ -147,7 +147,7 @@ def _print_part(event: object, args: argparse.Namespace) -> None:
     elif isinstance(event, Result) and event.exit_status:
         print(event, file=sys.stderr)
     elif not args.quiet:
-        print(event)
+        print(_text(event, args) if isinstance(event, Result) else event)
 
 
 def print_found(found: Any, args: argparse.Namespace) -> int:
@@ -161,13 +161,17 @@ def print_found(found: Any, args: argparse.Namespace) -> int:
     if args.json:
         print(strict_json(shown.as_dict()))
     elif not args.quiet and not shown.is_printed_in_parts:
-        text = repr(shown) if chosen is None else getattr(shown, chosen)()
+        text = _text(shown, args) if chosen is None else getattr(shown, chosen)()
         if text:
             print(text)
     if not args.quiet and not args.json:
         for message in shown.messages():
             print(message, file=sys.stderr)
     return shown.exit_status
+
+
+def _text(result: Result, args: argparse.Namespace) -> str:
+    return repr(result) if args.verbose else result.brief()
 
 
 def is_shown(args: argparse.Namespace) -> bool:

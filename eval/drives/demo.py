@@ -10,8 +10,10 @@ from typing import Annotated, ClassVar, Final, Literal
 from crosscue.datasets.simulate import simulate_approach
 from crosscue.eval.drives.replay import replay_drive
 from crosscue.eval.drives.score import ScoredRun, score_run
+from crosscue.eval.pipeline.outcome import MAX_LINES
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.recording.view import save_recording
+from crosscue.eval.report.opening import judged_sentences
 from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.files import door
 from crosscue.replay.files.whole_file import write_text
@@ -100,6 +102,7 @@ class Demo(Result):
     scored: ScoredRun = field(metadata=HIDDEN)
     recording: Path
 
+    max_lines: ClassVar = MAX_LINES
     also: ClassVar = {
         **{name: f"drive.{name}" for name in ("log", "vehicle", "truth", "attribution")},
         "run": "run.path",
@@ -113,15 +116,20 @@ class Demo(Result):
         return self.run.made.exit_status
 
     def lines(self) -> Iterator[str]:
-        """Yield the summaries of the replay and of the scores, and the files to open."""
-        yield repr(self.run.made)
+        """Yield what was found, the scores and the summary of the replay."""
         whose = "our annotations" if self.drive.attribution else "the truth of the simulation"
-        yield f"\nagainst {whose}"
+        yield f"against {whose}:"
+        yield from judged_sentences(self.scored.scored.one)
+        yield ""
         yield repr(self.scored)
+        yield ""
+        yield repr(self.run.made)
+
+    def closing(self) -> Iterator[str]:
+        """Yield the files to open."""
         yield f"\nreport     {self.scored.report.resolve()}"
         yield f"recording  {self.recording.resolve()}"
-        command = f"crosscue view {self.run.path} --truth {self.drive.truth}"
-        yield f"           look at it with: {command}"
+        yield f"           look at it with: crosscue view {self.run.path}"
         if self.drive.attribution:
             yield f"pictures   {self.drive.attribution}"
 

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from crosscue.eval.catalog.find_runs import runs_of
+from crosscue.eval.pipeline.outcome import MAX_LINES
 from crosscue.eval.pipeline.run import Run, moved_to
 from crosscue.eval.report.junit import write_junit
+from crosscue.eval.report.opening import judged_sentences
 from crosscue.eval.report.summary import (
     gate_lines,
     pose_summary,
@@ -74,6 +76,7 @@ class ScoredRuns(Result):
     report: Path | None = field(metadata=HIDDEN)
 
     also: ClassVar = {"gates": "gate_outcomes", "runs": "metrics_by_run"}
+    max_lines: ClassVar = MAX_LINES
 
     @property
     def is_many(self) -> bool:
@@ -119,8 +122,16 @@ class ScoredRuns(Result):
         return {str(one.scored.one.run.path): one.metrics for one in self.runs}
 
     def lines(self) -> Iterator[str]:
-        """Yield the scores, where they were written, and the gates."""
+        """Yield what was found, then the scores."""
         yield from _lines_together(self) if self.is_many else _lines_of_one(self)
+
+    def brief(self) -> str:
+        """Return the text without ``--verbose``, which is all of it with attribution or smoother."""
+        has_more = bool(self.attribution) or any(one.scored.smoothed for one in self.runs)
+        return repr(self) if has_more else Result.brief(self)
+
+    def closing(self) -> Iterator[str]:
+        """Yield where the scores were written, and the gates."""
         if self.report is not None:
             yield f"written to {visible(str(self.report))}"
         if self.gates:
@@ -130,15 +141,17 @@ class ScoredRuns(Result):
 def _lines_of_one(found: ScoredRuns) -> list[str]:
     (run,) = found.runs
     one = run.scored.one
-    lines = [f"run        {visible(str(one.run.path))}", *_account(found)]
-    lines += [reported_line("note", visible(text)) for text in one.run.drive_manifest().notices]
-    lines.append("")
-    lines += _scores(found, one.why_no_pose)
+    lines = [f"run        {visible(str(one.run.path))}"]
+    lines += [reported_line("", visible(sentence)) for sentence in judged_sentences(one)]
+    lines += [] if found.is_whole else _account(found)
+    lines += ["", *_scores(found, one.why_no_pose)]
     if one.pose is not None:
         lines += ["", pose_summary(one.pose)]
     if run.scored.smoothed is not None:
         lines.append(smoother_text(run.scored.smoothed))
-    return lines
+    notices = one.run.drive_manifest().notices
+    notes = [reported_line("note", visible(text)) for text in notices]
+    return [*lines, "", *(_account(found) if found.is_whole else []), *notes]
 
 
 def _lines_together(found: ScoredRuns) -> list[str]:

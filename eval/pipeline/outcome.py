@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from crosscue.detectors.runner import FrameCounts
 from crosscue.eval.pipeline.scene.outcome import ApproachSummary, SceneOutcome
@@ -15,6 +15,9 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.safe_text import terminal_width, visible, wrapped
 from crosscue.replay.time.segments import ONE_SEGMENT, TimeSegment
 from crosscue.results import HIDDEN, Result, json_key
+
+# Lines of a result that are printed without --verbose.
+MAX_LINES: Final = 25
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -104,6 +107,7 @@ class Outcome(Result):
     segments: tuple[TimeSegment, ...] = field(default=ONE_SEGMENT.segments, metadata=HIDDEN)
 
     also: ClassVar = {"run": "run.path", "pose": "pose", "detected": "detection_counts"}
+    max_lines: ClassVar = MAX_LINES
 
     @property
     def exit_status(self) -> int:
@@ -133,19 +137,18 @@ class Outcome(Result):
         }
 
     def lines(self) -> Iterator[str]:
-        """Yield the account, the pose, cues and approaches, at most 80 columns wide."""
+        """Yield approaches, cues, the pose and the account, at most 80 columns wide."""
         width = min(terminal_width(), 80)
         for line in map(visible, _lines_of(self)):
             yield wrapped(line[9:], width, lead=line[:9]) if len(line) > width else line
 
 
 def _lines_of(outcome: Outcome) -> list[str]:
+    account = [*account_lines(outcome.account), *details_of(_ledgers(outcome))]
     lines = [f"run      {outcome.run.path}"]
-    for log in outcome.account.reading:
-        lines.append(f"log      {log.log}")
-        lines.append(f"         integrity: {log.integrity}")
-        lines += [f"  note   {sentence}" for sentence in log.notices]
-    lines += [*account_lines(outcome.account), *details_of(_ledgers(outcome))]
+    lines += [] if outcome.account.is_whole else account
+    if outcome.scene is not None:
+        lines += _found(outcome.scene)
     if outcome.rows:
         lines += [
             f"pose     {outcome.rows:,} rows over {outcome.travelled_m:.0f} m in "
@@ -154,13 +157,18 @@ def _lines_of(outcome: Outcome) -> list[str]:
         ]
     else:
         lines.append("pose     none")
+    lines += account if outcome.account.is_whole else []
+    lines += [f"  note   {sentence}" for sentence in outcome.notices]
+    for log in outcome.account.reading:
+        lines.append(f"log      {log.log}")
+        lines.append(f"         integrity: {log.integrity}")
+        lines += [f"  note   {sentence}" for sentence in log.notices]
     if outcome.detected is not None:
         lines += _detected(outcome)
     if outcome.scene is not None:
-        lines += _scene_lines(outcome.scene)
+        lines += _not_used(outcome.scene)
     if outcome.landmark_counts:
         lines.append(f"marks    {_landmarks(outcome.landmark_counts)}")
-    lines += [f"  note   {sentence}" for sentence in outcome.notices]
     speed = outcome.drive_seconds / max(outcome.seconds, 1e-9)
     digits = 0 if speed >= 10 else 1
     lines.append(f"took     {outcome.seconds:.2f} s, {speed:.{digits}f} times real time")
@@ -181,17 +189,19 @@ def _detected(outcome: Outcome) -> list[str]:
     return lines
 
 
-def _scene_lines(scene: SceneOutcome) -> list[str]:
-    """Return the output lines on cues and approaches."""
+def _found(scene: SceneOutcome) -> list[str]:
+    """Return the output lines on approaches and cues."""
     seen = [f"{cue} {count:,}" for cue, count in scene.positive.items()]
-    lines = [f"cues     {', '.join(seen) or 'none'} (frames each, of {scene.frames:,})"]
+    lines = [f"approach {_approach(one)}" for one in scene.approaches]
+    return [*lines, f"cues     {', '.join(seen) or 'none'} (frames each, of {scene.frames:,})"]
+
+
+def _not_used(scene: SceneOutcome) -> list[str]:
+    """Return the output lines on detections that did not count, and cues not looked for."""
     rows = candidate_rows(scene.candidates), candidate_rows(scene.ranged)
-    lines += [f"  skip   {sentence}" for sentence in candidate_lines(*rows)]
+    lines = [f"  skip   {sentence}" for sentence in candidate_lines(*rows)]
     lines += [f"  skip   {sentence}" for sentence in not_looked_lines(scene.not_looked_for)]
-    lines += [f"  note   {n:,} x {what}" for what, n in scene.counts.items() if n]
-    for one in scene.approaches:
-        lines.append(f"approach {_approach(one)}")
-    return lines
+    return [*lines, *(f"  note   {n:,} x {what}" for what, n in scene.counts.items() if n)]
 
 
 def _approach(one: ApproachSummary) -> str:

@@ -94,7 +94,7 @@ def opening_of(
         RunError: A table is damaged.
     """
     tables = read_run_tables(run)
-    sentences = _told(run, tables, threshold) if scored is None else _judged(scored)
+    sentences = _told(run, tables, threshold) if scored is None else judged_sentences(scored)
     events = [*_events(tables, threshold)]
     if scored is not None:
         events += _mistakes(scored.judged.cues, worst)
@@ -169,7 +169,7 @@ def _frame(frames: np.typing.NDArray[np.int64], event: _Event) -> int:
     return int(frames[max(int(np.searchsorted(frames, event.t_ns, side="right")) - 1, 0)])
 
 
-def _judged(scored: RunScored) -> tuple[str, ...]:
+def judged_sentences(scored: RunScored) -> tuple[str, ...]:
     """Return a sentence for each true approach, and for the pose."""
     judged = scored.judged.approaches
     results = () if judged is None else judged.results

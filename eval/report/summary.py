@@ -27,16 +27,18 @@ LABEL: Final = 11
 
 def scores_text(scores: PooledScores, why_no_pose: str = "") -> str:
     """Return the pooled scores of any number of drives as text."""
-    missing = scores.not_scored() | ({"pose": why_no_pose} if why_no_pose else {})
-    lines = [*_coverage(scores), *(_line("not scored", f"{k}: {v}") for k, v in missing.items())]
-    if scores.cues:
-        lines += ["", *_cues(scores.cues)]
+    lines: list[str] = []
     if scores.approaches is not None:
-        lines += ["", *_approaches(scores.approaches)]
-    if scores.belief:
-        lines += ["", *_belief(scores.belief)]
+        lines += [*_approaches(scores.approaches), ""]
+    if scores.cues:
+        lines += [*_cues(scores.cues), ""]
     if scores.range:
-        lines += ["", *_range(scores.range)]
+        lines += [*_range(scores.range), ""]
+    if scores.belief:
+        lines += [*_belief(scores.belief), ""]
+    missing = scores.not_scored() | ({"pose": why_no_pose} if why_no_pose else {})
+    lines += [*_coverage(scores), *(_line("not scored", f"{k}: {v}") for k, v in missing.items())]
+    lines += _left_out(scores.cues)
     return "\n".join(part for line in lines for part in _wrapped(line))
 
 
@@ -91,7 +93,8 @@ def _coverage(scores: PooledScores) -> list[str]:
 
 
 def _cues(cues: Mapping[str, CueScore]) -> list[str]:
-    shown = {name: one for name, one in cues.items() if one.scored}
+    scored = {name: one for name, one in cues.items() if one.scored}
+    shown = {name: one for name, one in scored.items() if one.positives or _is_missed(one)}
     lines = ["cue                  scored  found  precision (95 %)      recall (95 %)"]
     for name, one in shown.items():
         star = " " if one.is_sources_reading else "*"
@@ -100,11 +103,18 @@ def _cues(cues: Mapping[str, CueScore]) -> list[str]:
             f"{visible(name):19}{star} {one.scored:6} {one.positives:6}  "
             f"{_fraction(one.precision):20}  {recall}".rstrip()
         )
+    none = [visible(name) for name in scored if name not in shown]
+    if none:
+        lines.append(_line("found none", f"and none is known to be missed: {', '.join(none)}"))
     if any(not one.is_sources_reading for one in shown.values()):
         lines.append("* judged by the feature or object that the source does not judge it by")
     if any(math.isnan(one.precision.clusters_low) for one in shown.values() if one.positives):
         lines.append(f"{TOO_FEW}: under {MIN_CLUSTERS}, intervals count frames only")
-    return [*lines, *_left_out(cues)]
+    return lines
+
+
+def _is_missed(one: CueScore) -> bool:
+    return one.recall is not None and bool(one.recall.of)
 
 
 def _left_out(cues: Mapping[str, CueScore]) -> list[str]:
