@@ -126,7 +126,7 @@ class ScoredRuns(Result):
         yield from _lines_together(self) if self.is_many else _lines_of_one(self)
 
     def brief(self) -> str:
-        """Return the text without ``--verbose``, which is all of it with attribution or smoother."""
+        """Return the text without ``--verbose``: all of it with attribution or smoother."""
         has_more = bool(self.attribution) or any(one.scored.smoothed for one in self.runs)
         return repr(self) if has_more else Result.brief(self)
 
