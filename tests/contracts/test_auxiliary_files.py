@@ -61,6 +61,7 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ),
     ("fit detector", "--card"): ("{run} --labels {coco} --card {gone}", SETTINGS),
     ("view", "RUN"): ("{gone} -o {out}.rrd", INPUT),
+    ("report", "RUN"): ("{gone} -o {out}.html", INPUT),
     ("compare", "RUN_A"): ("{gone} {run}", INPUT),
     ("compare", "RUN_B"): ("{run} {gone}", INPUT),
     ("merge", "RUNS"): ("{gone} -o {out}", INPUT),
@@ -100,6 +101,7 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("score", "--logs"): ("{run} --truth {truth} --logs {gone}", INPUT),
     ("view", "--truth"): ("{run} -o {out}.rrd --truth {gone}", INPUT),
     ("view", "--logs"): ("{run} -o {out}.rrd --logs {gone}", INPUT),
+    ("report", "--logs"): ("{run} -o {out}.html --logs {gone}", INPUT),
     ("vehicle init", "--dbc"): ("{log} -o {out}.toml --dbc {gone}.dbc", INPUT),
     ("fit compass", "--vehicle"): ("{log} --vehicle {gone}", SETTINGS),
     ("truth from-gnss", "--vehicle"): ("{log} -o {out} --vehicle {gone}", SETTINGS),
@@ -185,7 +187,7 @@ ANY_BYTES: Final = {"seal", "model fetch", "completion"}
 CREATED_IF_MISSING: Final = {("landmarks add", "DB")}
 # Arguments that accept a folder; an empty folder is another error.
 FOLDERS: Final = {
-    ("estimate", "--logs"), ("score", "--logs"), ("view", "--logs"),
+    ("estimate", "--logs"), ("score", "--logs"), ("view", "--logs"), ("report", "--logs"),
     ("score detector", "--logs"), ("fit detector", "--logs"), ("landmarks add", "--images"),
     ("train road", "--data"), ("train mask-rcnn", "--images"), ("train mask-rcnn", "--val-images"),
     ("merge", "RUNS"), ("query", "RUNS"), ("status", "RUNS"), ("history", "RUNS"),

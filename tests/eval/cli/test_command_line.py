@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -198,3 +198,29 @@ def test_undescribed_parameter_is_refused() -> None:
 
     with pytest.raises(TypeError, match="no description of size"):
         fill(argparse.ArgumentParser(), verb)
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class _Long(Result):
+    count: int
+    max_lines: ClassVar[int] = 25
+
+    def lines(self) -> Iterator[str]:
+        yield from map(str, range(self.count))
+
+    def closing(self) -> Iterator[str]:
+        yield "report R"
+
+
+@pytest.mark.parametrize("count", [0, 1, 23, 24, 25, 26, 200])
+def test_brief_text_is_the_first_lines_and_the_files_to_open(count: int) -> None:
+    found = _Long(count)
+    brief, whole = found.brief().splitlines(), repr(found).splitlines()
+
+    assert len(whole) == count + 1
+    assert len(brief) <= 25
+    assert brief[-1] == whole[-1] == "report R"
+    if brief != whole:
+        shown = brief[:-2]
+        assert shown == whole[: len(shown)]
+        assert brief[-2] == f"... and {count - len(shown)} lines more: add -v"
