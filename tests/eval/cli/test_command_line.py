@@ -184,6 +184,7 @@ def test_result_is_printed_in_the_chosen_format(
 ) -> None:
     call, parser, _ = parsed("a")
     parser.add_argument("-q", dest="quiet", action="store_true")
+    parser.set_defaults(verbose=False)
     args = parser.parse_args(words.split())
 
     assert print_found(call(args), args) == 0
