@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import pytest
 
-from crosscue.datasets.labels.table import LABEL_FORMATS, read_tool_labels
+from crosscue.datasets.labels.table import LABEL_FORMATS, ToolFormat, read_tool_labels
 from crosscue.datasets.truth.annotations import Annotation, Annotations, Picture, time_in_name
 from crosscue.replay.errors import CrosscueError
 
@@ -51,7 +51,9 @@ def times(read: Annotations) -> dict[int, Picture]:
 
 @pytest.mark.parametrize("name", LABEL_FORMATS)
 @pytest.mark.parametrize("is_named", [True, False], ids=["format named", "recognised"])
-def test_written_labels_are_read_back_unchanged(name: str, is_named: bool, tmp_path: Path) -> None:
+def test_written_labels_are_read_back_unchanged(
+    name: ToolFormat, is_named: bool, tmp_path: Path
+) -> None:
     wrote = labels()
     path = LABEL_FORMATS[name].write(tmp_path, wrote)
     path = confirm_predictions(path) if path.suffix == ".json" else path
@@ -73,7 +75,7 @@ def test_written_labels_are_read_back_unchanged(name: str, is_named: bool, tmp_p
 @pytest.mark.parametrize("name", LABEL_FORMATS)
 @pytest.mark.parametrize("content", [b"{", b"[1]", b'{"labels": 3}', b"<a", b"\xff\xfe"])
 def test_damaged_labels_are_refused_with_file_name(
-    name: str, content: bytes, tmp_path: Path
+    name: ToolFormat, content: bytes, tmp_path: Path
 ) -> None:
     path = LABEL_FORMATS[name].write(tmp_path, labels())
     path.write_bytes(content)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from crosscue.datasets.truth.box_labels import BoxLabels, read_box_labels
-from crosscue.replay.errors import AnnotationError, CrosscueError, EmptyResultError, UsageError
+from crosscue.replay.errors import AnnotationError, CrosscueError, UsageError
 
 BOX = (10.0, 20.0, 50.0, 60.0)
 SIZE = (100, 80)
@@ -140,14 +140,3 @@ def test_unreadable_labels_are_refused_in_one_line(
 
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)
-
-
-def test_empty_label_file_is_valid_but_no_images_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "classes.txt").write_text("car\n")
-    (tmp_path / "7.txt").write_text("")
-    assert read(tmp_path).pictures[0].boxes == ()
-
-    empty = {"categories": [{"id": 1, "name": "car"}], "images": [], "annotations": []}
-    (tmp_path / "coco.json").write_text(json.dumps(empty))
-    with pytest.raises(EmptyResultError, match="no labelled image"):
-        read(tmp_path / "coco.json")

@@ -77,26 +77,6 @@ def test_truncated_array_yields_exactly_its_complete_rows(
     assert len(column.rows) == whole
 
 
-def test_object_arrays_are_refused(tmp_path: Path) -> None:
-    path = _save(tmp_path / "value", np.array([{"a": 1}], dtype=object))
-
-    with pytest.raises(LogFormatError, match="plain numbers"):
-        read_column(path)
-
-
-def test_rows_outside_time_range_are_counted() -> None:
-    with open_log(shared(*SEGMENT)) as log:
-        ledger = Ledger("")
-        start_ns = 46_420_000_000_000
-        selection = Selection(frozenset({"car/speed"}), start_ns, start_ns + 10**10)
-        times = np.concatenate([block.log_ns for block in log.read(ledger, selection)])
-
-    account = ledger.topic("car/speed")
-    assert ((times >= start_ns) & (times < start_ns + 10**10)).all()
-    assert account.used == len(times)
-    assert account.found == account.used + account.skipped["outside --from/--to"] == 4974
-
-
 @pytest.mark.parametrize("damaged", [np.nan, np.inf, -1e300, 5e8, -5e8])
 def test_invalid_time_drops_only_its_row(tmp_path: Path, damaged: float) -> None:
     times = np.arange(50) * 0.01

@@ -64,8 +64,3 @@ def test_enu_matrix_is_rotation_with_up_along_ellipsoid_normal(
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(matrix) == pytest.approx(1.0)
     np.testing.assert_allclose(matrix @ up_m[0], [0.0, 0.0, 100.0], atol=1e-7)
-
-
-def test_array_of_wrong_shape_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"expected \(N, 3\), got \(2,\)"):
-        ecef_to_geodetic([1.0, 2.0])

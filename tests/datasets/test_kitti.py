@@ -173,14 +173,6 @@ def test_drive_with_timestamps_only_is_refused(tmp_path: Path) -> None:
         open_log(drive)
 
 
-def test_several_sequences_in_one_folder_are_refused(tmp_path: Path) -> None:
-    drive = tracking_drive(tmp_path / "drive", 2)
-    (drive / "oxts" / "0004.txt").write_text("")
-
-    with pytest.raises(LogFormatError, match="2 sequences; expected a folder with one"):
-        open_log(drive)
-
-
 @settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

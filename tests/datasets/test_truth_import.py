@@ -77,27 +77,6 @@ def test_coco_import_writes_present_and_absent_cues(tmp_path: Path, log: Path) -
     assert cli.run(["check", str(tmp_path), str(log), "-q"]) == 0
 
 
-def test_add_option_keeps_approaches_and_replaces_cues(tmp_path: Path, log: Path) -> None:
-    path = tmp_path / "truth.json"
-    source = _write(tmp_path / "coco.json", coco())
-    assert _import(source, log, path) == 0
-    approach = {
-        "id": 4,
-        "intersection": "A",
-        "start_ns": START_NS,
-        "enter_ns": START_NS + STEP_NS,
-        "control": "none",
-        "features": {"left": True, "right": False, "straight": True},
-    }
-    tree = json.loads(path.read_text())
-    _write(path, tree | {"approaches": [approach], "cues": []})
-
-    assert _import(source, log, path) == 1
-    assert _import(source, log, path, "--add") == 0
-    assert [one.id for one in read_truth(path).approaches] == [4]
-    assert len(read_truth(path).cues) == 2
-
-
 # Faults of the file that do not depend on its log: it cannot be read, exit status 4.
 DAMAGED = {
     "expected whole nanoseconds",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import crosscue
-from crosscue.detectors.base import Detections, DetectorChoice, Frame, View
+from crosscue.detectors.base import DetectorChoice, Frame, View
 from crosscue.detectors.box_detector import BoxDetector, ScoredBox
 from crosscue.detectors.registry import chosen, make
 from crosscue.replay.errors import CrosscueError, UsageError, VehicleError
@@ -127,18 +127,3 @@ def test_wrong_box_of_a_run_is_refused_with_frame_and_reason(
     assert str(refused.value).startswith("detector yields: ")
     assert " ns: " in str(refused.value)
     assert fault in str(refused.value)
-
-
-def test_missing_detector_members_are_named() -> None:
-    place = f"{__name__}:NoDetector"
-
-    with pytest.raises(VehicleError, match=f"{place}.* without view, identity; .*BoxDetector"):
-        make(DetectorChoice("mine", place, {}))
-
-
-def test_detections_are_selected_by_label() -> None:
-    boxes = np.array([[0, 0, 2, 5], [0, 0, 2, 7], [1, 1, 2, 2]], np.float64)
-    found = Detections(0, (9, 9), boxes, np.ones(3), ("a", "b", "a"), (b"",) * 3)
-
-    assert found.of("a").heights_px.tolist() == [5.0, 1.0]
-    assert len(found.of("c")) == 0

@@ -14,8 +14,7 @@ from crosscue.detectors.catalog import entries, fetch, places
 from crosscue.detectors.catalog.card import ModelCard, WeightFile
 from crosscue.detectors.catalog.class_names import cue_label
 from crosscue.detectors.registry import make
-from crosscue.eval.cli import run
-from crosscue.replay.errors import CrosscueError, UsageError, VehicleError
+from crosscue.replay.errors import CrosscueError, UsageError
 from support.data import shared
 from support.range_server import Served, serving
 
@@ -106,23 +105,10 @@ def test_every_available_entry_runs(
     assert detector.identity.startswith("model-")
 
 
-def test_unfetched_model_is_reported_with_the_fetch_command(cache: Path) -> None:
-    with pytest.raises(VehicleError) as error:
-        make(DetectorChoice("objects", "yolox-nano"))
-
-    message = "model yolox-nano: not fetched yet (3.7 MB, licence Apache-2.0); crosscue model fetch"
-    assert message in str(error.value)
-
-
 @pytest.mark.parametrize("name", ["my.onnx", "nets/own.safetensors", "weights.pth"])
 def test_weights_in_place_of_a_detector_are_answered_with_how_to_name_them(name: str) -> None:
     with pytest.raises(UsageError, match=r"expected a model card.*crosscue model init.*detectors"):
         make(DetectorChoice(name, name))
-
-
-def test_misspelled_model_name_suggests_the_nearest() -> None:
-    with pytest.raises(UsageError, match="did you mean yolox-nano"):
-        places.card_path("yolo-nano")
 
 
 @pytest.mark.parametrize("content", [CONTENT[:-1] + b"x", CONTENT + b"more", b"<html>404</html>"])
@@ -150,17 +136,6 @@ def test_file_that_is_named_must_exist_also_if_the_weights_are_cached(
 
     with pytest.raises(UsageError, match=r"gone\.onnx"):
         fetch.fetch_weights("net", tmp_path / "gone.onnx")
-
-
-def test_model_list_and_show_print_every_entry(
-    cache: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["model", "list"]) == 0
-    listed = capsys.readouterr().out
-    for name in places.names():
-        assert name in listed
-        assert run(["model", "show", name]) == 0
-        assert entries.entry(name).sha256 in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,3 @@ def test_road_mask_is_recovered() -> None:
 
     assert isinstance(back, RoadMask)
     np.testing.assert_array_equal(rle.decode_mask(back.mask, back.mask_size_px), is_road)
-
-
-def test_black_image_has_no_objects() -> None:
-    assert len(found()) == 0

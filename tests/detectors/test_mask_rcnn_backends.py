@@ -26,7 +26,6 @@ from crosscue.detectors.networks.mask_rcnn.cpu import MIN_PIXELS, Halved, Winogr
 from crosscue.detectors.networks.mask_rcnn.detector import (
     MaskRcnnDetector,
     MaskRcnnSettings,
-    build,
     detector_of,
     laid_in,
     place_picture,
@@ -34,7 +33,6 @@ from crosscue.detectors.networks.mask_rcnn.detector import (
 from crosscue.detectors.networks.mask_rcnn.network import build_network
 from crosscue.detectors.networks.mask_rcnn.parts import TorchParts, as_input
 from crosscue.detectors.networks.mask_rcnn.screening import ScreenedParts
-from crosscue.replay.errors import VehicleError
 from support.mask_rcnn import CPU, noise_frame, plan_of, random_checkpoint
 
 BACKENDS = ("torch", "openvino")
@@ -230,20 +228,6 @@ def test_cpu_copy_matches_the_original_and_leaves_it_unchanged() -> None:
             np.testing.assert_allclose(mine.numpy(), other.numpy(), rtol=1e-3, atol=1e-4)
     after = network.state_dict()
     assert all(torch.equal(value, after[name]) for name, value in before.items())
-
-
-def test_missing_openvino_is_reported_with_its_extra(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(sys.modules, "openvino", None)
-
-    with pytest.raises(VehicleError, match=r"not installed.*pip install openvino"):
-        build(backend="openvino")
-
-
-def test_openvino_with_device_cuda_is_refused() -> None:
-    with pytest.raises(VehicleError, match=r"backend openvino runs on a cpu only, got device cuda"):
-        build(backend="openvino", device="cuda")
 
 
 _WATCHED = """

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crosscue.detectors.base import View
 from crosscue.detectors.images import MAX_PIXELS, Encoded, decode, reduction
 from crosscue.replay.columns import Bytes
-from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
+from crosscue.replay.errors import LogError, LogTooLargeError
 
 COLOUR, GREY = View(), View(is_grey=True)
 
@@ -117,13 +117,3 @@ def test_damaged_picture_is_refused_or_decoded(where: int, flip: int, suffix: st
         return
     assert pixels.dtype == np.uint8
     assert pixels.shape == (height, width)
-
-
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
-@pytest.mark.parametrize("fraction", [0.0, 0.3, 0.9])
-def test_truncated_picture_is_refused(suffix: str, fraction: float) -> None:
-    whole = _encode(np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8), suffix)
-    cut = whole.content[: int(len(whole.content) * fraction)]
-
-    with pytest.raises(LogFormatError):
-        decode(Encoded(whole.coding, cut), COLOUR)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 import crosscue
 from crosscue.detectors.base import Frame
 from crosscue.detectors.networks.model_detector import RoadModel, build
-from crosscue.eval import cli
 from crosscue.replay.errors import UsageError
 from support.data import shared
 from support.onnx_models import constant_model
@@ -52,19 +51,6 @@ def test_card_is_written_and_road_is_found(
     assert isinstance(detector, RoadModel)
     mask = detector.road_mask(Frame(0, "", np.zeros((64, 128, 3), np.uint8), (128, 64)))
     np.testing.assert_array_equal(mask.mean(axis=1), np.arange(size[1]) >= size[1] // 2)
-
-
-def test_names_are_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = network(tmp_path, mask=scores((64, 32)))
-
-    assert cli.run(["model", "init", str(path)]) == 2
-    assert capsys.readouterr().err == (
-        f"crosscue: {path}: 3 classes without names; name them in their order, such as "
-        "--classes road,curb,mark, or one per line in --class-names FILE\n"
-    )
-    assert cli.run(["model", "init", str(path), "--classes", "sky,way,curb"]) == 2
-    assert "none of the classes sky, way, curb is known to be drivable" in capsys.readouterr().err
-    assert cli.run(["model", "init", str(path), "--classes", "sky,road,curb"]) == 0
 
 
 @pytest.mark.parametrize(

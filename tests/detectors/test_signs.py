@@ -14,11 +14,6 @@ from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.signs.detector import build, orb_points
 from crosscue.detectors.signs.matching import nearest, window_counts
 from crosscue.detectors.signs.templates import AMERICAN, Kind, draw_sign_template
-from crosscue.detectors.training.operating_point import (
-    Verdicts,
-    rates_at,
-    threshold_at_precision,
-)
 from crosscue.eval.cli import run
 from crosscue.replay.columns import Block, Bytes, Images, Messages, Topic
 from crosscue.replay.ledger import Ledger
@@ -127,16 +122,6 @@ def test_window_counts_each_template_point_once(seed: int, reach: int) -> None:
             assert counts[row, column] == len(set(drawn[near].tolist()))
 
 
-def test_threshold_is_the_lowest_that_meets_the_precision() -> None:
-    judged = Verdicts(np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, True, False, True]), 4)
-
-    assert threshold_at_precision(judged, 0.95) == 0.8
-    assert threshold_at_precision(judged, 0.6) == 0.6
-    assert rates_at(judged, 0.8).precision == 1.0
-    assert rates_at(judged, 0.8).recall == 0.5
-    assert threshold_at_precision(Verdicts(np.array([0.9]), np.array([False]), 1), 0.95) is None
-
-
 def test_fit_signs_measures_on_frames_not_used_for_the_choice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -239,27 +224,6 @@ def test_fit_signs_on_drives_reports_an_interval_by_drive(
     assert half["chosen_on"]["signs"] == 1
     low, high = whole["recall_interval_by_drive"]
     assert 0.0 <= low <= whole["recall"] <= high <= 1.0
-
-
-def test_fixed_threshold_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fitted = str(coco(tmp_path / "a", range(4)))
-
-    assert run(["fit", "signs", fitted, "--label", "one way left", "--threshold", "0.99"]) == 0
-
-    reported = capsys.readouterr().out
-    assert "min_score = 0.99\n" in reported
-    assert "recall    0.00 (0 of 2; " in reported
-
-
-@pytest.mark.parametrize("text", ["{", "[]", '{"images": [], "annotations": [], "categories": []}'])
-def test_invalid_coco_file_is_reported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
-) -> None:
-    (tmp_path / "coco.json").write_text(text)
-
-    status = 1 if "images" in text else 4  # a valid file without data, otherwise a missing file
-    assert run(["fit", "signs", str(tmp_path / "coco.json"), "--label", "stop"]) == status
-    assert "coco.json: no " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -290,3 +290,42 @@ def test_card_that_contradicts_its_weights_is_refused(
 
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_nested_and_prefixed_weights_are_recognised(tmp_path: Path) -> None:
+    from crosscue.detectors.catalog.recognise_weights import recognise_weights
+
+    state = {
+        f"module.{name}": value
+        for name, value in hollow("ssdlite320_mobilenet_v3_large", 4).items()
+    }
+    torch.save({"model": state, "epoch": 7}, tmp_path / "my.pth")
+
+    _, guess = recognise_weights(tmp_path / "my.pth", None)
+
+    assert guess.reasons[:2] == (
+        "its weights are stored under 'model'",
+        "its tensor names begin with 'module.'",
+    )
+
+
+def test_torchscript_archive_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "my.pt"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in ("data.pkl", "constants.pkl", "version"):
+            archive.writestr(f"my/{name}", b"\x80\x02N.")
+
+    assert run(["model", "init", str(path)]) in (1, 2)
+
+    assert "TorchScript archive carries code" in capsys.readouterr().err
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    state = hollow("ssdlite320_mobilenet_v3_large", 4)
+    state[MEAN] = torch.full((672,), torch.nan)
+    torch.save(state, tmp_path / "my.pth")
+
+    with pytest.raises(crosscue.VehicleError, match=f"{MEAN}: holds values that are not finite"):
+        crosscue.draft_card(tmp_path / "my.pth", class_names=NAMES)
+
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["my.pth"]

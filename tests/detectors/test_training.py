@@ -24,7 +24,7 @@ from crosscue.detectors.training.operating_point import Verdicts
 from crosscue.detectors.training.samples import Sampler, SampleSettings
 from crosscue.detectors.training.scores import average_precisions
 from crosscue.eval.cli import run
-from crosscue.replay.errors import SchemaError
+from crosscue.replay.errors import CrosscueError, SchemaError
 from support.mask_rcnn import CPU, plan_of, write_bars
 
 WINDOW = SampleSettings(96, 64)
@@ -310,3 +310,68 @@ def test_invalid_flags_are_reported_before_training(
 
     assert run([*base, *flags]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_box_beyond_the_picture_is_clipped_and_counted(tmp_path: Path) -> None:
+    labelled = _changed(tmp_path, annotations=_with({"bbox": [-10, -5, 30, 300]}))
+
+    assert labelled.pictures[0].objects[0].box_px == (0.0, 0.0, 20.0, 96.0)
+    assert labelled.left_out == {"boxes cut off at the picture's edge": 1}
+
+
+def test_state_of_other_settings_or_damaged_state_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "state.safetensors"
+    one, _ = _training(tmp_path / "a", Schedule(4, batch=2))
+    one.save(path, {})
+    other, _ = _training(tmp_path / "b", Schedule(5, batch=2))
+
+    with pytest.raises(SchemaError, match="training with other settings"):
+        other.resume(path)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(SchemaError, match="damaged"):
+        one.resume(path)
+
+
+@pytest.mark.slow
+def test_nan_loss_ends_the_training(tmp_path: Path) -> None:
+    training, sampler = _training(tmp_path, Schedule(40, batch=1))
+    with torch.no_grad():
+        training.network.rpn.head.cls_logits.bias.fill_(float("nan"))
+
+    with pytest.raises(CrosscueError, match="lower --learning-rate"):
+        list(training.steps(sampler))
+
+
+@pytest.mark.slow
+def test_train_mask_rcnn_measures_a_network_without_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = tmp_path / "frames"
+    run(["train", "frames", "L901", "--per-layout", "3", "-o", str(frames), "-q"])
+    base = [
+        "train",
+        "mask-rcnn",
+        "--measure",
+        "embedded",
+        "--data",
+        str(frames / "coco.json"),
+        "--images",
+        str(frames / "images"),
+    ]
+
+    assert run([*base, "--subset", "1:", "--proposals", "100", "200", "--json"]) == 0
+    tree = json.loads(capsys.readouterr().out)
+    assert tree["pictures"] == 2
+    assert [row["proposals"] for row in tree["measured"]] == [100, 200]
+    first = tree["measured"][0]
+    assert 0.0 < first["ap"]["box"] <= 100.0
+    by_score = [row for row in first["rates"] if row["label"] == "car"]
+    assert [row["score"] for row in by_score] == [0.5, 0.9, 0.95]
+    assert [row["found"] for row in by_score] == sorted(
+        (row["found"] for row in by_score), reverse=True
+    )
+
+    assert run(base) == 0
+    reported = capsys.readouterr().out
+    assert "embedded on 3 pictures, 100 proposals" in reported
+    assert "score from 0.95" in reported

@@ -59,12 +59,3 @@ def test_scaled_front_and_rear_wheels_measure_the_same_distance() -> None:
     ]
 
     assert distances_m[1] == pytest.approx(distances_m[0], rel=2e-3)
-
-
-def test_equal_front_and_rear_speeds_yield_no_front_scales() -> None:
-    truth = drive(np.random.default_rng(seed=7))
-    rear = wheels(truth, CAR).wheels_mps
-    car = WheelSamples(truth.t_ns, np.hstack([rear, rear]))
-    made = integrate(car, CAR).increments
-
-    assert front_wheels(car, made, CAR, (int(truth.t_ns[0]), int(truth.t_ns[-1]))) == ()

@@ -53,11 +53,6 @@ def test_choice_is_the_first_option_of_lowest_cost(
     assert choose_option(*np.array(options).T) == costs.index(min(costs))
 
 
-def test_choice_without_options_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least one option"):
-        choose_option(np.empty(0), np.empty(0), np.empty(0))
-
-
 def _decided(memory: Memory, x: float, y: float, heading: float) -> Memory:
     return remember(memory, recognise(memory, x, y, RADIUS_M), x, y, heading, SAME_RAD)
 

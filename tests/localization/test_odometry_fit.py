@@ -14,7 +14,6 @@ from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import OdometrySettings, TurnSignal, integrate
 from crosscue.localization.start_pose import start_pose
 from crosscue.replay.columns import Floats
-from crosscue.replay.errors import VehicleError
 from support.simulated_drive import BASE_M, TRACK_M, Truth, drive, gyro, wheels
 
 CAR = OdometrySettings(
@@ -122,51 +121,6 @@ def test_straight_drive_leaves_turn_parameters_unobservable() -> None:
     assert fit.settings.yaw_rate_scale == CAR.yaw_rate_scale
     assert fit.settings.turn_delay_s == CAR.turn_delay_s
     assert fit.value("wheel_scale") == pytest.approx(1.02, abs=0.005)
-
-
-def steered(truth: Truth) -> TurnSignal:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        curvature = np.where(truth.speed_mps != 0.0, truth.yaw_radps / truth.speed_mps, 0.0)
-    values = 18.0 * np.arctan(BASE_M * np.clip(curvature, -0.2, 0.2)) + 0.05
-    return TurnSignal(truth.t_ns, values, "steering")
-
-
-def test_wide_turns_fit_the_steering_ratio_but_keep_the_wheelbase() -> None:
-    rng = np.random.default_rng(seed=6)
-    there = drive(rng, seconds=60.0)
-    speed = np.full(len(there.t_ns), 12.0)
-    yaw = 0.1 * np.sin(np.arange(len(speed)) / 60.0)
-    heading = np.concatenate([[0.0], np.cumsum(0.025 * (yaw[1:] + yaw[:-1]))])
-    middle = 0.5 * (heading[1:] + heading[:-1])
-    steps = 0.6 * np.column_stack([np.cos(middle), np.sin(middle)])
-    xy = np.vstack([[0.0, 0.0], np.cumsum(steps, axis=0)])
-    truth = Truth(there.t_ns, np.column_stack([xy, heading]), speed, yaw)
-    found = KnownDrive(
-        wheels(truth, CAR, rng), steered(truth), positions(truth, 0.3, rng, lever=False), (0.0, 0.0)
-    )
-    fit = fit_odometry(found, replace(CAR, steering_ratio=15.0))
-
-    assert fit.settings.wheelbase_m == BASE_M
-    assert "wheelbase_m" in {one.parameter for one in fit.not_observable}
-    assert fit.value("steering_ratio") == pytest.approx(18.0, rel=0.05)
-    assert fit.value("steering_offset_rad") == pytest.approx(0.05, abs=0.01)
-
-
-def test_drive_with_too_few_positions_is_refused() -> None:
-    rng = np.random.default_rng(seed=3)
-    there = straight()
-
-    with pytest.raises(VehicleError, match="5 positions are within the wheel speeds; expected 15"):
-        fit_odometry(simulated_drive(there, rng).until(int(there.t_ns[81])), CAR)
-
-
-def test_drive_of_a_stationary_car_is_refused() -> None:
-    still = straight()
-    zero = np.zeros_like(still.xyh)
-    still = Truth(still.t_ns, zero, zero[:, 0], zero[:, 0])
-
-    with pytest.raises(VehicleError, match="the car went 0 m while its position is known"):
-        fit_odometry(simulated_drive(still, np.random.default_rng(0)), CAR)
 
 
 def shifted(fixes: Fixes, turn_rad: float, by_m: Floats) -> Fixes:

@@ -276,10 +276,3 @@ def test_time_without_odometry_is_coasted_and_counted() -> None:
     assert done.poses.x_m[0] == pytest.approx(21.0)
     assert done.poses.travelled_m[0] == pytest.approx(1.0)
     assert done.poses.cov_xyh[0, 0] > (0.5 * 2.0) ** 2
-
-
-def test_wrong_shapes_and_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"var_rad2: expected \(2,\), got \(1,\)"):
-        Headings(np.zeros(2, np.int64), np.zeros(2), np.zeros(1))
-    with pytest.raises(ValueError, match="heading_interval_m: expected >= 0, got -1"):
-        TrackSettings(heading_interval_m=-1.0)

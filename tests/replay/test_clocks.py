@@ -77,14 +77,6 @@ def test_gaps_are_counted_exactly(gaps: dict[int, int], rows_per_block: int) -> 
         assert (log.longest_step_ns, log.longest_step_at_ns) == (longest_ns, log_ns[row])
 
 
-def test_gaps_beyond_the_kept_ones_are_counted() -> None:
-    steps = np.full(60_000, 10 * MS)
-    steps[::10] = 100 * MS
-    log = log_report(START_NS + np.cumsum(steps), 60_000)
-
-    assert log.gaps == 6000 - 1
-
-
 @pytest.mark.slow
 @quick
 @given(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from crosscue.replay.errors import VehicleError
-from crosscue.replay.vehicle.fusion import Fusion, usual_cues
+from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import parse
 
 
@@ -44,11 +44,3 @@ def fusion_of(text: str) -> Fusion:
 def test_invalid_fusion_setting_is_refused_with_hint(text: str, match: str) -> None:
     with pytest.raises(VehicleError, match=match):
         fusion_of(text)
-
-
-def test_fusion_without_cue_that_can_start_is_refused() -> None:
-    silent = "\n".join(
-        f"{name} = {{ can_start = false }}" for name in usual_cues() if usual_cues()[name].can_start
-    )
-    with pytest.raises(VehicleError, match="none can start an approach"):
-        fusion_of(f"[fusion.cues]\n{silent}")

@@ -64,20 +64,6 @@ def test_only_partial_files_of_dead_processes_are_swept(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b.txt"]
 
 
-def test_files_of_other_programs_are_not_swept(tmp_path: Path) -> None:
-    others = [".a.txt.1234.partial", "a.partial", ".drive.crosscue-xyz.partial", ".a.partial"]
-    for name in others:
-        (tmp_path / name).write_text("of another program")
-    (tmp_path / f".folder.crosscue-{'0' * 16}.partial").mkdir()
-    (tmp_path / f".link.crosscue-{'0' * 16}.partial").symlink_to(tmp_path / others[0])
-    os.mkfifo(tmp_path / f".pipe.crosscue-{'0' * 16}.partial")
-    before = sorted(path.name for path in tmp_path.iterdir())
-
-    sweep(tmp_path, again=True)
-
-    assert sorted(path.name for path in tmp_path.iterdir()) == before
-
-
 def test_temporary_folders_of_killed_processes_are_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

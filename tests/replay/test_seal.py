@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,19 +11,16 @@ import numpy as np
 import pytest
 
 from crosscue.eval.cli import run
-from crosscue.replay.base import Selection
 from crosscue.replay.errors import LogError
 from crosscue.replay.formats import FORMATS
-from crosscue.replay.ledger import CHANGED, DIFFERS, Ledger
+from crosscue.replay.ledger import CHANGED, DIFFERS
 from crosscue.replay.limits import MIB
-from crosscue.replay.logs.opening import open_log
 from crosscue.replay.seal import seal as sealing
 from crosscue.replay.seal.seal import digests_of, read_seal, seal_path
 from support.accounted import read
 from support.can_files import candump, random_frames
 from support.every_format import EVERY_FORMAT
-from support.pictures import picture_folder
-from support.rosbag_files import rows_of, write_bag, write_folder
+from support.rosbag_files import rows_of, write_folder
 
 
 def _sealed(folder: Path, kind: str) -> Path:
@@ -111,20 +107,6 @@ def test_changed_byte_is_reported_with_its_block(
     assert f"{name}: bytes 0 to {size} differ from the seal" in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_commands_report_changed_block_of_sealed_log(
-    long_log: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    at = long_log.read_bytes().index(b"#", MIB) + 2
-    _flip(long_log, at)
-    out = long_log.with_name("out.mcap")
-
-    assert run(["convert", str(long_log), "-o", str(out)]) == 3
-    assert f"can.log: bytes {MIB} to {2 * MIB}" in " ".join(capsys.readouterr().err.split())
-    assert run(["info", str(long_log)]) == 3
-    assert f"can.log: bytes {MIB} to {2 * MIB}" in " ".join(capsys.readouterr().out.split())
-
-
 @pytest.mark.parametrize("is_cut", [True, False])
 def test_changed_size_is_reported_in_one_line(long_log: Path, is_cut: bool) -> None:
     size = long_log.stat().st_size
@@ -142,21 +124,6 @@ def test_changed_size_is_reported_in_one_line(long_log: Path, is_cut: bool) -> N
     assert drop.detail == f"size changed: can.log ({size} bytes when sealed, now {now})"
 
 
-def test_missing_and_new_files_are_reported_in_one_line_each(tmp_path: Path) -> None:
-    log = picture_folder(tmp_path / "front", 12, "rate_hz: 10\n")
-    assert run(["seal", str(log)]) == 0
-    for number in range(5):
-        (log / f"frame_{number}.png").unlink()
-    (log / "frame_99.png").write_bytes((log / "frame_7.png").read_bytes())
-
-    reported = [drop.detail for drop in read(log)[1].drops() if drop.reason == CHANGED]
-
-    assert reported == [
-        "missing: frame_0.png, frame_1.png, frame_2.png and 2 more",
-        "not in the seal: frame_99.png",
-    ]
-
-
 def test_seal_of_changed_log_is_replaced_only_with_overwrite(
     long_log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,21 +139,6 @@ def test_seal_of_changed_log_is_replaced_only_with_overwrite(
 
     assert run(["seal", "--overwrite", str(long_log)]) == 0
     assert run(["check", str(long_log)]) == 0
-
-
-def test_info_shows_whether_log_is_sealed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = EVERY_FORMAT["candump"](tmp_path)
-    for quick in ([], ["--quick"]):
-        assert run(["info", str(log), *quick]) == 0
-        assert "not sealed" in capsys.readouterr().out
-    assert run(["seal", str(log)]) == 0
-    sealed_at = read_seal(seal_path(log)).sealed_at
-    capsys.readouterr()
-    for quick in ([], ["--quick"]):
-        assert run(["info", str(log), *quick]) == 0
-        assert f"sealed at {sealed_at} (xxh3_128" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("suffix", ["-wal", "-journal"])
@@ -292,39 +244,6 @@ def test_convert_does_not_overwrite_a_sealed_log(
     assert out.read_bytes() == before
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["mcap", "rosbag1"])
-def test_window_of_indexed_log_checks_only_its_blocks(tmp_path: Path, kind: str) -> None:
-    rows = rows_of(40_000)
-    if kind == "mcap":
-        log = next(write_folder(tmp_path / "bag", rows, "mcap").glob("*.mcap"))
-    else:
-        log = write_bag(tmp_path / "log.bag", rows, chunk_bytes=300_000)
-    assert log.stat().st_size > 3 * MIB
-    assert run(["seal", str(log)]) == 0
-    total = read_seal(seal_path(log)).blocks
-    early = Selection(end_ns=rows[200].log_ns)
-
-    def losses(selection: Selection) -> list[str]:
-        ledger = Ledger(str(log))
-        with open_log(log) as opened:
-            for _ in opened.read(ledger, selection):
-                pass
-        (checked,) = re.findall(r"(\d+) of \d+ blocks|$", ledger.integrity)[:1]
-        assert selection != early or 0 < int(checked) < total, ledger.integrity
-        return [drop.detail for drop in ledger.drops() if drop.reason == DIFFERS]
-
-    assert losses(early) == losses(Selection()) == []
-    middle = total // 2
-    _flip(log, middle * MIB + 77)
-    assert losses(early) == []
-    assert losses(Selection()) == [f"{log.name}: bytes {middle * MIB} to {(middle + 1) * MIB}"]
-    _flip(log, middle * MIB + 77)
-    at = rows[10].payload[4:20]
-    _flip(log, log.read_bytes().index(at)) if at in log.read_bytes() else _flip(log, 5000)
-    assert losses(early) == [f"{log.name}: bytes 0 to {MIB}"]
-
-
 def test_file_of_sealed_folder_is_checked_against_folder_seal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -351,17 +270,6 @@ def test_subfolder_of_sealed_folder_is_checked_against_seal(tmp_path: Path) -> N
 
     _flip(one, one.stat().st_size - 1)
     assert f"{one.name}: bytes 0 to {one.stat().st_size}" in _losses_text(camera)
-
-
-def test_log_added_to_sealed_folder_is_not_sealed(tmp_path: Path) -> None:
-    place = write_folder(tmp_path / "bag", rows_of(50))
-    assert run(["seal", str(place)]) == 0
-    late = place / "can.log"
-    late.write_bytes(candump(random_frames(30)))
-
-    assert read(late)[1].is_whole
-    assert "sealed" not in read(late)[1].integrity
-    assert not read(place)[1].is_whole
 
 
 def test_interrupted_seal_leaves_files_unchanged(

@@ -3,11 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 from mcap.writer import Writer
 
 from crosscue.replay.columns import Messages
-from crosscue.replay.errors import UsageError
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.logs.topic_part import read_topic
 
@@ -41,11 +39,3 @@ def test_unknown_type_is_read_as_messages(tmp_path: Path) -> None:
         for i in range(len(block))
     ]
     assert found == [b"0", b"1", b"2"]
-
-
-def test_missing_topic_error_lists_available_topics(tmp_path: Path) -> None:
-    with (
-        open_log(two_topic_log(tmp_path / "x.mcap")) as log,
-        pytest.raises(UsageError, match=r"no topic '/spede'; there are: /speed, /other"),
-    ):
-        read_topic(log, "/spede")

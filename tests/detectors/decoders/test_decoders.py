@@ -58,13 +58,6 @@ def test_output_of_another_shape_is_refused(decoder: type[BoxOutput]) -> None:
             output.candidates(changed, SIZE)
 
 
-def test_missing_output_is_refused(decoder: type[BoxOutput]) -> None:
-    output, _ = _built(decoder)
-
-    with pytest.raises(ValueError, match="expected"):
-        output.candidates({"other": np.zeros((1, 2)), "another": np.zeros(3)}, SIZE)
-
-
 def interface(sample: Sample, names: tuple[str, ...] = CLASSES) -> Interface:
     return Interface(
         tuple(Tensor(name, shape or input_shape(sample)) for name, shape in sample.inputs.items()),

@@ -6,7 +6,6 @@ from scipy.optimize import curve_fit
 
 from crosscue.detectors.ranging.height_to_range import FAMILIES, Family, fit_range, range_of
 from crosscue.replay.columns import Floats
-from crosscue.replay.errors import UsageError
 from crosscue.replay.vehicle.vehicle import RangeCurve
 
 TRUE: dict[Family, tuple[float, ...]] = {
@@ -66,11 +65,3 @@ def test_outlying_heights_are_rejected_and_counted(family: Family, seed: int) ->
     assert 15 <= found.outliers <= 47
     assert found.pairs + found.outliers == 300
     assert found.curve.residual_sd_m < 1.3 * clean.curve.residual_sd_m
-
-
-def test_pairs_on_no_common_curve_are_refused() -> None:
-    height_px = np.array([10.0, 10.0, 10.0, 200.0])
-    range_m = np.array([30.0, 30.0, 30.0, 90.0])
-
-    with pytest.raises(UsageError, match="pinhole: too few of 4 pairs are on one curve"):
-        fit_range(height_px, range_m, "pinhole")

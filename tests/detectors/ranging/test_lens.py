@@ -44,14 +44,6 @@ def test_housing_from_behind_is_dark_before_a_coloured_wall() -> None:
     assert lens_of(red, BOX + np.array([-3.0, 0.0, 3.0, 0.0])) == "dark"
 
 
-def test_small_grey_or_outside_box_has_an_unknown_lens() -> None:
-    picture = housing("red")
-
-    assert lens_of(picture, BOX * 0.2) == "unknown"
-    assert lens_of(picture[:, :, 0].copy(), BOX) == "unknown"
-    assert lens_of(picture, BOX + 200.0) == "unknown"
-
-
 def test_lenses_are_set_only_for_lights_and_survive_the_cache(
     tmp_path: Path,
 ) -> None:

@@ -6,7 +6,6 @@ One cluster on this machine serves all tests that need one: starting it takes lo
 import os
 import signal
 import socket
-import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,7 +20,7 @@ from crosscue.eval.studies.town import work
 from crosscue.eval.studies.town.settings import LandmarkStudy
 from crosscue.eval.studies.town.work import assemble, chunks_of, run
 from crosscue.localization.town.settings import City, TownDrive
-from crosscue.replay.errors import CrosscueError, UsageError, WorkerError
+from crosscue.replay.errors import CrosscueError, WorkerError
 from support.drive_work import letters, write_jobs
 from support.trees import tree
 
@@ -68,13 +67,6 @@ def test_unreachable_cluster_address_is_reported() -> None:
         address = f"127.0.0.1:{free.getsockname()[1]}"
     with pytest.raises(CrosscueError, match=f"--ray {address}: no connection"):
         connect_ray(address).__enter__()
-
-
-def test_missing_ray_package_names_the_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-
-    with pytest.raises(UsageError, match=r"pip install ray"), connect_ray(LOCAL):
-        pass
 
 
 @pytest.mark.slow

@@ -29,31 +29,6 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_one_failing_drive_does_not_stop_the_rest(
-    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "runs"
-
-    assert run(["replay", str(drives), "-o", str(out), "--json"]) == 3
-
-    reported = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
-    assert set(reported) == {"monday", "tuesday", "broken"}
-    assert "not an MCAP file" in reported["broken"]["error"]
-    assert reported["monday"]["result"]["pose"]["rows"] > 1000
-    assert not (out / reported["broken"]["name"] / "manifest.json").exists()
-
-    assert run(["replay", str(drives), "-o", str(out), "--json"]) == 3
-    reported = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
-    assert reported["monday"]["earlier"]
-    assert reported["tuesday"]["earlier"]
-    assert not reported["broken"]["earlier"]
-
-    assert run(["replay", str(drives), "-o", str(out), "--retry-failed", "--json"]) == 4
-    (only,) = json.loads(capsys.readouterr().out)["drives"]
-    assert only["name"][:-9] == "broken"
-    assert "not an MCAP file" in Path(only["run"], "failure.log").read_text()
-
-
 def test_merged_shards_equal_one_batch(
     drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,6 +1,5 @@
 """Progress of a batch, and details of its failures."""
 
-import json
 import math
 import os
 import subprocess
@@ -14,11 +13,9 @@ import crosscue
 from crosscue.eval.batch import status
 from crosscue.eval.batch.jobs import Job, in_turn, run_many
 from crosscue.eval.batch.journal import entry_path, error_of, write_entry, write_plan
-from crosscue.eval.batch.merge import gathered
 from crosscue.eval.batch.status import DriveState, drives_of_folder, pace_of
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import FAILURE, LOCK, signature
-from crosscue.replay.errors import UnreadableRunError
 from support.drive_work import letters, write_jobs
 
 WORDS = ("plain", "damaged", "bug", "loss")
@@ -115,37 +112,3 @@ def test_stale_drive_of_another_machine_is_processed_again(tmp_path: Path) -> No
     assert states(tmp_path / "runs") == {"drive0": "running"}
     assert error_of_abandoned_drive(1.0e9) is None
     assert states(tmp_path / "runs") == {"drive0": "done"}
-
-
-def test_drives_without_a_run_are_merged_as_failures_in_any_order(
-    batch: list[Job], tmp_path: Path
-) -> None:
-    other = tmp_path / "other" / "runs"
-    write_plan(other, ["drive0", "drive1", "drive9"], "1/2")
-    folders = [tmp_path / "runs", other]
-
-    runs, failures = gathered(folders)
-
-    assert set(runs) == {"drive0", "drive3"}
-    assert set(failures) == {"drive1", "drive2", "drive9", "later"}
-    assert "cut; copy it again" in failures["drive1"]
-    assert failures["later"] == "no run yet (waiting); replay again"
-    assert gathered(folders[::-1])[1] == failures
-
-
-def test_status_of_a_folder_without_batch_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UnreadableRunError, match="no batch of drives; expected the folder"):
-        drives_of_folder(tmp_path)
-    with pytest.raises(crosscue.UsageError, match="each named once"):
-        crosscue.batch_status(tmp_path, tmp_path)
-
-
-@pytest.mark.parametrize("torn", ["", "[]", '{"drives": 3}', "{"])
-def test_invalid_plan_does_not_hide_started_drives(
-    batch: list[Job], tmp_path: Path, torn: str
-) -> None:
-    folder = tmp_path / "runs"
-    (folder / ".drives" / "plans" / "all.json").write_text(torn)
-
-    assert len(states(folder)) == len(batch)
-    assert json.loads((folder / ".drives" / "drive0.json").read_text())["exit_status"] == 0

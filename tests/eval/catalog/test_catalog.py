@@ -89,12 +89,6 @@ def test_invalid_selection_is_refused(runs: Path, query: str, message: str) -> N
         crosscue.catalog(runs).select(query)
 
 
-def test_single_run_folder_is_a_catalog(runs: Path) -> None:
-    found = crosscue.catalog(runs / "a/monday")
-
-    assert found.select("name = 'monday'") == (runs / "a/monday",)
-
-
 def test_merged_run_is_not_counted_again(tmp_path: Path) -> None:
     run = add_run(tmp_path / "runs/one", "one")
     merge_runs({"one": run}, create(tmp_path / "runs/merged", overwrite=False), {})

@@ -9,7 +9,6 @@ import pytest
 
 import crosscue
 from crosscue.eval.batch.jobs import Job, attempt
-from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.catalog.query import index, records
 from crosscue.eval.catalog.query.index import NAME
 from crosscue.eval.runs.folder import RunFolder
@@ -101,21 +100,6 @@ def test_failed_run_is_a_row_with_status_and_reason(runs: Path, manifests_read: 
     assert crosscue.catalog(runs).select("outcome = 'failed'") == ()
 
 
-def test_commands_and_catalog_find_runs_to_the_same_depth(runs: Path) -> None:
-    deep = runs / "1/2/3/4/5"
-    add_run(deep / "friday", "friday")
-    add_run(deep / "6/deeper", "deeper")
-    (deep / "cut").mkdir()
-    (deep / "cut/input.json").touch()
-
-    found = crosscue.catalog(runs)
-
-    found_by_catalog = {*found.runs, *(runs / run for run in found.left_out)}
-    assert {*runs_of([str(runs)])} == found_by_catalog
-    assert {deep / "friday", deep / "cut"} < found_by_catalog
-    assert deep / "6/deeper" not in found_by_catalog
-
-
 @pytest.mark.parametrize(
     "damage",
     [
@@ -139,18 +123,6 @@ def test_missing_or_damaged_index_is_rebuilt(
     manifests_read.clear()
     crosscue.catalog(runs)
     assert manifests_read == []
-
-
-def test_index_of_another_layout_is_rebuilt(
-    runs: Path, manifests_read: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    crosscue.catalog(runs)
-    manifests_read.clear()
-    monkeypatch.setattr(index, "_MARK", "another")
-
-    crosscue.catalog(runs)
-
-    assert len(manifests_read) == 4
 
 
 def test_catalog_on_a_full_disk_works_without_index(

@@ -9,10 +9,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from crosscue.eval import cli
-from crosscue.eval.catalog.compare import compare_runs, open_scored, read_tolerance
+from crosscue.eval.catalog.compare import compare_runs, read_tolerance
 from crosscue.eval.runs.account import Account, line
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.scoring.by_drive import by_drive_table
 from crosscue.replay.errors import UsageError
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -113,19 +112,6 @@ def test_drives_of_only_one_run_are_counted_and_left_out(
     assert worse.exists()
 
 
-def test_metrics_of_unpaired_drives_are_not_compared(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        folder = tmp_path / name
-        folder.mkdir()
-        drives = {name: {"distance_m": 8.0}, "both": {"distance_m": float(name == "a")}}
-        (folder / "metrics.json").write_text(json.dumps({"pose": {"by_drive": drives}}))
-        pq.write_table(by_drive_table(iter([])), folder / "by_drive.parquet")
-
-    found = compare_runs(open_scored(tmp_path / "a"), open_scored(tmp_path / "b"))
-
-    assert [one.path for one in found.metrics] == ["pose.by_drive.both.distance_m"]
-
-
 @pytest.mark.parametrize("text", ["", "a", "-1", "nan", "1e999", "x=%", "5%%"])
 def test_invalid_tolerance_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match=r"expected 0\.01"):
@@ -159,14 +145,6 @@ def test_losses_in_either_run_exit_3(tmp_path: Path, lossy: str) -> None:
         run_folder(tmp_path / name, None, **changes)
 
     assert cli.run(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "-q"]) == 3
-
-
-def test_damaged_scores_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    good, worse = _pair(tmp_path)
-    for text in ("{", "[]", "[" * 100_000):
-        (worse / "score" / "metrics.json").write_text(text)
-        assert cli.run(["compare", str(good), str(worse)]) == 4
-        assert "run crosscue score again" in capsys.readouterr().err
 
 
 def test_control_characters_in_names_are_not_printed(

@@ -95,16 +95,6 @@ def test_markdown_option_prints_a_table(fleet: Path, capsys: pytest.CaptureFixtu
     assert all(line.count("|") == 7 for line in lines if line.startswith("|"))
 
 
-def test_comparison_pairs_drives_in_any_order_of_runs(fleet: Path) -> None:
-    before, after = (sorted((fleet / side).iterdir()) for side in ("before", "after"))
-
-    found = crosscue.compare_many(after, before)
-
-    assert found.judged == crosscue.compare_many(after[::-1], before[3:] + before[:3]).judged
-    assert found.is_many
-    assert found.worse == (RECALL, DUSK)
-
-
 def test_unpaired_drives_and_unscored_runs_are_reported(tmp_path: Path, fleet: Path) -> None:
     before = sorted((fleet / "before").iterdir())
     after = scored_runs(tmp_path / "after", [19] * 7, first=4)

@@ -14,7 +14,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 import crosscue
-from crosscue.replay.errors import UnreadableRunError, UsageError
+from crosscue.replay.errors import UnreadableRunError
 from support.catalog_runs import add_run, runs_below
 
 ROWS = 200_000
@@ -112,11 +112,6 @@ def test_queries_fetch_only_required_columns_and_row_groups(url: str) -> None:
     assert footer < one_group < footer + size / 41
     assert one_group < one_column < footer + size / 5
     assert fetched("select avg(approaches) from runs") == 0
-
-
-def test_selection_of_remote_runs_is_refused(url: str) -> None:
-    with pytest.raises(UsageError, match="runs on a store have no folder here"):
-        crosscue.catalog(url).select("true")
 
 
 @pytest.mark.parametrize(

@@ -33,11 +33,6 @@ def test_folder_names_its_runs_but_not_their_merged_run(runs: Path) -> None:
     assert runs_of([str(runs)]) == (runs / "a", runs / "b", runs / "deep" / "c")
 
 
-def test_run_named_twice_is_refused(runs: Path) -> None:
-    with pytest.raises(CrosscueError, match="named twice"):
-        runs_of([str(runs / "b"), str(runs)])
-
-
 def test_patterns_and_list_files_are_expanded(runs: Path) -> None:
     runs.parent.joinpath("runs.txt").write_text("# two\nruns/b\n\nruns/a\n")
 

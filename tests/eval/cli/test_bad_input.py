@@ -1,9 +1,7 @@
 """Bad input on the command line: readable parts are read, and the rest is reported in one line."""
 
-from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from crosscue.datasets.simulated.drive import DriveSettings
@@ -18,59 +16,8 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
     return write_drive(folder, DriveSettings(seed=3, blocks=1, block_m=60.0))
 
 
-def _info(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
-    status = cli.run(["info", str(path)])
-    captured = capsys.readouterr()
-    assert "Traceback" not in captured.err
-    return status, captured.out, captured.err
-
-
 def _is_one_line(err: str) -> bool:
     return err.startswith("crosscue: ") and err.count("\n") == 1
-
-
-def _write_empty(path: Path) -> None:
-    path.write_bytes(b"")
-
-
-def _write_noise(path: Path) -> None:
-    path.write_bytes(np.random.default_rng(1).bytes(5000))
-
-
-@pytest.mark.parametrize(
-    "suffix", [".mcap", ".bag", ".db3", ".log", ".asc", ".blf", ".trc", ".mf4"]
-)
-@pytest.mark.parametrize("write_content", [_write_empty, _write_noise], ids=["empty", "noise"])
-def test_file_without_log_content_is_refused(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    suffix: str,
-    write_content: Callable[[Path], None],
-) -> None:
-    path = tmp_path / f"drive{suffix}"
-    write_content(path)
-
-    status, _, err = _info(path, capsys)
-
-    assert status == 4
-    assert _is_one_line(err)
-    assert path.name in err
-
-
-def test_damage_to_the_only_chunk_is_reported(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], drive: DriveFiles
-) -> None:
-    damaged = bytearray(drive.log.read_bytes())
-    damaged[len(damaged) // 3] ^= 0x40
-    path = tmp_path / "flipped.mcap"
-    path.write_bytes(damaged)
-    argv = ["replay", str(path), "--vehicle", str(drive.vehicle), "-o", str(tmp_path / "run")]
-
-    assert cli.run(argv) == 4
-    message = capsys.readouterr().err
-    assert "damaged chunk" in message
-    assert "not one row is left" in message
-    assert not (tmp_path / "run" / "manifest.json").exists()
 
 
 @pytest.mark.parametrize(

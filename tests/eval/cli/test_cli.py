@@ -82,43 +82,6 @@ def test_control_characters_in_an_error_are_escaped(
     assert capsys.readouterr().err == "crosscue: \\x1b[31mred\\x07 /t\\udcff\n"
 
 
-@pytest.mark.parametrize(
-    ("argv", "status"),
-    [
-        ([], 2),
-        (["--help"], 0),
-        (["fake", "--number", "3"], 3),
-        (["fake", "--nubmer", "3"], 2),
-        (["fake", "--help"], 0),
-        (["replya"], 2),
-        (["--version"], 0),
-    ],
-)
-def test_arguments_yield_documented_exit_status(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    argv: list[str],
-    status: int,
-) -> None:
-    _register_command(monkeypatch, None)
-
-    assert cli.run(argv) == status
-    capsys.readouterr()
-
-
-@pytest.mark.parametrize("length", ["0", "-1", "inf", "nan", "far"])
-@pytest.mark.parametrize(
-    "flag", ["score run --rpe", "landmarks add db --every", "fit landmarks --same-within"]
-)
-def test_length_option_must_be_positive(
-    flag: str, length: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run(f"{flag}={length}".split()) == 2
-    error = capsys.readouterr().err
-    assert f"{flag.split()[-1]}" in error
-    assert "expected metres, above 0" in error or "invalid float value: 'far'" in error
-
-
 def test_misspelt_command_gets_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["replya"]) == 2
     assert "did you mean 'replay'" in capsys.readouterr().err

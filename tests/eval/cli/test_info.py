@@ -21,10 +21,10 @@ from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import DATA, Block, CanFrames, Topic
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.logs.log_summary import common_span, summarise_log
+from crosscue.replay.logs.log_summary import summarise_log
 from crosscue.replay.safe_text import table, terminal_cells, visible, wrapped
 from crosscue.results import plain
-from support.clock_streams import SECOND_NS, START_NS, Stream, table_of
+from support.clock_streams import START_NS, Stream, table_of
 from support.data import shared
 from support.gap_drive import Clock, write_drive
 
@@ -132,33 +132,6 @@ def test_losses_are_reported_by_topic_reason_and_place() -> None:
     assert "- an unknown number of unknown topics: file is cut (at byte 9)" in text
     assert "- at least 0 rows of unknown topics dropped: file is cut" in text
     assert re.search(r"^\(topic not known\) .*>= 0$", text, re.M)
-
-
-def test_combined_logs_report_their_common_time() -> None:
-    early = summarise_log(example_log(path=Path("a.mcap")))
-    late_stream = Stream(300, 50 * MS)
-    late = summarise_log(
-        BlockLog(
-            (table_of("/x", late_stream.log_ns() + 10 * SECOND_NS),),
-            (column_topic("/x"),),
-            path=Path("b.mcap"),
-        )
-    )
-    boot = summarise_log(
-        BlockLog(
-            (table_of("/x", late_stream.log_ns() - START_NS),),
-            (column_topic("/x"),),
-            path=Path("c.log"),
-        )
-    )
-
-    common = common_span([early, late])
-    assert common.start_ns == START_NS + 10 * SECOND_NS
-    assert common.end_ns == early.end_ns
-    assert common.findings == ()
-    assert common_span([early, boot]).start_ns is None
-    assert common_span([early, boot]).findings[0].startswith("no two share a clock")
-    assert common_span([]).start_ns is None
 
 
 def test_hostile_names_are_escaped_in_text_and_json() -> None:

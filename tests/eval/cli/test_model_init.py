@@ -119,37 +119,6 @@ def test_class_names_of_openvino_file_are_read(
 
 
 @pytest.mark.parametrize(
-    "metadata",
-    ["names: [a, b", "names: " + 500 * "[" + 500 * "]", "names: {0: \xff}", "a: !!python/name:os"],
-)
-def test_damaged_openvino_metadata_is_refused_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], metadata: str
-) -> None:
-    path = _openvino_file(tmp_path)
-    (tmp_path / "metadata.yaml").write_text(metadata, encoding="latin-1")
-
-    assert run(["model", "init", str(path)]) == 2
-
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
-    assert "metadata.yaml: not readable as metadata: " in message
-    assert not (tmp_path / "my.toml").exists()
-
-
-def test_torchvision_export_with_unnamed_outputs_is_recognised(tmp_path: Path) -> None:
-    """torch.onnx numbers unnamed outputs."""
-    outputs = {"1042": _zeros(2, 4), "1043": np.ones(2, np.int64), "1044": _zeros(2)}
-    path = tmp_path / "my.onnx"
-    path.write_bytes(constant_model((3, 64, 128), outputs))
-
-    crosscue.draft_card(path, class_names=["person"])
-
-    output = read_card(tmp_path / "my.toml").output
-    assert isinstance(output, TorchvisionOutput)
-    assert (output.boxes, output.labels, output.scores) == ("1042", "1043", "1044")
-
-
-@pytest.mark.parametrize(
     ("names", "columns", "activation", "is_normalised"),
     [
         (("logits", "pred_boxes"), 80, "sigmoid", False),
@@ -211,31 +180,6 @@ def test_network_with_size_input_receives_the_picture_size(tmp_path: Path) -> No
     )
 
 
-def test_network_for_unsupported_task_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "my.onnx"
-    model = onnx.load_model_from_string(
-        constant_model((1, 3, 64, 128), {"output0": _zeros(1, 56, 168)})
-    )
-    onnx.helper.set_model_props(model, {"names": "{0: 'person'}", "task": "pose"})
-    path.write_bytes(model.SerializeToString())
-
-    with pytest.raises(crosscue.UsageError, match="expected one of detect, segment, found 'pose'"):
-        crosscue.draft_card(path)
-    with pytest.raises(crosscue.UsageError, match="expected one of detect, segment, found 'pose'"):
-        crosscue.draft_card(path, kind="yolov8", class_names=["person"])
-
-
-@pytest.mark.parametrize("shape", [(1, 56, 168), (1, 504, 57)], ids=["v8-pose", "v7-pose"])
-def test_pose_export_without_metadata_is_named_as_one(
-    tmp_path: Path, shape: tuple[int, ...]
-) -> None:
-    path = tmp_path / "my.onnx"
-    path.write_bytes(constant_model((1, 3, 64, 128), {"output0": _zeros(*shape)}))
-
-    with pytest.raises(crosscue.UsageError, match="as those of a network for poses"):
-        crosscue.draft_card(path)
-
-
 def test_check_picture_is_not_written_to_an_image_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -292,22 +236,6 @@ def test_assumptions_are_reported_and_written_to_the_card(
     assert "assumed    logits become scores by the logistic function" in message
     text = (tmp_path / "my.toml").read_text(encoding="utf-8")
     assert "# Assumed, please check: logits become scores" in text
-
-
-def test_ambiguous_layouts_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One row per cell, and boxes that are wrong in both layouts."""
-    model = constant_model((1, 3, 64, 128), {"output": np.full((1, 168, 85), 20.0, np.float32)})
-    path = tmp_path / "my.onnx"
-    path.write_bytes(model)
-
-    assert run(["model", "init", str(path)]) == 2
-
-    message = capsys.readouterr().err
-    assert "several kinds fit: yolox (" in message
-    assert "; yolov5 (" in message
-    assert "choose one with --kind" in message
-    assert run(["model", "init", str(path), "--kind", "yolox"]) == 2
-    assert "not written: on noise, there are scores from 400 to 400" in capsys.readouterr().err
 
 
 def test_published_yolox_is_recognised_by_running_it(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import pytest
 
 import crosscue
 from crosscue.datasets.real import annotate_pandaset, recordings
-from crosscue.detectors.catalog import fetch as weights
 from crosscue.detectors.catalog import places
 from crosscue.eval.cli import run
 from support.data import shared
@@ -50,29 +48,6 @@ def test_real_demo_is_fetched_once_replayed_and_scored(
     assert tree["metrics"]["coverage"]
 
 
-def test_existing_demo_is_not_replaced(
-    stand_in_drive: StandIn, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["demo", "--real", "-q"]) == 0
-    assert run(["demo", "--real"]) == 1
-
-    assert "--overwrite" in capsys.readouterr().err
-
-
-def test_local_data_folder_needs_no_download(
-    stand_in_drive: StandIn, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert run(["demo", "--real", "--data", str(stand_in_drive.folder), "-q"]) == 0
-    shutil.rmtree(recordings.recording_folder(stand_in_drive.known).parent)
-    shutil.rmtree(places.model_folder())
-    monkeypatch.setenv(weights.DATA, str(stand_in_drive.folder))
-
-    drive = crosscue.fetch_drive()
-
-    assert drive.log.is_dir()
-    assert not stand_in_drive.server.gets
-
-
 @pytest.mark.parametrize("name", [PICTURE, "net.onnx"])
 def test_file_of_wrong_checksum_is_not_kept(stand_in_drive: StandIn, name: str) -> None:
     stand_in_drive.server.files[name] = stand_in_drive.server.files[name][:-1] + b"\0"
@@ -83,36 +58,6 @@ def test_file_of_wrong_checksum_is_not_kept(stand_in_drive: StandIn, name: str) 
     below = (recordings.recording_folder(stand_in_drive.known), places.model_folder())
     names = [path.name for folder in below for path in folder.rglob("*")]
     assert Path(name).name not in names
-
-
-def test_folder_without_the_recording_is_refused(stand_in_drive: StandIn, tmp_path: Path) -> None:
-    with pytest.raises(crosscue.LogError, match="expected a folder with"):
-        crosscue.fetch_drive(tmp_path)
-
-    other = stand_in_drive.folder / "sequences" / "pandaset_002" / PICTURE.removeprefix("drive/")
-    other.write_bytes(b"another")
-    with pytest.raises(crosscue.UsageError, match="recording pandaset_002 requires"):
-        crosscue.fetch_drive(stand_in_drive.folder)
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("--real --layout C", "--layout: applies only to a simulated drive"),
-        ("--real --seed 0", "--seed: applies only to a simulated drive"),
-        ("--data .", "--data: applies only to a real drive; add --real"),
-    ],
-)
-def test_options_of_the_other_demo_are_refused(
-    line: str, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["demo", *line.split()]) == 2
-    assert message in capsys.readouterr().err
-
-
-def test_source_for_simulated_demo_is_refused() -> None:
-    with pytest.raises(crosscue.UsageError, match="add real=True"):
-        crosscue.demo(source="folder")
 
 
 def test_stored_truth_equals_output_of_annotation_script(tmp_path: Path) -> None:

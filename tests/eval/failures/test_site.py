@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 
 import crosscue
-from crosscue.eval.failures.record import read_failures, write_failures
-from crosscue.replay.errors import EmptyResultError, OutputError, UsageError
 from support.scene_run import scene_run
 from support.scoring import truth_folder
 
@@ -79,30 +77,3 @@ def test_missing_log_yields_pages_without_pictures(tmp_path: Path) -> None:
     assert site.pictures == 0
     assert site.without_picture == site.failures
     assert "drive.mcap" in site.reasons[0]
-
-
-def test_folder_other_than_a_site_is_not_replaced(
-    site_of_run: tuple[Path, crosscue.Site], tmp_path: Path
-) -> None:
-    folder, _ = site_of_run
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "notes.txt").write_text("keep")
-
-    with pytest.raises(UsageError, match=r"notes\.txt"):
-        crosscue.browse(folder / "run", tmp_path / "mine", overwrite=True)
-    with pytest.raises(OutputError, match="holds files already"):
-        crosscue.browse(folder / "run", folder / "site")
-    assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
-
-
-def test_site_of_no_failures_is_not_written(
-    site_of_run: tuple[Path, crosscue.Site], tmp_path: Path
-) -> None:
-    write_failures([], tmp_path / "none.json")
-    assert read_failures(tmp_path / "none.json") == ()
-
-    with pytest.raises(EmptyResultError):
-        crosscue.browse(tmp_path / "none.json", tmp_path / "site")
-    with pytest.raises(UsageError):
-        crosscue.browse([tmp_path / "none.json", site_of_run[0] / "run"], tmp_path / "site")
-    assert not (tmp_path / "site").exists()

@@ -12,7 +12,6 @@ import pytest
 
 import crosscue
 from crosscue.detectors.catalog.card import read_card
-from crosscue.detectors.catalog.class_scores import Isotonic
 from crosscue.detectors.training.platt import fit_isotonic, fit_platt
 from crosscue.eval.fit.detector.threshold import (
     TRIED,
@@ -87,11 +86,6 @@ def test_calibrated_scores_are_probabilities_in_the_same_order(fit) -> None:  # 
     assert (np.diff(after[order]) > 0.0).all()
 
 
-def test_decreasing_isotonic_points_are_refused() -> None:
-    with pytest.raises(ValueError, match="increasing numbers"):
-        Isotonic(kind="isotonic", scores=(0.2, 0.4), fractions=(0.6, 0.5))
-
-
 PICTURES = 700
 SIZE = (64, 48)
 
@@ -160,15 +154,6 @@ def test_fitted_card_reaches_required_precision_of_cues(drive: Path) -> None:
 
     again = crosscue.fit_detector(drive / "run", drive / "labels", card=drive / "net_fitted.toml")
     assert again.classes[0].scores == one.scores
-
-
-def test_calibrated_scores_are_not_fitted_again(drive: Path) -> None:
-    run = drive / "run_fitted"
-    if not run.exists():
-        crosscue.fit_detector(drive / "run", drive / "labels", drive / "net_fitted.toml")
-        detect_with_card(drive, "net_fitted")
-    with pytest.raises(UsageError, match="calibrated already"):
-        crosscue.fit_detector(run, drive / "labels")
 
 
 def test_held_out_calibration_is_reported_without_threshold(drive: Path) -> None:

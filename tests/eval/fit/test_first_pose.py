@@ -20,10 +20,9 @@ from crosscue.eval.fit.first_pose import with_start, with_start_of
 from crosscue.eval.fit.gnss_truth import write_gnss_truth
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
-from crosscue.eval.scoring.pose.smoother import score_smoother
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Floats, Table, Topic
-from crosscue.replay.errors import UsageError, VehicleError
+from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.pose import Gnss, GnssUse, Odometry, Start
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
@@ -120,12 +119,6 @@ def test_three_numbers_specify_the_first_pose() -> None:
     assert start.heading_rad == pytest.approx(math.pi / 2)
 
 
-@pytest.mark.parametrize("text", ["1,2,north", "1,nan,3", "1,2", "1,2,3,4", "90"])
-def test_start_option_needs_three_finite_numbers(text: str) -> None:
-    with pytest.raises(UsageError, match=r"expected X,Y,HEADING in metres and degrees"):
-        with_start([straight_drive()], Vehicle(version=1), EVERYTHING, start=text)
-
-
 def test_truth_without_observable_heading_is_refused(tmp_path: Path) -> None:
     path = write_gnss_truth([straight_drive()], Vehicle(version=1), EVERYTHING, tmp_path)
 
@@ -154,17 +147,3 @@ def test_fused_gnss_positions_bound_the_drift_of_odometry(tmp_path: Path) -> Non
 
     assert errors_m["start"] > 5.0
     assert errors_m["fuse"] < 1.0
-
-
-def test_smoother_uses_gnss_positions_of_the_filter(tmp_path: Path) -> None:
-    pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
-    vehicle = with_start([straight_drive()], LONG_WHEELS, EVERYTHING, gnss="fuse")
-    run = replayed(tmp_path / "run", vehicle)
-    truth = write_gnss_truth([straight_drive()], Vehicle(version=1), EVERYTHING, tmp_path / "truth")
-
-    assert score_smoother(run, truth, {}).smoother_rmse_m < 1.0
-
-
-def test_gnss_fusion_needs_a_map_origin() -> None:
-    with pytest.raises(VehicleError, match=r"the map's origin is unknown; expected GNSS"):
-        with_start([straight_drive(0.0)], Vehicle(version=1), EVERYTHING, gnss="fuse")

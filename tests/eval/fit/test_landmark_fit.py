@@ -44,16 +44,6 @@ def test_threshold_is_the_lowest_that_meets_the_required_rate(required: float) -
     assert fitted.fitted_found.of + fitted.held_out_found.of == 400
 
 
-def test_too_few_pairs_and_invalid_arguments_are_refused() -> None:
-    one = ScoredPairs(np.array([1.0]), np.array([False]), np.array([0]))
-    with pytest.raises(ValueError, match="two-place pairs of at least two queries"):
-        fit_landmarks(one, 0.01)
-    with pytest.raises(ValueError, match=r"wanted_rate: expected 0 to 1, got 1\.5"):
-        fit_landmarks(simulated_pairs(1), 1.5)
-    with pytest.raises(ValueError, match=r"is_same: expected \(2,\), got \(1,\)"):
-        ScoredPairs(np.zeros(2), np.zeros(1, np.bool_), np.zeros(2, np.int64))
-
-
 def test_intervals_equal_published_values() -> None:
     """Clopper-Pearson 0 of 100: 1 - 0.025^(1/100); 10 of 100 and Wilson from published tables."""
 
@@ -105,38 +95,6 @@ def test_threshold_fitted_to_a_table_of_pairs_is_written(
     assert "# mine" in car.read_text()
     assert cli.run(command) == 0
     assert "28 held-out pairs cannot show a rate of 0.001" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("table", "status", "message"),
-    [
-        ("a,b\n", 4, "expected columns query,known,same"),
-        ("query,known,same\nx.png,y.png,maybe\n", 4, "pairs.csv:2: same: expected 1 or 0"),
-        ("query,known,same\nx.png,y.png,1\n", 4, "x.png: No such file"),
-        ("query,known,same\n", 1, "use more labelled pictures"),
-    ],
-)
-def test_invalid_tables_of_pairs_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, status: int, message: str
-) -> None:
-    (tmp_path / "pairs.csv").write_text(table)
-
-    assert cli.run(["fit", "landmarks", "--pairs", str(tmp_path / "pairs.csv")]) == status
-    assert message in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (["--max-landmarks", "0"], "--max-landmarks 0"),
-        (["--same-within", "60"], "--same-within 60: expected less"),
-    ],
-)
-def test_options_that_leave_no_pairs_are_refused(
-    capsys: pytest.CaptureFixture[str], flags: list[str], message: str
-) -> None:
-    assert cli.run(["fit", "landmarks", "--pairs", "pairs.csv", *flags]) == 2
-    assert message in capsys.readouterr().err
 
 
 def test_threshold_is_fitted_to_a_recorded_drive_with_poses(

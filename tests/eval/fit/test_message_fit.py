@@ -11,9 +11,8 @@ import pytest
 
 from crosscue.datasets.truth.truth import read_truth
 from crosscue.eval.cli import run as crosscue
-from crosscue.eval.fit.annotated_runs import AnnotatedRuns, add_approaches, graph_of_runs
+from crosscue.eval.fit.annotated_runs import AnnotatedRuns, add_approaches
 from crosscue.eval.runs.folder import RunFolder, open_run
-from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from support.fusion_runs import (
     made_up_drive,
@@ -95,25 +94,6 @@ def test_approach_with_unknown_roads_is_left_out(tmp_path: Path) -> None:
 
     assert not found.approaches
     assert found.used == {"to an intersection with unknown roads, left out": 1}
-
-
-def test_truth_of_another_drive_is_refused(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    late = [one for one in made_up_drive(rng, left=True, signed=True) if one.t_ns >= 3_000_000_000]
-    run = write_run(tmp_path / "run", late)
-
-    with pytest.raises(RunError, match="give the truth of this drive"):
-        annotated_run(run, write_empty_truth(tmp_path / "truth", end_ns=2_000_000_000))
-
-
-def test_runs_with_different_graphs_are_refused(
-    tmp_path: Path, drives: tuple[list[Path], list[Path]]
-) -> None:
-    other = parse("version = 1\n[fusion.cues]\nlanes_past = { use = false }", "car.toml")
-    run = write_run(tmp_path / "run", [], other)
-
-    with pytest.raises(UsageError, match="other cues or features"):
-        graph_of_runs([open_run(drives[0][0]), run])
 
 
 def test_command_writes_a_section_for_the_vehicle_file(

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 import crosscue
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval.fit.odometry import FittedOdometry
-from crosscue.eval.fit.vehicle_output import check_output
-from crosscue.replay.errors import EmptyResultError, UsageError
-from crosscue.replay.vehicle.vehicle import Vehicle
 
 BIAS = 0.002
 
@@ -46,30 +41,3 @@ def test_fit_reduces_held_out_error_and_nees_is_within_band(
 
     assert one.after.held_out_m < one.before.held_out_m
     assert one.after.all_nees < fitted.fitted.nees_band[1]
-
-
-def test_vehicle_file_records_the_source_of_its_odometry(
-    fitted: FittedOdometry, files: DriveFiles
-) -> None:
-    assert fitted.path is not None
-    written = crosscue.load_vehicle(fitted.path).odometry
-    source = written.fitted
-
-    assert written.gyro_bias_radps == fitted.section["gyro_bias_radps"]
-    assert source is not None
-    assert source.log == files.log.name
-    assert source.start_ns < source.end_ns
-    assert source.sd["gyro_bias_radps"] > 0.0
-    assert files.vehicle.read_text().splitlines()[0] == fitted.path.read_text().splitlines()[0]
-
-
-def test_log_without_positions_is_refused(files: DriveFiles, tmp_path: Path) -> None:
-    with pytest.raises(EmptyResultError, match=r"no positions to fit to: .*--truth"):
-        crosscue.fit_odometry(files.log, files.vehicle, tmp_path / "out.toml")
-    assert not (tmp_path / "out.toml").exists()
-
-
-def test_settings_in_memory_cannot_be_written_to_a_vehicle_file(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="expected a vehicle file"):
-        check_output(Vehicle(version=1), tmp_path / "out.toml", overwrite=False)
-    check_output(None, tmp_path / "out.toml", overwrite=False)

@@ -64,10 +64,3 @@ def test_command_writes_a_section_for_the_vehicle_file(
     learned = parse(text, "car.toml").fusion.temporal
     assert learned is not None
     assert learned.model_dump(mode="json") == reported["temporal"]
-
-
-def test_single_place_is_refused(drives: Drives, capsys: pytest.CaptureFixture[str]) -> None:
-    status = crosscue(["fit", "temporal", str(drives[0][0]), "--truth", str(drives[1][0])])
-
-    assert status == 1
-    assert "two places or more" in capsys.readouterr().err

@@ -213,21 +213,6 @@ def test_intrinsics_for_another_image_size_are_refused(
         assert not out.exists()
 
 
-def test_estimate_with_intrinsics_for_another_size_leaves_run_unchanged(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
-    assert run(["replay", str(log), "-o", str(out), "--detectors", BRIGHT, "--no-cache"]) == 0
-    before = {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()}
-    vehicle.write_text("version = 1\n[camera]\nfocal_px = 60.0\nsize_px = [80, 60]\n")
-    capsys.readouterr()
-
-    assert run(["estimate", str(out), "--vehicle", str(vehicle)]) == 2
-
-    assert "camera.size_px = [80, 60]: the images are 64 x 48" in capsys.readouterr().err
-    assert {file.name: file.read_bytes() for file in out.iterdir() if file.is_file()} == before
-
-
 def test_later_picture_not_matching_intrinsics_is_dropped(tmp_path: Path) -> None:
     log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
     ok, encoded = cv2.imencode(".png", np.zeros((96, 128), np.uint8))

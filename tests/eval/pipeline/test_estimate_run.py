@@ -173,15 +173,3 @@ def test_resumed_run_writes_same_bytes_as_uninterrupted_run(
     _replay(drive, tmp_path / "run", "--resume")
 
     assert _tables(tmp_path / "run") == _tables(drive / "run")
-
-
-def test_custom_cue_with_existing_name_is_refused(
-    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = (drive / "vehicle.toml").read_text() + "\n[cues.own.stop_sign]\nlabels = ['x']\n"
-    (tmp_path / "v.toml").write_text(text)
-
-    arguments = ["estimate", str(drive / "run"), "--vehicle", str(tmp_path / "v.toml")]
-    assert run(arguments) == 2
-
-    assert "a cue of this name already exists" in capsys.readouterr().err

@@ -137,22 +137,6 @@ def test_landmarks_correct_a_drifting_pose(
     assert axis[-1] < 0.7 * without.table("pose")["major_axis_m"].to_numpy()[-1]
 
 
-def test_landmarks_without_camera_are_refused(
-    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    command = ["replay", str(town.drive.log), "--vehicle", str(town.vehicle), "-o", str(run)]
-    assert cli.run(command) == 0
-    capsys.readouterr()
-
-    command[-1] = str(tmp_path / "other")
-    status, text = _refusal(capsys, *command, "--landmarks", str(town.database))
-
-    assert status == 1
-    assert "no camera in the logs" in text
-    assert not (tmp_path / "other").exists()
-
-
 def _refusal(capsys: pytest.CaptureFixture[str], *command: str) -> tuple[int, str]:
     status = cli.run(list(command))
     captured = capsys.readouterr()
@@ -203,24 +187,6 @@ def test_landmarks_list_and_match_report_stored_landmarks(
     assert "1 landmarks compared" in capsys.readouterr().out
 
 
-def test_invalid_near_option_is_refused(town: Town, capsys: pytest.CaptureFixture[str]) -> None:
-    capsys.readouterr()
-    for text in ("1,2", "1,2,-3", "nan,0,1", "a,b,c"):
-        status, err = _refusal(capsys, "landmarks", "list", str(town.database), f"--near={text}")
-        assert (status, "expected x,y,radius in metres" in err) == (2, True)
-
-
-def test_invalid_limit_and_best_options_are_refused(
-    town: Town, capsys: pytest.CaptureFixture[str]
-) -> None:
-    capsys.readouterr()
-    database = str(town.database)
-
-    for command in (("list", database, "--limit=-1"), ("match", database, "x.png", "--best=0")):
-        status, err = _refusal(capsys, "landmarks", *command)
-        assert (status, "expected" in err) == (2, True)
-
-
 def photos(folder: Path, table: str) -> tuple[Path, Path]:
     folder.mkdir()
     for i in range(2):
@@ -229,24 +195,6 @@ def photos(folder: Path, table: str) -> tuple[Path, Path]:
     (folder / "blank.png").write_bytes(encoded(np.zeros((50, 50), np.uint8)))
     (folder / "at.csv").write_text(table)
     return folder, folder / "at.csv"
-
-
-def test_pictures_with_coordinates_become_landmarks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    table = "image,x_m,y_m,var_x_m2,cov_xy_m2,var_y_m2,heading_rad\n"
-    table += "0.png,1.5,-2,4,1,9,0.5\n1.png,5e6,4e5,1,0,1,\nblank.png,0,0,1,0,1,\n"
-    folder, csv = photos(tmp_path / "photos", table)
-    add = ["landmarks", "add", str(tmp_path / "lm.sqlite"), "--images", str(folder)]
-    assert cli.run([*add, "--coordinates", str(csv), "--json"]) == 0
-
-    counts = json.loads(capsys.readouterr().out)
-    assert (counts["pictures"], counts["added"], counts["blank"]) == (3, 2, 1)
-    with LandmarkDatabase(tmp_path / "lm.sqlite") as database:
-        first, second = (one.place for one in database)
-    assert (first.name, first.heading_rad) == ("photos/0.png", 0.5)
-    np.testing.assert_array_equal(first.cov_m2, [[4.0, 1.0], [1.0, 9.0]])
-    assert (second.xy_m.tolist(), second.heading_rad) == ([5e6, 4e5], None)
 
 
 @pytest.mark.parametrize(
@@ -273,14 +221,6 @@ def test_bad_coordinates_are_refused_and_nothing_is_written(
     assert got == status
     assert why in text
     assert not (tmp_path / "lm.sqlite").exists()
-
-
-def test_landmarks_add_requires_log_with_poses_or_images_with_coordinates(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for more in ([], ["--images", "x"], ["log"], ["log", "--poses", "p", "--images", "x"]):
-        status, text = _refusal(capsys, "landmarks", "add", str(tmp_path / "lm.sqlite"), *more)
-        assert (status, "expected LOG... with --poses" in text) == (2, True)
 
 
 def block(payloads: list[bytes], first_ns: int = 0, step_ns: int = 500_000_000) -> Block:

@@ -114,15 +114,3 @@ def test_moved_logs_are_accepted_and_changed_logs_refused(
     assert "has changed since" in capsys.readouterr().err
     assert run([*estimate, "--logs", str(drives / "D-1")]) == 4
     assert run([*estimate, "--logs", str(tmp_path / "elsewhere")]) == 0
-
-
-def test_merge_refuses_different_runs_with_same_name(
-    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = str(drives / "D-0" / "drive.mcap")
-    assert run(["replay", log, "--each", "-o", str(tmp_path / "a"), "-q"]) == 0
-    assert run(["replay", log, "--each", "-o", str(tmp_path / "b"), "-q", "--to", "2"]) == 0
-
-    assert run(["merge", str(tmp_path / "a"), str(tmp_path / "b"), "-o", str(tmp_path / "c")]) == 2
-    assert "two different runs have one name" in capsys.readouterr().err
-    assert not (tmp_path / "c").exists()

@@ -6,7 +6,6 @@ import json
 import warnings
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -103,22 +102,6 @@ def test_losses_raise_warning_and_are_recorded_in_table_metadata(
     assert any(one["dropped"] or one["dropped_unknown"] for one in lost)
 
 
-def test_pictures_are_frames_and_have_no_table(tmp_path: Path) -> None:
-    with crosscue.open(EVERY_FORMAT["images"](tmp_path)) as log:
-        camera = next(iter(log.topics.values()))
-        frame = next(camera.frames())
-
-        decoded = cv2.imdecode(np.frombuffer(frame.encoded, np.uint8), cv2.IMREAD_COLOR)
-        assert decoded is not None
-        np.testing.assert_array_equal(frame.rgb, np.asarray(decoded)[:, :, ::-1])
-        assert "png" in repr(frame)
-        with pytest.raises(crosscue.UsageError, match="use frames"):
-            camera.table()
-        assert [one.t_ns for one in camera.frames(start_s=0.1, end_s=0.3)] == [
-            one.t_ns for one in camera.frames()
-        ][1:3]
-
-
 @pytest.mark.parametrize(
     ("paths", "error"),
     [
@@ -135,11 +118,3 @@ def test_unreadable_paths_raise_crosscue_errors(
 
     with pytest.raises(error):
         crosscue.open(*paths)
-
-
-def test_missing_topic_error_suggests_the_nearest(drive: DriveFiles) -> None:
-    with (
-        crosscue.open(drive.log) as log,
-        pytest.raises(crosscue.MissingTopicError, match="did you mean /can"),
-    ):
-        log["/cam"]

@@ -78,11 +78,6 @@ def test_estimate_with_other_settings_is_written_to_another_folder(
         crosscue.estimate_run(run, vehicle, run.path / "inside")
 
 
-def test_recording_of_unsupported_file_type_is_refused(run: crosscue.Run) -> None:
-    with pytest.raises(crosscue.UsageError, match="ends in"):
-        crosscue.save_recording(run, run.path / "drive.mp4")
-
-
 def test_known_sign_is_drawn_and_unknown_sign_refused() -> None:
     assert crosscue.draw_sign("one way left", 48).ndim == 2
     with pytest.raises(crosscue.UsageError, match="one way left"):

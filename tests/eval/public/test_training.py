@@ -36,11 +36,6 @@ def test_training_frames_equal_those_of_the_command(
         crosscue.render_training_frames(tmp_path / "c", ["A"])
 
 
-def test_intersection_study_refuses_training_layouts() -> None:
-    with pytest.raises(crosscue.UsageError, match="expected some of A to H"):
-        crosscue.IntersectionStudy(layouts=("L1",))
-
-
 def test_invalid_training_settings_are_refused_before_writing(tmp_path: Path) -> None:
     road = crosscue.RoadTrainingSettings(layouts=["L1"], width_px=130)
     masks = crosscue.MaskRcnnTrainingSettings(data="gone", images="gone", window_px=(65, 64))

@@ -84,10 +84,3 @@ def test_invalid_part_options_are_refused_in_one_line(
     assert named in printed.err
     assert printed.err.count("\n") == 1
     assert not output.exists()
-
-
-def test_unavailable_views_are_refused_with_available_ones(tmp_path: Path) -> None:
-    bare = scene_run(tmp_path, without=frozenset({"pose"}))
-
-    with pytest.raises(UsageError, match="it has ahead,belief"):
-        crosscue.save_recording(bare.path, tmp_path / "x.rrd", only=("map",))

@@ -14,7 +14,6 @@ from rerun.chunk import RrdReader
 
 from crosscue.detectors import rle
 from crosscue.detectors.images import Encoded
-from crosscue.eval import cli
 from crosscue.eval.recording import save_rrd
 from crosscue.eval.recording.camera import shown
 from crosscue.eval.recording.notes import inert
@@ -22,7 +21,7 @@ from crosscue.eval.recording.plan import log_landmarks
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.replay.errors import LogError
 from support.scene_run import FRAMES, LABEL, scene_run
-from support.scoring import at, good_truth, truth_folder
+from support.scoring import at, good_truth
 
 
 def _rows(path: Path) -> Counter[str]:
@@ -126,32 +125,6 @@ def test_unsupported_picture_encodings_become_jpeg() -> None:
     assert np.abs(again.astype(int) - pixels).max() < 12
     with pytest.raises(LogError, match="fewer bytes"):
         shown(Encoded("raw", memoryview(b"too short"), layout))
-
-
-def test_view_refuses_to_replace_another_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    letter = tmp_path / "letter.md"
-    letter.write_text("keep me")
-
-    assert cli.run(["view", str(tmp_path), "-o", str(letter)]) == 2
-
-    assert "letter.md: expected a name that ends in .rrd" in capsys.readouterr().err
-    assert letter.read_text() == "keep me"
-
-
-def test_view_accepts_truth_without_a_track(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = scene_run(tmp_path / "drive")
-    truth = truth_folder(tmp_path / "truth")
-    out = tmp_path / "out.rrd"
-
-    assert cli.run(["view", str(run.path), "-o", str(out), "--truth", str(truth)]) == 3
-    assert capsys.readouterr().out == f"{out}\n"
-    rows = _rows(out)
-    assert rows["/plots/range/true_start"] == rows["/plots/range/true_end"] == 40
-    assert "/plan/true_car" not in rows
 
 
 @settings(max_examples=30, deadline=None)

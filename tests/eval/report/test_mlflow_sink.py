@@ -7,7 +7,6 @@ from urllib.parse import urlsplit
 
 import pytest
 
-import crosscue
 from crosscue.eval import cli
 from crosscue.eval.runs.tags import write_tags
 from support.scoring import run_folder, truth_folder
@@ -79,10 +78,3 @@ def test_unusable_mlflow_store_is_refused_before_scoring(
     printed = capsys.readouterr().err
     assert message in printed
     assert printed.count("\n") == 1
-
-
-def test_missing_mlflow_names_the_package_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "mlflow.tracking", None)
-
-    with pytest.raises(crosscue.UsageError, match=r"pip install mlflow-skinny"):
-        crosscue.open_mlflow("http://localhost:1")

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from crosscue.eval import cli
 from crosscue.eval.report.opening import opening_of
-from crosscue.eval.report.page import reported_time, write_report
+from crosscue.eval.report.page import write_report
 from crosscue.eval.report.scene_figures import (
     draw_belief,
 )
@@ -221,8 +221,3 @@ def test_ticks_are_few_round_and_inside_the_range(low: float, width: float, max_
     assert (steps > 0.0).all()
     leading = steps / 10.0 ** np.floor(np.log10(steps) + 1e-4)
     assert (np.abs(leading[:, None] - [1.0, 2.0, 2.5, 5.0]).min(axis=1) < 1e-3).all()
-
-
-def test_times_are_formatted_like_the_viewer() -> None:
-    assert reported_time(1_700_000_014_250_999_999) == "2023-11-14 22:13:34.250 UTC"
-    assert reported_time(2_500_000_000) == "2.500 s"

@@ -8,14 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from rerun.chunk import RrdReader
 
-from crosscue.eval.drives.score import ScoreWork
 from crosscue.eval.recording import save_rrd
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import ClockGap, gaps_of
-from crosscue.eval.scoring.drives import ScoreSettings
 from support.gap_drive import Clock, replayed, write_drive
 
 PAUSE = Clock(pause_s=(5.0, 7.1))
@@ -70,29 +67,3 @@ def test_lines_of_a_recording_break_at_gaps(paused: RunFolder, tmp_path: Path) -
     ]
     name = next(n for n in strips[0].schema.names if n.endswith("strips"))
     assert len(strips[0][name].to_pylist()[0]) == 2
-
-
-def test_report_shades_each_gap_with_its_duration(
-    paused: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    figures: list[Figure] = []
-    draw = Figure.savefig
-
-    def kept(figure: Figure, *args: Any, **more: Any) -> None:
-        figures.append(figure)
-        draw(figure, *args, **more)
-
-    monkeypatch.setattr(Figure, "savefig", kept)
-    work = ScoreWork(paused.path.parent / "truth.json", ScoreSettings(), (10.0,))
-    page = work(paused.path).report.read_text()
-
-    assert page.count('class="bar s0"') == 2, "the sign's lane, before and after"
-    assert page.count('class="gap"') == 2, "belief and range"
-    assert page.count(">gap of 2.2 s</text>") == 2
-    over_time = [f.axes[0] for f in figures if "time" in f.axes[0].get_xlabel()]
-    assert len(over_time) == 3
-    for axes in over_time:
-        assert [text.get_text() for text in axes.texts] == ["gap of 2.2 s"]
-        assert np.isnan(np.asarray(axes.lines[0].get_xdata(), np.float64)).sum() == 1
-    (by_way,) = [f.axes[0] for f in figures if "travelled" in f.axes[0].get_xlabel()]
-    assert np.isnan(np.asarray(by_way.lines[0].get_ydata(), np.float64)).sum() == 1

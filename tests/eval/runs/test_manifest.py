@@ -9,23 +9,17 @@ import pytest
 
 from crosscue.eval import cli
 from crosscue.eval.batch.merge import merge_runs
-from crosscue.eval.catalog.decoded_logs import decode_tables
 from crosscue.eval.runs.account import account
 from crosscue.eval.runs.folder import RunFolder, create, open_run, write_manifest
 from crosscue.eval.runs.manifest import (
     FORMAT_VERSION,
-    DecodeManifest,
     EstimateManifest,
     Manifest,
     TimeSegments,
 )
-from crosscue.replay.base import EVERYTHING
-from crosscue.replay.columns import Topic
 from crosscue.replay.errors import RunError
 from crosscue.replay.time.segments import Cause, Epoch, EpochMarks, LogClock, TimeSegment
-from crosscue.replay.vehicle.vehicle import Vehicle
 from support.manifests import detected, estimated, log_account
-from support.memory_log import MemoryLog, wheel_block
 
 SET_BACK = TimeSegments(
     segments=(
@@ -52,20 +46,6 @@ def test_manifest_is_read_back_unchanged(manifest: Manifest, tmp_path: Path) -> 
     assert run.manifest() == manifest
     write_manifest(run, run.manifest())
     assert run.file("manifest.json").read_bytes() == first
-
-
-def test_decode_manifest_is_not_accepted_as_a_run(tmp_path: Path) -> None:
-    wheels = Topic("wheels", "crosscue/WheelSpeeds", "columns")
-    log = MemoryLog((wheels,), [wheel_block([3], [1.0])], path=Path(__file__))
-    run = create(tmp_path / "out", overwrite=False)
-    decode_tables([log], Vehicle(version=1), run, EVERYTHING)
-
-    found = run.manifest()
-    assert isinstance(found, DecodeManifest)
-    assert found.stage == "decode"
-    assert found.tables == {"wheels": "wheels.parquet"}
-    with pytest.raises(RunError, match="tables of crosscue decode; give a run"):
-        run.drive_manifest()
 
 
 @pytest.mark.parametrize("command", ["score", "estimate", "view"])

@@ -35,16 +35,6 @@ def test_tags_are_set_listed_and_removed(runs: Path, capsys: pytest.CaptureFixtu
     ]
 
 
-def test_removing_the_last_tag_restores_the_run_folder(runs: Path) -> None:
-    before = tree(runs / "a/monday")
-
-    crosscue.tag_runs([runs / "a/monday"], {"weather": "rain"})
-    assert tree(runs / "a/monday") != before
-    crosscue.tag_runs([runs / "a/monday"], remove=["weather", "never_set"])
-
-    assert tree(runs / "a/monday") == before
-
-
 def test_tags_are_columns_of_runs_and_approaches(runs: Path) -> None:
     crosscue.catalog(runs)
     crosscue.tag_runs([runs / "a/monday"], {"weather": "rain"})
@@ -86,11 +76,6 @@ def test_invalid_tags_are_refused_without_changes(
 
     assert message in capsys.readouterr().err
     assert tree(runs) == before
-
-
-def test_tags_without_a_run_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["tag", "weather=rain"]) == 2
-    assert "no run named" in capsys.readouterr().err
 
 
 def test_damaged_tags_are_reported_and_not_overwritten(runs: Path) -> None:

@@ -86,10 +86,3 @@ def test_added_drives_are_not_reported_as_change() -> None:
 @pytest.mark.parametrize("drives", [1, MIN_PLACES - 1])
 def test_too_few_drives_yield_no_change_points(drives: int) -> None:
     assert places(results(history(np.random.default_rng(5), {3: 9.0}, drives))) == [[]]
-
-
-def test_constant_missing_and_single_version_results_have_no_change() -> None:
-    assert places(results(np.ones((DRIVES, VERSIONS)))) == [[]]
-    assert places(results(np.ones((DRIVES, 1)))) == [[]]
-    assert places(results(np.full((DRIVES, VERSIONS), np.nan))) == [[]]
-    assert change_points({}) == {}

@@ -278,13 +278,6 @@ def test_mean_band_covers_95_percent_of_simulated_means() -> None:
     assert np.mean((means > low) & (means < high)) == pytest.approx(0.95, abs=0.006)
 
 
-def test_chi_square_refuses_invalid_arguments() -> None:
-    with pytest.raises(ValueError, match="dimensions: expected >= 1, got 0"):
-        chi_square.quantile(0.5, 0)
-    with pytest.raises(ValueError, match=r"probability: expected in \(0, 1\), got 1.0"):
-        chi_square.quantile(1.0, 2)
-
-
 def stationary_track() -> Trajectory:
     return planar(np.arange(5, dtype=np.int64), np.ones(5), np.ones(5), np.zeros(5))
 
@@ -352,7 +345,3 @@ def test_trajectories_that_cannot_be_scored_are_refused(
 ) -> None:
     with pytest.raises(error, match=message):
         call()
-
-
-def test_statistics_of_empty_array_are_nan() -> None:
-    assert math.isnan(statistics(np.empty(0)).rmse)

@@ -19,7 +19,6 @@ from crosscue.eval.scoring.scene.belief import (
     judge_belief,
     log_score,
     reliability_bins,
-    score_belief,
 )
 from crosscue.eval.scoring.scene.detection import Definition
 from crosscue.eval.scoring.scene.ranges import judge_range, score_range
@@ -252,21 +251,6 @@ def test_reliability_of_calibrated_belief_is_on_diagonal() -> None:
     assert sum(one.steps for one in bins) == 20000
     inside = [one.there.low <= one.mean_probability <= one.there.high for one in bins]
     assert sum(inside) >= 8
-
-
-def test_nan_values_are_excluded_and_counted() -> None:
-    broken = tables(
-        belief=belief_table({"intersection": {10: 0.95, 12: math.nan, 13: 0.95}, "left": {}}),
-        ranges=range_table(8, 45, math.nan),
-    )
-    judged = judge_approaches(broken, truth())
-    assert judged is not None
-
-    assert judged.rows_not_numbers == 1
-    assert score_belief(judge_belief(broken, truth()))["intersection"].left_out["not a number"] == 1
-    assert score_range(judge_range(broken, truth()))["start"].left_out == {"not a number": 37}
-    # A range that is not a number is not a range.
-    assert judged.results[0].why_not_detected == "no range"
 
 
 def test_belief_comparison_is_decided_only_over_enough_drives() -> None:

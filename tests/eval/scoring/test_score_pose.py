@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -16,13 +15,10 @@ from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
 from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.replay.base import EVERYTHING
-from crosscue.replay.columns import Block, Images, Messages, Topic
-from crosscue.replay.errors import RunError, SchemaError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.logs.opening import open_log
+from crosscue.replay.columns import Block
+from crosscue.replay.errors import SchemaError
 from crosscue.replay.vehicle.pose import Start
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
-from crosscue.replay.write.convert import LogWriter
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
 
 SECOND = 1_000_000_000
@@ -150,35 +146,6 @@ def test_recording_with_truth_is_larger_than_without(tmp_path: Path) -> None:
 
     sizes = [(tmp_path / f"{name}.rrd").stat().st_size for name in ("plain", "truth")]
     assert 10_000 < sizes[0] < sizes[1]
-
-
-def test_recording_stores_encoded_pictures_unchanged(tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
-    noise = rng.integers(0, 255, (3, 240, 320, 3), np.uint8)
-    jpegs = [cv2.imencode(".jpg", picture)[1].ravel() for picture in noise]
-    edges = np.cumsum([0, *map(len, jpegs)])
-    times = np.array([1, 2, 3], np.int64) * SECOND
-    ranges = Messages(np.concatenate(jpegs), edges[:-1], edges[1:])
-    images = Images(ranges, ("jpeg",) * 3)
-    camera = Topic("/camera", "crosscue/Images", "columns")
-    log = tmp_path / "drive.mcap"
-    with LogWriter(log, Ledger(str(log))) as writer:
-        writer.add_topic(camera)
-        writer.write(Block("/camera", times, images))
-    wheels = MemoryLog((WHEELS, GYRO), _blocks(5), path=Path(__file__))
-    with open_log(log) as opened:
-        vehicle = Vehicle(version=1)
-        folder = create(tmp_path / "run", overwrite=False)
-        run = replay_drive([opened, wheels], vehicle, folder, EVERYTHING).run
-
-    save_recording(run, tmp_path / "drive.rrd")
-    log.unlink()
-    with pytest.raises(RunError, match="is gone; name its folder with --logs DIR"):
-        save_recording(run, tmp_path / "without.rrd")
-    save_recording(replace(run, without_images=True), tmp_path / "without.rrd")
-
-    sizes = [(tmp_path / f"{name}.rrd").stat().st_size for name in ("drive", "without")]
-    assert edges[-1] <= sizes[0] - sizes[1] < 1.02 * edges[-1] + 20_000
 
 
 def test_nees_is_not_computed_without_common_frame(tmp_path: Path) -> None:

@@ -140,3 +140,16 @@ def test_permanent_condition_of_intersection_does_not_exclude_good_runs() -> Non
 
     assert cost.condition == "dusk"
     assert cost.detected_m.value == pytest.approx(-10.0)
+
+
+def test_occluded_cue_is_reported_as_hidden() -> None:
+    (one,) = _found(NO_LEFT, _cue("road_left", objects=30, visible=0.4))
+
+    assert one.cause == "hidden"
+    assert "30 frames" in one.reported
+
+
+def test_counted_cue_below_threshold_is_reported_as_too_little() -> None:
+    (one,) = _found(NO_LEFT, _cue("road_left", objects=30, positives=25))
+
+    assert one.cause == "too little"

@@ -6,11 +6,14 @@ from collections.abc import Mapping
 import pytest
 
 from crosscue.eval.scoring.columns import RunTables
-from crosscue.eval.scoring.drives import score_drive
+from crosscue.eval.scoring.drives import as_metrics, score, score_drive
 from crosscue.eval.studies.attribution import (
     AttributedDrive,
     attribute,
+    attribution_lines,
+    attribution_tree,
 )
+from crosscue.replay.files.tree_text import strict_json
 from support.scoring import BELIEF, CUES, belief_table, good_truth, range_table, tables
 
 Beliefs = Mapping[str, Mapping[int, float]]
@@ -52,3 +55,14 @@ def test_cue_effect_is_distance_lost_without_it() -> None:
     assert found["parked"].belief["right"].verdict == "first"
     assert found["stop_sign"].detected_only_with == found["stop_sign"].full_only_with == 6
     assert math.isnan(found["stop_sign"].full_m.value)
+
+
+def test_attribution_is_serialised_and_summary_fits_80_columns() -> None:
+    drive = _drive("d", {"stop_sign": NEVER})
+    found = attribute([drive], GROUPS)
+    metrics = as_metrics(score([drive.judged])) | {"attribution": attribution_tree(found)}
+
+    assert '"detected_only_with": 1' in strict_json(metrics)
+    lines = attribution_lines(found)
+    assert max(map(len, lines)) <= 80
+    assert len(lines) == len(GROUPS) + 2

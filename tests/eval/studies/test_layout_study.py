@@ -134,3 +134,11 @@ def test_difference_is_zero_for_equal_beliefs_and_antisymmetric() -> None:
     assert score_difference(some, confident).brier.value < 0.0
     with pytest.raises(ValueError, match="the same drives"):
         score_difference(some, confident[1:])
+
+
+def test_study_has_100_layouts_with_two_drives_each() -> None:
+    scenes = STUDY.scenes()
+
+    assert len(set(STUDY.layouts)) >= 100
+    assert len(scenes) == 2 * len(STUDY.layouts)
+    assert len({scene.name for scene in scenes}) == len(scenes)

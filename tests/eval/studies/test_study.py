@@ -1,5 +1,6 @@
 """Studies: reproducible with any number of workers, resumed after a stop, with checked input."""
 
+import json
 import math
 import os
 import signal
@@ -22,21 +23,24 @@ from crosscue.eval.studies.intervals import (
     ratio_of_means,
 )
 from crosscue.eval.studies.town import work
+from crosscue.eval.studies.town.field_study import drive_field, finish_field
 from crosscue.eval.studies.town.landmark_study import comparisons_of
 from crosscue.eval.studies.town.range_study import (
+    calibrate,
     drive_choices,
     summarise_ranges,
 )
 from crosscue.eval.studies.town.replayed import through_log
 from crosscue.eval.studies.town.run import drive_study, finish_landmarks, finish_range
 from crosscue.eval.studies.town.settings import (
+    FieldStudy,
     LandmarkStudy,
     RangeStudy,
     load_study,
 )
 from crosscue.localization.town.drive import DriveResult
 from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
-from crosscue.replay.errors import StudyFileError
+from crosscue.replay.errors import RunError, StudyFileError
 
 TOWN = TownDrive(city=City(largest_km2=2.0))
 SMALL = LandmarkStudy(
@@ -275,3 +279,61 @@ def test_intervals_of_study_cover_true_values() -> None:
     assert ratio.low < 1.3 < ratio.high
     assert fraction_of(8, 10).value == 0.8
     assert fraction_of(0, 0).low == 0.0
+
+
+def test_folder_of_another_study_is_refused(tmp_path: Path) -> None:
+    run_study(SMALL, tmp_path)
+    other = SMALL.model_copy(update={"seed": 9})
+
+    with pytest.raises(RunError, match="other settings"):
+        list(drive_study(other, tmp_path, 1))
+    list(drive_study(other, tmp_path, 1, overwrite=True))
+
+
+@pytest.mark.parametrize("flags", [["--drives", "0"], ["--workers", "0"], ["--seed", "-3"]])
+def test_study_options_out_of_range_are_refused(
+    tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(["study", "range", "-o", str(tmp_path), *flags]) == 2
+    assert flags[0] in capsys.readouterr().err
+
+
+def test_study_prints_strict_json_without_progress(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = tmp_path / "s.toml"
+    settings.write_text(
+        'version = 1\nkind = "range"\ncompass_2sigma_deg = [60.0]\n'
+        "[drive.city]\nlargest_km2 = 2.0\n"
+    )
+    command = ["study", "range", "--settings", str(settings), "--drives", "4"]
+
+    assert cli.run([*command, "-o", str(tmp_path / "out"), "--json"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    found = json.loads(captured.out)
+    assert [r["drives"] for r in found["results"]] == [4, 4]
+    assert found["study"]["drive"]["city"]["largest_km2"] == 2.0
+
+
+@pytest.mark.slow
+def test_default_compass_interval_equals_calibrated_one() -> None:
+    default = TownDrive()
+
+    assert calibrate(default, 2, tolerance=0.01) == default.sensors.compass_interval_m
+
+
+@pytest.mark.slow
+def test_field_runs_are_reused(tmp_path: Path) -> None:
+    study = FieldStudy(range_runs=1, landmark_runs=1, minutes=2.0)
+    first = [run for _, run in drive_field(study, tmp_path, 1, through_log)]
+    logs = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/drive.mcap")}
+    again = [run for _, run in drive_field(study, tmp_path, 1, through_log)]
+    finish_field(study, again, tmp_path)
+
+    assert first == again
+    assert {path: path.stat().st_mtime_ns for path in logs} == logs
+    assert [run.has_landmarks for run in first] == [False, True]
+    assert all(run.is_whole and run.minutes == pytest.approx(2.0, abs=0.01) for run in first)
+    with pytest.raises(RunError, match="other settings"):
+        list(drive_field(FieldStudy(minutes=3.0), tmp_path, 1, through_log))

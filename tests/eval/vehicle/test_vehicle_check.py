@@ -11,12 +11,11 @@ import pytest
 from crosscue.eval.cli import run
 from crosscue.eval.vehicle.check import Checked, _normalized, check_drive_signals
 from crosscue.eval.vehicle.drive_check import check_vehicle
-from crosscue.eval.vehicle.ground_picture import draw_ground
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Table, Topic
 from crosscue.replay.vehicle.drafting.series import Series
 from crosscue.replay.vehicle.pose import Odometry
-from crosscue.replay.vehicle.vehicle import Camera, Vehicle
+from crosscue.replay.vehicle.vehicle import Vehicle
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block
 from support.pandaset_drive import pandaset_drive
 
@@ -63,17 +62,6 @@ def test_steering_is_compared_without_offset_at_a_ratio_of_15() -> None:
     found = _normalized(wheel, Vehicle(version=1, odometry=odometry))
 
     np.testing.assert_allclose(found.values, [0.0, 0.2], atol=1e-12)
-
-
-def test_horizon_is_drawn_only_with_known_intrinsics() -> None:
-    pixels = np.full((400, 640, 3), 90, np.uint8)
-    known = Vehicle(version=1, camera=Camera(focal_px=800.0, center_px=(320.0, 150.0)))
-
-    drawn = draw_ground(pixels, known)
-
-    assert (drawn[150, 300] != 90).any()
-    np.testing.assert_array_equal(pixels, 90)
-    np.testing.assert_array_equal(draw_ground(pixels, Vehicle(version=1)), pixels)
 
 
 def write_vehicle(path: Path, camera: str) -> Path:

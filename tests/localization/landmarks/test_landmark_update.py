@@ -118,13 +118,6 @@ def test_nan_position_and_invalid_covariance_are_refused(
         update_camera_position(some_belief(1), np.array(xy), np.array(cov))
 
 
-def test_invalid_landmark_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"sigmas: expected 0 to 4\.0, got 9"):
-        LandmarkSettings(sigmas=9.0)
-    with pytest.raises(ValueError, match="revisit_m: expected >= 0, got nan"):
-        LandmarkSettings(revisit_m=math.nan)
-
-
 def run(
     folder: Path, seed: int, lever_m: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[Advance, Truth, PlaceMeasurements]:

@@ -11,7 +11,6 @@ import pytest
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.layout import CanMessage, CanSignal
 from crosscue.replay.errors import CrosscueError, LogTooLargeError, SchemaError
-from crosscue.replay.limits import Limits
 from support.can_layouts import dbc_text
 
 YAW = CanMessage(
@@ -70,13 +69,6 @@ def write_file(folder: Path, text: str | bytes, name: str = "bus.dbc") -> Path:
     return path
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "utf-8-sig", "utf-16"])
-def test_units_are_read_in_every_text_encoding(encoding: str, tmp_path: Path) -> None:
-    path = write_file(tmp_path, dbc_text([YAW]).encode(encoding))
-
-    assert CanDatabase.load([path]).named("Yaw").signal("rate").unit == "°/s"
-
-
 @pytest.mark.parametrize(
     ("old", "new", "where"),
     [
@@ -121,13 +113,6 @@ def test_file_that_is_not_a_database_is_refused(
         CanDatabase.load([write_file(tmp_path, content, name)])
 
 
-def test_file_over_size_limit_is_refused(tmp_path: Path) -> None:
-    path = write_file(tmp_path, dbc_text([YAW]))
-
-    with pytest.raises(LogTooLargeError, match="larger than 100 bytes"):
-        CanDatabase.load([path], Limits(message_bytes=100))
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -144,23 +129,6 @@ def test_excessive_signal_and_message_sizes_are_refused(
 
     with pytest.raises(LogTooLargeError, match=words):
         CanDatabase.load([write_file(tmp_path, text.replace(old, new, 1))])
-
-
-@pytest.mark.slow
-def test_truncated_dbc_file_is_refused_or_reported(tmp_path: Path) -> None:
-    text = dbc_text([YAW, WHEEL]).rstrip()
-    complete = CanDatabase.load([write_file(tmp_path, text)])
-    reported = 0
-    for cut in range(len(text)):
-        try:
-            database = CanDatabase.load([write_file(tmp_path, text[:cut])])
-        except SchemaError:
-            continue
-        reported += 1
-        # A truncation after a complete line of the closing section cannot be detected.
-        is_hidden = text[:cut].endswith(";\n")
-        assert is_hidden or database.messages == complete.messages or database.notices
-    assert reported > 10
 
 
 def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
@@ -196,39 +164,6 @@ def test_conflicting_definitions_are_refused_without_keep_first(tmp_path: Path) 
     (conflict,) = database.conflicts
     assert not conflict.is_harmless
     assert any("the first is used" in notice for notice in database.notices)
-
-
-def test_messages_of_same_name_get_distinct_topic_names(tmp_path: Path) -> None:
-    text = dbc_text([YAW, replace(YAW, arbitration_id=0x124)])
-
-    database = CanDatabase.load([write_file(tmp_path, text)])
-
-    assert [m.topic_name for m in database.messages] == ["Yaw_0x123", "Yaw_0x124"]
-    assert database.named("Yaw_0x124").arbitration_id == 0x124
-    with pytest.raises(ValueError, match="2 messages are named 'Yaw'; choose one of: Yaw_0x123"):
-        database.named("Yaw")
-
-
-def test_only_message_with_oversized_signals_is_not_decodable(tmp_path: Path) -> None:
-    broken = replace(YAW, length=4)
-
-    database = CanDatabase.load([write_file(tmp_path, dbc_text([broken, WHEEL]))])
-
-    assert database.named("Yaw").problem == "signal load does not fit into 4 bytes"
-    assert not database.named("Wheel").problem
-    assert any("Yaw cannot be decoded" in notice for notice in database.notices)
-
-
-def test_message_with_branch_but_no_multiplexer_is_not_decodable(tmp_path: Path) -> None:
-    text = dbc_text([YAW, WHEEL]).replace("SG_ state ", "SG_ state m3")
-
-    database = CanDatabase.load([write_file(tmp_path, text)])
-
-    assert (
-        database.named("Yaw").problem
-        == "signal state is multiplexed, but its multiplexer is not specified"
-    )
-    assert not database.named("Wheel").problem
 
 
 def test_arxml_file_defines_frames(tmp_path: Path) -> None:

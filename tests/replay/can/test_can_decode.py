@@ -189,11 +189,3 @@ def test_encoding_refuses_values_out_of_range(value: float, words: str) -> None:
 
     with pytest.raises(ValueError, match=rf"Wide\.speed: {words}"):
         encode(message, {"speed": np.array([1.0, value])})
-
-
-def test_encoding_refuses_missing_and_unknown_signals() -> None:
-    with pytest.raises(ValueError, match="no signal 'count'; there are"):
-        encode(WIDE, {"count": np.array([1])})
-    pair = replace(WIDE, signals=(CanSignal("a", 0, 8), CanSignal("b", 8, 8)))
-    with pytest.raises(ValueError, match="no column for signal b"):
-        encode(pair, {"a": np.array([1])})

@@ -12,7 +12,7 @@ from crosscue.replay.can.decode import (
     BusDecoder,
 )
 from crosscue.replay.can.layout import CanMessage, CanSignal
-from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Table
+from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, CanFrames
 from crosscue.replay.ledger import Ledger
 from support.can_layouts import block_of, frames_of
 
@@ -40,19 +40,6 @@ def decoder(
 ) -> tuple[BusDecoder, Ledger]:
     ledger = Ledger("made up")
     return BusDecoder(DATABASE, "can0", ledger, selected, allow_longer=allow_longer), ledger
-
-
-def test_single_signals_can_be_selected() -> None:
-    decode = BusDecoder(DATABASE, "can0", Ledger("made up"), [("Switch", "two")])
-
-    (block,) = decode(block_of(frames_of(np.array([[2, 0xA5]], np.uint8), 0x400)))
-
-    assert isinstance(block.rows, Table)
-    assert {name: column.tolist() for name, column in block.rows.columns.items()} == {"two": [5.0]}
-    with pytest.raises(ValueError, match="Switch has no signal 'tow'; there are: page, zero, two"):
-        BusDecoder(DATABASE, "can0", Ledger("made up"), [("Switch", "tow")])
-    with pytest.raises(ValueError, match="no message 'Sped' among 6; did you mean Speed"):
-        BusDecoder(DATABASE, "can0", Ledger("made up"), ["Sped"])
 
 
 def test_number_of_counted_unknown_ids_is_bounded(
@@ -112,11 +99,3 @@ def test_every_frame_is_decoded_or_counted(
     assert sum(decode.counts.values()) == account.skipped.total()
     times = np.sort(np.concatenate([np.zeros(0, np.int64), *(b.log_ns for b in blocks)]))
     assert len(np.unique(times)) == account.used
-
-
-def test_rows_that_are_not_can_frames_are_refused() -> None:
-    decode, _ = decoder()
-    table = Block("can0", np.zeros(1, np.int64), Table({"a": np.zeros(1)}))
-
-    with pytest.raises(ValueError, match="can0: expected CanFrames, got Table"):
-        decode(table)

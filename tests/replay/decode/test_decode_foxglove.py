@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
-from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import pytest
 from google.protobuf import (  # type: ignore[import-untyped]
     descriptor_pb2,
@@ -93,44 +91,6 @@ def stamped(cls: Any, seconds: int, nanos: int) -> Any:
     return message
 
 
-def test_compressed_images_are_byte_ranges_of_payloads() -> None:
-    topic = proto_topic("CompressedImage", IMAGE)
-    cls = message_class(topic.schema, "CompressedImage")
-    pictures = [b"\xff\xd8" + bytes(300), b"\x89PNG\r\n\x1a\n" + bytes(9)]
-    payloads = []
-    for i, picture in enumerate(pictures):
-        message = stamped(cls, 5 + i, 7)
-        message.data, message.format, message.frame_id = picture, "jpeg", "front"
-        payloads.append(message.SerializeToString())
-    ledger = Ledger("made")
-
-    block = decoder_of(topic)(block_of("/t", [payloads[0], payloads[1], b""]), ledger)
-
-    assert isinstance(block.rows, Images)
-    assert block.rows.coding == ("jpeg", "png")
-    assert [block.rows.bytes_.payload(i).tobytes() for i in range(2)] == pictures
-    assert block.header_ns is not None
-    assert block.header_ns.tolist() == [5_000_000_007, 6_000_000_007]
-    assert ledger.topic("/t").skipped == {"empty picture": 1}
-
-
-def test_video_packets_of_unknown_coding_are_skipped() -> None:
-    topic = proto_topic("CompressedVideo", IMAGE)
-    cls = message_class(topic.schema, "CompressedVideo")
-    payloads = []
-    for coding in ("h264", "h265", "vp9"):
-        message = stamped(cls, 1, 0)
-        message.data, message.format = b"\x00\x00\x00\x01", coding
-        payloads.append(message.SerializeToString())
-    ledger = Ledger("made")
-
-    images = decoder_of(topic)(block_of("/t", payloads), ledger).rows
-
-    assert isinstance(images, Images)
-    assert images.coding == ("h264", "h265")
-    assert ledger.details[0].detail == "vp9"
-
-
 def test_raw_images_keep_size_and_pixel_format() -> None:
     topic = proto_topic("RawImage", RAW)
     cls = message_class(topic.schema, "RawImage")
@@ -152,29 +112,6 @@ def test_raw_images_keep_size_and_pixel_format() -> None:
     assert images.step_bytes is not None
     assert images.step_bytes.tolist() == [12]
     assert ledger.topic("/t").dropped == {"picture has fewer bytes than its size needs": 1}
-
-
-def test_location_fix_has_columns_of_navsatfix() -> None:
-    topic = proto_topic("LocationFix", FIX)
-    cls = message_class(topic.schema, "LocationFix")
-    message = stamped(cls, 3, 4)
-    message.latitude, message.longitude, message.altitude = 37.5, -122.25, 11.0
-    message.position_covariance.extend(range(9))
-    bare = stamped(cls, 4, 4)
-    wrong = stamped(cls, 5, 4)
-    wrong.position_covariance.extend([1.0, 2.0])
-    ledger = Ledger("made")
-
-    block = decoder_of(topic)(
-        block_of("/t", [each.SerializeToString() for each in (message, wrong, bare)]), ledger
-    )
-
-    assert isinstance(block.rows, Table)
-    assert block.rows["latitude_deg"].tolist() == [37.5, 0.0]
-    np.testing.assert_array_equal(block.rows["covariance_m2"], [range(9), [np.nan] * 9])
-    assert block.header_ns is not None
-    assert block.header_ns.tolist() == [3_000_000_004, 4_000_000_004]
-    assert ledger.topic("/t").dropped == {MISFIT: 1}
 
 
 def test_unknown_protobuf_type_has_dotted_columns() -> None:
@@ -228,17 +165,6 @@ def test_invalid_descriptor_is_refused_in_one_line(schema: bytes, complaint: str
         decoder_for(topic)
     assert "\n" not in str(caught.value)
     assert "/cam" in str(caught.value)
-
-
-@pytest.mark.parametrize("name", ["CompressedImage", "LocationFix"])
-def test_timestamp_without_seconds_is_refused(name: str) -> None:
-    topic = proto_topic(name, IMAGE if name == "CompressedImage" else FIX)
-    renamed = Topic(
-        topic.name, topic.type_name, "protobuf", topic.schema.replace(b"seconds", b"seconbs")
-    )
-
-    with pytest.raises(SchemaError, match="lacks the field seconds"):
-        decoder_for(renamed)
 
 
 @given(raw=st.binary(max_size=80), name=st.sampled_from(["CompressedImage", "LocationFix"]))
@@ -312,20 +238,6 @@ def test_invalid_json_message_is_dropped_alone(raw: bytes) -> None:
 
     assert len(block) == 1
     assert ledger.topic("/t").dropped == {MISFIT: 1}
-
-
-def test_json_values_keep_dtype_and_missing_values_are_nan() -> None:
-    rows: list[Mapping[str, Any]] = [
-        {"n": 2**53 + 1, "b": True, "in": {"x": 1}},
-        {"n": 2, "b": False, "in": {"x": 0.5, "y": 2}, "s": "text", "l": [1, 2]},
-    ]
-    table = decoder_of(Topic("/t", "made.Thing", "json"))(json_block(*rows), Ledger("x")).rows
-
-    assert isinstance(table, Table)
-    assert table["n"].tolist() == [2**53 + 1, 2]
-    assert table["b"].dtype == np.bool_
-    np.testing.assert_array_equal(table["in.y"], [np.nan, 2.0])
-    np.testing.assert_array_equal(table["l.length"], [np.nan, 2.0])
 
 
 def test_json_schema_that_is_not_an_object_is_refused() -> None:

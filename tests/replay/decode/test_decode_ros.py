@@ -234,70 +234,6 @@ def test_taking_rows_of_both_byte_orders_keeps_values() -> None:
     np.testing.assert_array_equal(fields.take(keep).number("data"), [0, 3, 6, 9])
 
 
-def test_compressed_images_share_memory_with_the_log() -> None:
-    store, name = ros2_store(), "sensor_msgs/msg/CompressedImage"
-    pictures = [b"\xff\xd8" + bytes(50), b"\x89PNG\r\n\x1a\n" + bytes(9), b"????", b""]
-    labels = ["rgb8; jpeg compressed bgr8", "jpeg", "16UC1; compressedDepth png", "jpeg"]
-    header = store.types["std_msgs/msg/Header"](
-        store.types["builtin_interfaces/msg/Time"](1, 0), "cam"
-    )
-    payloads = [
-        serialized(store, store.types[name](header, label, np.frombuffer(p, np.uint8)), name)
-        for label, p in zip(labels, pictures, strict=True)
-    ]
-    block, ledger = block_of("/cam", payloads), Ledger("made")
-
-    images = decoder_of(ros2_topic("/cam", name))(block, ledger).rows
-
-    assert isinstance(images, Images)
-    assert images.coding == ("jpeg", "png")
-    assert [images.bytes_.payload(i).tobytes() for i in range(2)] == pictures[:2]
-    assert np.shares_memory(images.bytes_.buffer, block.rows.buffer)  # type: ignore[union-attr]
-    assert ledger.topic("/cam").skipped == {"unknown image coding": 1, "empty picture": 1}
-
-
-@pytest.mark.parametrize("is_cdr", [True, False])
-def test_learned_image_layout_validates_lengths(is_cdr: bool) -> None:
-    store, name = (ros2_store() if is_cdr else ros1_store()), "sensor_msgs/msg/CompressedImage"
-    topic = (ros2_topic if is_cdr else ros1_topic)("/cam", name)
-    stamp = store.types["builtin_interfaces/msg/Time"](7, 8)
-    header = store.types["std_msgs/msg/Header"](*(() if is_cdr else (3,)), stamp, "cam")
-
-    def message(size: int) -> bytes:
-        picture = np.frombuffer(b"\xff\xd8" + bytes(range(size)), np.uint8)
-        made = store.types[name](header, "jpeg", picture)
-        return bytes(
-            store.serialize_cdr(made, name) if is_cdr else store.serialize_ros1(made, name)
-        )
-
-    trained = decoder_of(topic)
-    trained(block_of("/cam", [message(5)]), Ledger("made"))
-    for length_error in range(-3, 4):
-        for rest in range(6):
-            last = bytearray(message(40) + bytes(rest))
-            last[-42 - rest - 4] += length_error
-            block = block_of("/cam", [message(9), message(0), bytes(last)], gap=1)
-            ledgers = Ledger("from_layout"), Ledger("from_walk")
-
-            from_layout, from_walk = (
-                trained(block, ledgers[0]),
-                decoder_of(topic)(block, ledgers[1]),
-            )
-
-            assert ledgers[0].details == ledgers[1].details
-            assert len(from_layout) == (
-                3 if 0 <= rest - length_error <= (3 if is_cdr else 0) else 2
-            )
-            assert isinstance(from_layout.rows, Images)
-            assert isinstance(from_walk.rows, Images)
-            np.testing.assert_array_equal(
-                from_layout.rows.bytes_.start, from_walk.rows.bytes_.start
-            )
-            np.testing.assert_array_equal(from_layout.rows.bytes_.stop, from_walk.rows.bytes_.stop)
-            assert from_layout.header_ns is not None
-            assert set(from_layout.header_ns.tolist()) == {7_000_000_008}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "complaint"),
@@ -390,13 +326,6 @@ def test_damaged_definition_is_used_or_refused_in_one_line(seed: int, is_cdr: bo
         return
     assert decoder is not None
     assert len(decoder(block_of("/t", payloads), ledger)) == ledger.topic("/t").used
-
-
-@pytest.mark.parametrize("is_cdr", [True, False])
-def test_empty_block_decodes_to_empty_block(is_cdr: bool) -> None:
-    topic_of = ros2_topic if is_cdr else ros1_topic
-    for name in ("sensor_msgs/msg/Imu", "can_msgs/msg/Frame", "sensor_msgs/msg/CompressedImage"):
-        assert len(decoder_of(topic_of("/t", name))(block_of("/t", []), Ledger("x"))) == 0
 
 
 def test_idl_definition_decodes_like_msg_definition() -> None:

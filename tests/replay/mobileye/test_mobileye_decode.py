@@ -15,7 +15,6 @@ from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import DevicePosition
-from crosscue.replay.mobileye.layout import VARIANTS
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from support.mobileye_frames import MS, frames, random_drive, status, triple, values
 
@@ -74,12 +73,6 @@ def test_complete_burst_yields_one_row_per_obstacle() -> None:
     assert ledger.is_whole
 
 
-def test_rows_that_are_not_can_frames_are_refused() -> None:
-    decoder = MobileyeDecoder("can1", Ledger("log"))
-    with pytest.raises(ValueError, match="can1: expected CanFrames, got Table"):
-        decoder(Block("can1", np.zeros(0, dtype=np.int64), Table({})))
-
-
 LEFT_LANE = [(0x766, "A13EFE0A80FF7F0A"), (0x767, "0D80801E")]
 
 
@@ -104,14 +97,6 @@ def test_lane_is_transformed_to_vehicle_frame(yaw_rad: float) -> None:
 def cubic(lanes: Table, x_m: float) -> float:
     c = [float(values(lanes, name)[0]) for name in ("c0_m", "c1", "c2_per_m", "c3_per_m2")]
     return c[0] + c[1] * x_m + c[2] * x_m**2 + c[3] * x_m**3
-
-
-def test_both_revisions_on_one_bus_are_a_notice() -> None:
-    blocks = [frames([status(0, 0)]), frames([status(0, 66, length=7)], [66 * MS])]
-    tables, ledger = decode(blocks)
-
-    assert [VARIANTS[k] for k in tables["status"]["layout"]] == ["classic", "2.32"]
-    assert any("status frames of both revisions" in n for n in ledger.notices)
 
 
 @pytest.mark.slow

@@ -97,12 +97,6 @@ def test_invalid_layout_is_refused(text: str, message: str) -> None:
         parse_layout(head + text)
 
 
-def test_messages_with_same_identifier_are_refused() -> None:
-    one = '[[message]]\nname = "{}"\nabout = ""\ntable = "t"\nid = 1\nlengths = [4]\nfields = []\n'
-    with pytest.raises(SchemaError, match="two messages have the same identifier"):
-        parse_layout(one.format("a") + one.format("b"))
-
-
 @given(
     start=st.integers(0, 63), bits=st.integers(1, 32), signed=st.booleans(), seed=st.integers(0, 99)
 )

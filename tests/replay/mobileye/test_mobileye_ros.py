@@ -21,7 +21,6 @@ from crosscue.replay.mobileye.settings import MobileyeSettings
 from support.mobileye_frames import (
     MS,
     frames,
-    join,
     random_drive,
     random_words,
     status,
@@ -139,15 +138,6 @@ def obstacle_drive() -> list[Block]:
     return messages_of(frames(sent, times))
 
 
-def test_obstacles_without_status_keep_their_own_time() -> None:
-    statuses, obstacles = obstacle_drive()
-    bag, ledger = tables_from_bag([statuses.take(np.arange(4) != 2), obstacles])
-
-    assert bag["obstacles"]["burst"].tolist() == [0, 0, 1, 1, -1, -1, 2, 2]
-    assert bag["obstacles"]["slot"].tolist() == [0, 1, 0, 1, -1, -1, 0, 1]
-    assert any("keep their own time" in n for n in ledger.notices)
-
-
 def lane_drive(seconds: int, mirrored: bool) -> list[Block]:
     """Return a left lane at 1.75 m and a right lane at -1.25 m, with bus signs or mirrored."""
     left, right = ("40FE", "4001") if not mirrored else ("C001", "C0FE")
@@ -191,8 +181,3 @@ def test_unused_messages_are_skipped_by_topic_and_reason() -> None:
         "/parsed_tx/lane": {"message was not decoded to columns": 1},
     }
     assert ledger.details[0].detail == "obstacle_pos_x"
-
-
-def test_topics_of_other_types_are_ignored() -> None:
-    reader = RosMobileye("ros", {"/imu": "sensor_msgs/msg/Imu"}, Ledger("log"), BUS_SETTINGS)
-    assert reader(join([replace(frames([status(0, 0)]), topic="/imu")])) == []

@@ -14,19 +14,13 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.detectors.images import MAX_PIXELS
-from crosscue.replay.limits import DEFAULT_LIMITS, MIB
+from crosscue.replay.limits import DEFAULT_LIMITS
 from support.can_files import blf, random_frames
 from support.measured import measured
 from support.mf4_files import unsorted
-from support.pictures import picture_folder
 from support.rosbag_files import rows_of, write_folder
 
 from .test_bombs import BOMB_BYTES, MAX_MB, PIECE, zstd_bomb
-
-SIDE_PX = 60_000
-# Memory limit with OpenCV and the table of detectors loaded; the images declare 10 GB.
-MAX_WITH_DETECTOR_MB = 500
 
 
 def _deflated(size: int) -> bytes:
@@ -181,21 +175,6 @@ def test_bomb_in_log_is_refused_with_size_and_limit(tmp_path: Path, case: str) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["message", "file"])
-def test_max_chunk_option_limits_zstd_size_in_bag(tmp_path: Path, kind: str) -> None:
-    path = (
-        _in_db3(_zstd_with_declared_size)(tmp_path)
-        if kind == "message"
-        else _bag_with_zstd_file_of_declared_size(tmp_path)
-    )
-
-    status, output, _ = measured(["info", str(path), "--max-chunk", "2"])
-
-    assert status == (3 if kind == "message" else 4)
-    assert f"declares {BOMB_BYTES} bytes, the limit is {2 * MIB} (--max-chunk)" in output
-
-
-@pytest.mark.slow
 def test_gzip_file_is_refused_without_decompression(tmp_path: Path) -> None:
     path = tmp_path / "drive.mcap.gz"
     with gzip.open(path, "wb", compresslevel=1) as file:
@@ -207,53 +186,3 @@ def test_gzip_file_is_refused_without_decompression(tmp_path: Path) -> None:
     assert status == 4, output
     assert peak_mb < MAX_MB
     assert "gzip" in output
-
-
-def _png() -> bytes:
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return (
-            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-        )
-
-    head = struct.pack(">IIBBBBB", SIDE_PX, SIDE_PX, 8, 2, 0, 0, 0)
-    parts = chunk(b"IHDR", head) + chunk(b"IDAT", _deflated(64 * MIB)) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + parts
-
-
-def _jpeg() -> bytes:
-    size = struct.pack(">BHHB", 8, SIDE_PX, SIDE_PX, 3) + b"\1\x11\0\2\x11\0\3\x11\0"
-    frame = b"\xff\xc0" + struct.pack(">H", 2 + len(size)) + size
-    return b"\xff\xd8" + frame + b"\xff\xda\0\x0c\3\1\0\2\0\3\0\0?\0" + bytes(1000) + b"\xff\xd9"
-
-
-def _webp() -> bytes:
-    body = b"WEBPVP8X" + struct.pack("<I", 10) + bytes(4)
-    body += (SIDE_PX - 1).to_bytes(3, "little") * 2 + bytes(100)
-    return b"RIFF" + struct.pack("<I", len(body)) + body
-
-
-PICTURES = {".png": _png, ".jpg": _jpeg, ".webp": _webp}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("suffix", PICTURES)
-@pytest.mark.parametrize("is_in_mcap", [False, True], ids=["folder", "mcap"])
-def test_image_bomb_is_dropped_before_decoding(
-    tmp_path: Path, suffix: str, is_in_mcap: bool
-) -> None:
-    log = picture_folder(tmp_path / "cam", 5, "rate_hz: 10\n")
-    (log / "frame_2.png").unlink()
-    (log / f"frame_2{suffix}").write_bytes(PICTURES[suffix]())
-    if is_in_mcap:
-        converted = tmp_path / "cam.mcap"
-        status, output, _ = measured(["convert", str(log), "-o", str(converted)])
-        assert status == 0, output
-        log = converted
-    argv = ["detect", str(log), "--detectors", "support.detecting:build", "--no-cache"]
-
-    status, output, peak_mb = measured([*argv, "-o", str(tmp_path / "run")])
-
-    assert status == 3, output
-    assert peak_mb < MAX_WITH_DETECTOR_MB
-    assert f"{SIDE_PX} x {SIDE_PX}" in output
-    assert f"{MAX_PIXELS:,}" in output

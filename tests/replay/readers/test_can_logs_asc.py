@@ -122,20 +122,6 @@ def test_dates_are_read_as_utc_in_every_time_zone(
     time.tzset()
 
 
-def test_log_without_header_keeps_first_frame(tmp_path: Path) -> None:
-    found, ledger = read_back(_log(tmp_path, LINE + LINE))
-
-    assert [f.t_ns for f in found["can/1"]] == [500_000_000] * 2
-    assert any("no 'base' line" in notice for notice in ledger.notices)
-    assert any("no readable start date" in notice for notice in ledger.notices)
-
-
-def test_commented_out_frame_is_counted_as_skipped(tmp_path: Path) -> None:
-    _, ledger = read_back(_log(tmp_path, HEAD + LINE + "// x" + LINE))
-
-    assert ledger.topic("").skipped == {"comment that holds a frame": 1}
-
-
 @pytest.mark.parametrize("name", ["issue_1256.asc", "logfile.asc"])
 def test_real_logs_match_python_can(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     path = shared("can", "python_can", name)

@@ -9,13 +9,9 @@ import pytest
 from crosscue.replay.columns import DATA, ERROR, REMOTE
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.readers.can_text import dialect as can_text
 from crosscue.replay.readers.can_text.lines import Lines, Tail, read_lines
 from support.can_files import (
     Sent,
-    by_bus,
-    candump,
-    random_frames,
     read_back,
 )
 from support.data import shared
@@ -27,19 +23,6 @@ def _log(folder: Path, text: str | bytes, name: str = "x.log") -> Path:
     path = folder / name
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     return path
-
-
-def test_chunk_boundaries_do_not_change_frames(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frames = random_frames(400)
-    path = _log(tmp_path, candump(frames))
-    monkeypatch.setattr(can_text, "read_lines", lambda p, _=0: read_lines(p, 400))
-
-    found, ledger = read_back(path)
-
-    assert found == by_bus(frames, "can{}")
-    assert ledger.is_whole
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from crosscue.replay.base import Selection
 from crosscue.replay.columns import Block, Images
-from crosscue.replay.errors import LogError, LogFormatError
+from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
-from crosscue.replay.logs.opening import open_log
 from support.accounted import read
 from support.videos import number_of, numbers_at_times, video
 
@@ -97,33 +96,6 @@ def test_undecodable_picture_is_dropped_without_shifting_times(
     assert (loss.t_ns, loss.detail) == (TIMES_NS[which], f"packet {which}")
 
 
-def test_constant_rate_is_reported(tmp_path: Path) -> None:
-    path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
-    path.with_suffix(".txt").write_text("rate_hz: 10")
-
-    blocks, ledger = read(path)
-
-    assert [t for b in blocks for t in b.log_ns.tolist()] == [100_000_000 * i for i in range(N)]
-    assert "times are computed from a constant rate of 10 Hz, from 0 on" in ledger.notices
-
-
-@pytest.mark.parametrize(("lines", "dropped", "skipped"), [(N + 3, 3, 0), (N - 3, 3, 0)])
-def test_mismatched_counts_of_times_and_pictures_are_reported(
-    tmp_path: Path, lines: int, dropped: int, skipped: int
-) -> None:
-    path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
-    path.with_suffix(".txt").write_text("\n".join(f"{i}.5" for i in range(lines)))
-
-    _, ledger = read(path)
-
-    account = ledger.topic("a")
-    assert sum(account.dropped.values()) == dropped
-    assert sum(account.skipped.values()) == skipped
-    assert f"{N} pictures and {lines} times (a.txt): paired in order from the first" in (
-        ledger.notices
-    )
-
-
 def test_selection_limits_pictures_and_counts_the_rest(tmp_path: Path) -> None:
     path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
     path.with_suffix(".txt").write_text(TIME_LINES)
@@ -191,18 +163,3 @@ def test_damaged_video_is_read_or_refused_in_one_line(tmp_path: Path, at: int, j
         blocks = []
         assert "\n" not in str(error)  # noqa: PT017
     assert sum(len(b) for b in blocks) <= 2 * N
-
-
-def test_raw_stream_without_time_file_is_refused(tmp_path: Path) -> None:
-    path = video(tmp_path / "a.h264", 3)
-
-    with pytest.raises(LogFormatError, match=r"a raw stream has no times; write a.h264.txt"):
-        open_log(path)
-
-
-def test_time_file_with_picture_names_is_refused_for_video(tmp_path: Path) -> None:
-    path = video(tmp_path / "a.mp4", 3)
-    path.with_suffix(".txt").write_text("a.png,0.5")
-
-    with pytest.raises(LogFormatError, match="names files; expected one time for each picture"):
-        open_log(path)

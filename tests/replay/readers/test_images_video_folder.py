@@ -10,9 +10,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.columns import Block, Images
-from crosscue.replay.errors import LogError, LogFormatError
-from crosscue.replay.limits import Limits
-from crosscue.replay.logs.opening import open_log
 from support.accounted import read
 from support.pictures import picture, picture_folder
 
@@ -41,16 +38,6 @@ def test_pictures_are_read_in_natural_order_with_their_times(tmp_path: Path, suf
     assert ledger.notices == []
     assert ledger.topic("front").declared == 12
     assert ledger.integrity.startswith({".png": "PNG", ".jpg": "JPEG", ".webp": "WebP"}[suffix])
-
-
-def test_numbering_gap_with_matching_number_of_times_is_reported(tmp_path: Path) -> None:
-    folder = picture_folder(tmp_path / "front", 6, FIVE)
-    (folder / "frame_2.png").unlink()
-
-    blocks, ledger = read(folder)
-
-    assert len(pictures_read(blocks)) == 5
-    assert "1 numbers are missing" in ledger.notices[0]
 
 
 def test_damaged_truncated_and_unsupported_files_are_not_read(tmp_path: Path) -> None:
@@ -84,34 +71,6 @@ def test_truncated_picture_is_reported(tmp_path: Path, suffix: str, fraction: fl
     assert pictures_read(blocks) == [(1.5, picture(1, suffix))]
     account = ledger.topic("front")
     assert account.skipped.total() + account.dropped.total() == 1
-
-
-def test_picture_over_size_limit_is_skipped(tmp_path: Path) -> None:
-    folder = picture_folder(tmp_path / "front", 3, "0.5\n1.5\n2.5")
-    (folder / "frame_1.png").write_bytes(picture(1) + bytes(5000))
-
-    blocks, ledger = read(folder, limits=Limits(message_bytes=4000))
-
-    assert len(pictures_read(blocks)) == 2
-    assert ledger.topic("front").skipped == {"picture over the size limit": 1}
-
-
-def test_folder_without_time_file_is_refused_with_instructions(tmp_path: Path) -> None:
-    folder = picture_folder(tmp_path / "front", 2)
-
-    with pytest.raises(LogFormatError, match=r"2 pictures but no time file; write timestamps.txt"):
-        open_log(folder)
-
-
-def test_unreadable_time_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5")
-
-    def refuse(self: Path, mode: str) -> None:
-        raise PermissionError(13, "Permission denied", str(self))
-
-    monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(LogError, match="no permission to read it"):
-        open_log(folder)
 
 
 def test_named_pipe_instead_of_picture_is_dropped(tmp_path: Path) -> None:

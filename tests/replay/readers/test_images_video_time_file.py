@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.errors import LogFormatError, LogTooLargeError
+from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.time_file_names import find_time_file
-from crosscue.replay.limits import DEFAULT_LIMITS, Limits
+from crosscue.replay.limits import DEFAULT_LIMITS
 from crosscue.replay.readers.time_file import TimeFile, read_time_file
 
 quick = settings(
@@ -95,13 +95,6 @@ def test_supported_notations_are_parsed(
 def test_invalid_line_is_refused_with_its_number(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(LogFormatError, match=message):
         read(tmp_path, text)
-
-
-def test_time_file_over_size_limit_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "times.txt").write_text("0.5\n" * 100)
-
-    with pytest.raises(LogTooLargeError, match="over 100 bytes"):
-        read_time_file(tmp_path / "times.txt", Limits(message_bytes=100))
 
 
 @quick

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag1 import Reader
 
-from crosscue.replay.errors import LogError, LogFormatError
+from crosscue.replay.errors import LogFormatError
 from crosscue.replay.limits import Limits
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.rosbag1.reader import BagLog
@@ -259,11 +259,6 @@ def test_unsupported_file_is_refused_in_one_line(
     with pytest.raises(LogFormatError, match=match) as refused:
         open_log(path)
     assert "\n" not in str(refused.value)
-
-
-def test_encrypted_bag_is_refused_with_instructions(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match=r"encrypted by 'rosbag/AesCbcEncryptor'.*rosbag decrypt"):
-        open_log(bag(tmp_path / "a.bag", encryptor=b"rosbag/AesCbcEncryptor"))
 
 
 @pytest.mark.slow

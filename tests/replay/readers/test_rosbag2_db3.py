@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag2 import Reader
 
-from crosscue.replay.errors import LogError, LogFormatError
+from crosscue.replay.errors import LogFormatError
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.readers.rosbag2.db3 import Db3Log
 from support.data import shared
 from support.rosbag_files import (
     Row,
@@ -69,10 +68,6 @@ def killed_recorder(path: Path, journal: str, before: int, after: int) -> None:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
-def db3_of(folder: Path, rows: list[Row]) -> Path:
-    return next(write_folder(folder, rows).glob("*.db3"))
 
 
 def test_real_database_matches_rosbags() -> None:
@@ -191,33 +186,6 @@ def test_unsupported_file_is_refused_in_one_line(
     with pytest.raises(LogFormatError, match=match) as refused:
         open_log(path)
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.slow
-def test_locked_database_is_refused(tmp_path: Path) -> None:
-    path = write_database(tmp_path / "a.db3", (1, 5, b"x"))
-    writer = sqlite3.connect(path, isolation_level=None)
-    writer.execute("BEGIN EXCLUSIVE")
-    try:
-        with pytest.raises(LogError, match="locked by another program"):
-            Db3Log(path)
-    finally:
-        writer.close()
-
-
-def test_zeroed_page_drops_only_its_rows(tmp_path: Path) -> None:
-    rows = rows_of(2000)
-    path = db3_of(tmp_path / "bag", rows)
-    content = bytearray(path.read_bytes())
-    middle = len(content) // 2 // 4096 * 4096
-    content[middle : middle + 4096] = bytes(4096)
-    path.write_bytes(content)
-    reading = read_rows(path)
-    dropped = sum(account.dropped.total() for account in reading.ledger.accounts.values())
-
-    assert len(rows) - 100 < len(reading.rows) < len(rows)
-    assert not Counter(reading.rows) - Counter(rows)
-    assert dropped == len(rows) - len(reading.rows)
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sqlite3
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -97,31 +96,6 @@ def test_messages_of_missing_listed_file_are_dropped_by_topic(tmp_path: Path) ->
         assert ledger.topic(name).in_file == count
 
 
-def test_messages_of_unreadable_listed_file_are_dropped(tmp_path: Path) -> None:
-    rows = rows_of(300)
-    folder = folder_of_parts(tmp_path / "bag", rows[:100], rows[100:])
-    write_metadata(folder, "part_0.db3", "part_1.db3", counts=count_by_topic(rows))
-    (folder / "part_1.db3").write_bytes(b"nothing of the kind")
-    reading = read_rows(folder)
-
-    assert by_topic(reading.rows) == by_topic(rows[:100])
-    dropped = sum(account.dropped.total() for account in reading.ledger.accounts.values())
-    assert dropped == 200
-    assert any("part_1.db3" in sentence for sentence in reading.ledger.notices)
-
-
-@pytest.mark.parametrize("declared", [0, 1])
-def test_too_low_counts_in_metadata_yield_notice(tmp_path: Path, declared: int) -> None:
-    rows = rows_of(200)
-    folder = folder_of_parts(tmp_path / "bag", rows)
-    write_metadata(folder, "part_0.db3", counts={"/can": declared})
-    reading = read_rows(folder)
-
-    assert by_topic(reading.rows) == by_topic(rows)
-    assert reading.ledger.is_whole
-    assert any(f"counts {declared} messages" in notice for notice in reading.ledger.notices)
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -158,18 +132,6 @@ def test_compressed_file_and_its_decompressed_copy_are_read_once(tmp_path: Path)
     assert any("it was not read" in sentence for sentence in reading.ledger.notices)
 
 
-def test_same_recording_in_two_formats_is_read_once(tmp_path: Path) -> None:
-    rows = rows_of(100)
-    folder = folder_of_parts(tmp_path / "bag", rows)
-    other = write_folder(tmp_path / "other", rows, "mcap")
-    shutil.copy(next(other.glob("*.mcap")), folder / "part_0.mcap")
-    write_metadata(folder, "part_0.db3")
-    reading = read_rows(folder)
-
-    assert by_topic(reading.rows) == by_topic(rows)
-    assert any("in another format" in sentence for sentence in reading.ledger.notices)
-
-
 @pytest.mark.parametrize("storage", STORAGES)
 def test_truncated_compressed_file_yields_readable_part(tmp_path: Path, storage: Storage) -> None:
     rows = rows_of(4000)
@@ -183,18 +145,6 @@ def test_truncated_compressed_file_yields_readable_part(tmp_path: Path, storage:
     assert not reading.ledger.is_whole
     dropped = sum(a.dropped.total() for n, a in reading.ledger.accounts.items())
     assert dropped == len(rows) - len(reading.rows)
-
-
-def test_two_types_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
-    rows = rows_of(100)
-    folder = folder_of_parts(tmp_path / "bag", rows[:50], rows[50:])
-    with sqlite3.connect(folder / "part_1.db3") as db:
-        db.execute("UPDATE topics SET type = 'std_msgs/msg/Int8' WHERE name = '/can'")
-    db.close()
-    reading = read_rows(folder)
-    odd = count_by_topic(rows[50:])["/can"]
-
-    assert reading.ledger.topic("/can").skipped == {"another message type on the same topic": odd}
 
 
 def test_time_range_spans_files(tmp_path: Path) -> None:

@@ -129,20 +129,6 @@ def test_wheel_radius_is_estimated_from_angular_speeds() -> None:
     assert not best.verdict.wrong
 
 
-def test_signs_are_undetermined_without_wheels_and_gnss() -> None:
-    bend = 0.02 * np.sin(0.3 * T_S)
-    steering = np.arctan(2.7 * bend / SPEED) * 15.0
-    found = choices_among(
-        candidate_signal(SignalKind.SPEED, "A.SPEED", SPEED),
-        candidate_signal(SignalKind.YAW_RATE, "A.YAW", -bend),
-        candidate_signal(SignalKind.STEERING, "A.ANGLE", -steering),
-        with_gnss=False,
-    )
-
-    assert found.yaw_rates[0].verdict.agrees_with == 0
-    assert found.steering[0].verdict.agrees_with == 0
-
-
 DBC: Final = """VERSION ""
 BU_: A
 BO_ 100 Wheels: 8 A

@@ -20,7 +20,7 @@ from mcap.writer import Writer as PeerWriter
 from rosbags.highlevel import AnyReader
 
 from crosscue.eval.cli import run as crosscue
-from crosscue.replay.columns import Block, CanFrames, Messages, Topic
+from crosscue.replay.columns import Block, CanFrames, Topic
 from crosscue.replay.errors import OutputError
 from crosscue.replay.files.partial_file import PartialFile
 from crosscue.replay.ledger import Ledger
@@ -30,7 +30,6 @@ from support.data import shared
 from support.ros_messages import (
     messages_of,
     random_message,
-    ros1_topic,
     ros2_store,
     ros2_topic,
 )
@@ -141,19 +140,6 @@ def test_full_disk_leaves_no_file_and_one_line_error(
         _write_with_failure(tmp_path / "other.mcap", 3, monkeypatch)
 
 
-def test_existing_files_and_folders_are_not_changed(tmp_path: Path) -> None:
-    (tmp_path / "there.mcap").write_bytes(b"mine")
-    (tmp_path / "folder.mcap").mkdir()
-
-    with pytest.raises(OutputError, match=r"there\.mcap: exists"):
-        McapWriter(tmp_path / "there.mcap")
-    with pytest.raises(OutputError, match="is a folder"):
-        McapWriter(tmp_path / "folder.mcap", overwrite=True)
-    with pytest.raises(OutputError, match=r"there\.mcap"):
-        McapWriter(tmp_path / "there.mcap" / "below.mcap")
-    assert (tmp_path / "there.mcap").read_bytes() == b"mine"
-
-
 def write_source(path: Path, compression: CompressionType = CompressionType.ZSTD) -> None:
     """Write two ROS 2 topics, one invalid definition and one unsupported encoding with mcap."""
     rng = np.random.default_rng(0)
@@ -200,25 +186,6 @@ def test_ros2_messages_are_copied_exactly_and_others_counted(
         assert (
             sum(1 for c, _, raw in reader.messages() if reader.deserialize(raw, c.msgtype)) == 120
         )
-
-
-def test_from_to_and_topics_select_messages(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    source, out = tmp_path / "in.mcap", tmp_path / "out.mcap"
-    write_source(source)
-    part = ["--topics", "/imu", "--from", "10000000000ns", "--to", "20000000000ns"]
-
-    status = crosscue(["convert", str(source), "-o", str(out), *part, "--json"])
-
-    report = json.loads(capsys.readouterr().out)
-    assert status == 0
-    assert {name: row["messages"] for name, row in report["written"].items()} == {"/imu": 10}
-    for account in report["topics"].values():
-        skipped, lost = sum(account["skipped"].values()), sum(account["dropped"].values())
-        assert account["found"] == account["written"] + skipped
-        if account["declared"] is not None:
-            assert account["declared"] == account["found"] + lost
 
 
 @pytest.mark.parametrize(
@@ -268,18 +235,6 @@ def _frames(n: int) -> CanFrames:
     zeros = np.zeros(n, np.uint8)
     no = np.zeros(n, np.bool_)
     return CanFrames(np.zeros(n, np.uint32), no, zeros, zeros, np.zeros((n, 8), np.uint8), no)
-
-
-def test_ros1_topic_with_invalid_definition_is_skipped(tmp_path: Path) -> None:
-    ledger = Ledger("made")
-    topic = ros1_topic("/t", "made_msgs/Thing", "Missing m\n")
-    rows = Messages(np.zeros(4, np.uint8), np.array([0], np.int64), np.array([4], np.int64))
-    with LogWriter(tmp_path / "o.mcap", ledger) as writer:
-        assert not writer.add_topic(topic)
-        assert writer.write(Block("/t", np.zeros(1, np.int64), rows)) == 0
-
-    assert ledger.topic("/t").skipped == {BAD_SCHEMA: 1}
-    assert "made_msgs/msg/Missing" in ledger.details[0].detail
 
 
 @pytest.mark.slow

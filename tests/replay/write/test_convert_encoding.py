@@ -288,11 +288,3 @@ def test_stamps_out_of_ros2_range_are_skipped() -> None:
 
     assert len(out.block) == 1
     assert ledger.topic("/t").skipped == {TIME_MISFIT: 2}
-
-
-def test_unknown_types_have_no_encoder() -> None:
-    encoders = Encoders()
-
-    assert encoders.encoder_for(Topic("/t", "unknown_msgs/msg/T", "cdr")) is None
-    assert encoders.encoder_for(Topic("/t", "unknown_msgs/T", "ros1")) is None
-    assert encoders.encoder_for(Topic("/t", "T", "flatbuffer")) is None

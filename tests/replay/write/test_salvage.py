@@ -95,8 +95,3 @@ def test_chunk_over_max_chunk_is_refused_with_limit(
     # A log with no chunk below the limit has nothing to convert.
     assert status == (3 if command == "info" else 4)
     assert "the limit is 1048" in text
-
-
-def test_negative_max_chunk_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert crosscue(["info", "x.mcap", "--max-chunk", "-1"]) == 2
-    assert "expected MiB" in capsys.readouterr().err

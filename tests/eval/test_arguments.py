@@ -1,8 +1,9 @@
-"""An error of a fit names its argument in Python, and the option on the command line."""
+"""An error of a function names its argument in Python, and the option on the command line."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 import pytest
@@ -88,3 +89,41 @@ def test_error_of_fit_names_argument_or_option(
 
     assert cli.run(line.split()) == 2
     assert capsys.readouterr().err.startswith(f"crosscue: {printed}")
+
+
+# Command lines with a wrong value, and what the error says; no file that they name exists.
+LINES: Final[dict[str, str]] = {
+    "failures run --top 0": "--top 0: expected 1 or more",
+    "failures run --threshold 0.4": "--threshold 0.4: expected 0.5 to 1",
+    "failures run --workers 0": "--workers 0: expected 1 or more",
+    "failures run -o x.csv": "expected a name that ends in",
+    "status a a": "each named once",
+    "tag weather=rain": "no run named",
+    "view run -o drive.mp4": "expected a name that ends in .rrd",
+    "landmarks list db --limit=-1": "--limit -1: expected 0 or more",
+    "landmarks match db x.png --best=0": "--best 0: expected 1 or more",
+    "landmarks list db --near=1,2": "expected x,y,radius in metres",
+    "landmarks list db --near=a,b,c": "expected x,y,radius in metres",
+    "landmarks add db": "expected LOG... with --poses",
+    "landmarks add db --every=far": "--every",
+    "score run --rpe=0": "expected metres, above 0",
+    "fit landmarks --pairs pairs.csv --max-landmarks 0": "--max-landmarks 0: expected 1 or more",
+    "study intersections -o out --layouts A,Z": "expected some of A to H, each once",
+    "study intersections -o out --runs 0": "expected 1 or more",
+    "study intersections -o out --width 100": "expected a multiple of 16",
+    "info x.mcap --max-chunk -1": "expected MiB",
+}
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_wrong_value_is_refused_in_one_line_before_anything_is_read(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    assert cli.run(line.split()) == 2
+
+    error = capsys.readouterr().err
+    assert LINES[line] in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
