@@ -75,6 +75,8 @@ from crosscue.replay.versions import versions_and_commit
 from .clocks import clock_rows
 from .drive_time import camera_timeline, time_segments
 from .empty_result import empty_result, nothing_left
+from .visual import TABLE as VISUAL
+from .visual import VisualPass, uses_pictures, visual_schema
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -164,6 +166,7 @@ def detect_into(
             reading.timeline,
             reading.clock,
             notices=uncounted,
+            visual=VisualPass(vehicle) if uses_pictures(logs, vehicle) else None,
         )
         _run_detectors(reading, runner, tables)
         frames = runner.counts.frames
@@ -461,6 +464,7 @@ class _Tables:
     timeline: Timeline
     clock: LogClock
     notices: list[str] = field(default_factory=list)
+    visual: VisualPass | None = None
     objects: dict[str, int] = field(default_factory=dict)
     masked: dict[str, set[str]] = field(default_factory=dict)
     """Labels of objects reported with a mask, by detector."""
@@ -485,6 +489,8 @@ class _Tables:
     def __enter__(self) -> _Tables:
         with ExitStack() as stack:
             for name, schema in detect_schemas().items():
+                if name == VISUAL and self.visual is None:
+                    continue
                 sink = LabelledSink(self.run, name, schema, self.timeline, self.clock)
                 self._sinks[name] = stack.enter_context(sink)
                 self._held[name] = []
@@ -555,6 +561,8 @@ class _Tables:
                 }
             )
         self._add_cues(result.t_ns, cues)
+        if self.visual is not None and (moved := self.visual(result)) is not None:
+            self._held[VISUAL].append(moved)
         self.drawer(result.t_ns, result.picture, result.found, cues.counts)
         for name, rows in self._held.items():
             if len(rows) > 8192:
@@ -646,6 +654,7 @@ def detect_schemas() -> dict[str, pa.Schema]:
 
     number, text = pa.float64(), pa.string()
     return {
+        VISUAL: visual_schema(),
         "frames": pa.schema(
             [
                 ("frame", pa.int64()),

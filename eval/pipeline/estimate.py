@@ -67,6 +67,7 @@ from .empty_result import empty_result, silent_roles
 from .landmarks import landmark_stage
 from .pose import PoseStage, estimating_of, fused_positions, turn_signal_of
 from .progress import report_time
+from .visual import VisualSource, visual_source
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -189,7 +190,7 @@ def _notices(reading: _Reading, stage: PoseStage, silent: Mapping[Signal, str]) 
     """Return the notices of the run, gaps first."""
     return (
         *gaps_text(reading.timeline.segments),
-        *_missing(reading.planned),
+        *_missing(reading.planned, has_speed=stage.visual is not None),
         *silent.values(),
         *_no_mobileye(reading.found, reading.planned),
         *_no_scene(reading.found, reading),
@@ -324,6 +325,11 @@ class _Reading:
         """The logs in drive time."""
         return [TimedLog(log, self.timeline.clock(i)) for i, log in enumerate(self.logs)]
 
+    def visual(self, run: RunFolder) -> VisualSource | None:
+        """Return the odometry by the pictures, if the run has it and no log has a speed."""
+        has_speed = self.planned.source_of(Signal.WHEEL_SPEEDS) is not None
+        return None if has_speed or self.vehicle.odometry.kind == "wheels" else visual_source(run)
+
     def clock_of(self, signal: Signal) -> LogClock:
         """Return the clock of the log that a signal comes from."""
         source = self.planned.source_of(signal)
@@ -333,6 +339,9 @@ class _Reading:
 def _pose(reading: _Reading, stage: PoseStage, run: RunFolder) -> PoseTally:
     tally = PoseTally()
     timeline, clock = reading.timeline, reading.clock_of(Signal.WHEEL_SPEEDS)
+    visual = reading.visual(run)
+    if visual is not None and reading.found is not None:
+        clock = timeline.clock(reading.found.camera_log)
     with (
         LabelledSink(run, "pose", pose_schema(), timeline, clock) as sink,
         LabelledSink(
@@ -349,7 +358,7 @@ def _pose(reading: _Reading, stage: PoseStage, run: RunFolder) -> PoseTally:
             _write_all(measured, stage.take_measured())
             mobileye.write(window.samples)
             report_time("estimating the pose", timeline, window.end_ns)
-        for poses in stage.finish():
+        for poses in chain(stage.finish(), () if visual is None else stage.follow(visual)):
             sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
             tally.add(poses)
         _write_all(measured, stage.take_measured())
@@ -418,8 +427,8 @@ def _sources(planned: SignalPlan, logs: Sequence[Log]) -> dict[str, str | None]:
     }
 
 
-def _missing(planned: SignalPlan) -> list[str]:
-    """Return notices about missing signals."""
+def _missing(planned: SignalPlan, *, has_speed: bool) -> list[str]:
+    """Return notices about missing signals; ``has_speed`` if the pictures give the speed."""
     names = {
         Signal.WHEEL_SPEEDS: "no wheel speeds, so no pose",
         Signal.MAGNETIC_FIELD: "no compass, so the heading drifts",
@@ -428,7 +437,8 @@ def _missing(planned: SignalPlan) -> list[str]:
     return [
         f"{what}: {planned.missing[signal]}"
         for signal, what in names.items()
-        if signal in planned.missing and not (signal is Signal.MAGNETIC_FIELD and has_heading)
+        if signal in planned.missing
+        and not (has_heading if signal is Signal.MAGNETIC_FIELD else has_speed)
     ]
 
 

@@ -44,6 +44,8 @@ from crosscue.replay.signals.windows import SampleWindow
 from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Timeline, TimeSegment
 from crosscue.replay.vehicle.vehicle import Vehicle
 
+from .visual import VisualSource
+
 # Max plausible fraction of rejected readings; a consistent filter rejects one in a thousand.
 REJECTED_SHARE: Final = 0.1
 # Time for which frames without odometry are kept.
@@ -64,7 +66,7 @@ def turn_signal_of(planned: SignalPlan, vehicle: Vehicle) -> Signal | None:
 
 def odometry_settings(vehicle: Vehicle) -> OdometrySettings:
     """Return the integrator's settings from the vehicle file."""
-    left_out = {"heading_from", "accel_var_m2ps3", "fitted", "scale_sd"}
+    left_out = {"kind", "heading_from", "accel_var_m2ps3", "fitted", "scale_sd"}
     fields = vehicle.odometry.model_dump(exclude=left_out)
     return OdometrySettings(**fields)
 
@@ -164,6 +166,7 @@ class PoseStage:
         started_with: Number of headings used for the first belief.
         turn_early: Number of turn samples before the first wheel speeds.
         timeline: Time segments of the drive.
+        visual: Odometry by the pictures, if it is used.
     """
 
     vehicle: Vehicle
@@ -177,6 +180,7 @@ class PoseStage:
     started_with: int = 0
     turn_early: int = 0
     timeline: Timeline = ONE_SEGMENT
+    visual: VisualSource | None = None
     _pending: Pending = field(default_factory=Pending)
     _state: TrackState | None = None
     _last_ns: int | None = None
@@ -210,6 +214,19 @@ class PoseStage:
         """Yield the rows that waited for more odometry."""
         yield from self._close()
         self._let_go(FOREVER_NS)
+
+    def follow(self, visual: VisualSource) -> Iterator[PoseColumns]:
+        """Yield the rows of odometry by pictures, which needs no integration."""
+        self.visual, increments = visual, visual.increments
+        if not len(increments):
+            return
+        self._start(int(increments.start_ns[0]), float(increments.speed_mps[0]), NO_HEADINGS)
+        assert self._state is not None
+        made = pose_track.advance_pose(self._state, increments, track_settings(self.vehicle))
+        self._state = made.state
+        self._measured.append(odometry_rows(increments))
+        self.track_counts += made.counts
+        yield made.poses
 
     def _let_go(self, before_ns: int) -> None:
         self.landmarks.let_go(before_ns)
@@ -248,6 +265,8 @@ class PoseStage:
 
     def doubts(self) -> list[str]:
         """Return notices about counts that contradict the settings."""
+        if self.visual is not None:
+            return [self.visual.notice()]
         if self._state is None:
             return ["no wheel speed in the selected part, so no pose"]
         counts = self.track_counts
@@ -476,6 +495,8 @@ def estimating_of(stage: PoseStage, frames: tuple[int, int] | None) -> dict[str,
                 "before the first wheel speeds": stage.turn_early,
             },
         )
+    if stage.visual is not None:
+        found["pairs of pictures"] = stage.visual.account()
     if frames is not None:
         found["frames"] = line(*frames, {})
     return {name: one for name, one in found.items() if one.entered}

@@ -51,7 +51,7 @@ MAX_MANIFEST_BYTES: Final = 256 << 20
 _RECORDS: Final = frozenset({MANIFEST, INPUT, FAILURE, LOCK, TAGS, TIMINGS})
 _RUN: Final = re.compile(
     r"drive\.rrd|report\.html|(?:frames|detections|road|skipped|pose|measurements|mobileye_(?:obstacles|lanes)"
-    r"|cues|range|belief|ranged_objects)\.parquet"
+    r"|cues|range|belief|ranged_objects|visual_odometry)\.parquet"
     r"|score/(?:(?:metrics|truth_file|smoother|detector_[\w.-]+)\.json|junit\.xml|(?:truth|estimate)\.tum"
     r"|(?:report|detector_[\w.-]+)\.html|(?:curves|cue_frames|approaches|by_drive)\.parquet"
     r"|pose_(?:plan|error|heading|nees|major_axis)\.png)"

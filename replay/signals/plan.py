@@ -42,6 +42,9 @@ class _Planner:
         return found[0] if found else None
 
     def choose(self, place: tuple[int, Topic], signal: Signal) -> None:
+        if signal is Signal.WHEEL_SPEEDS and self.vehicle.odometry.kind == "visual":
+            self.missing[signal] = 'odometry.kind = "visual"'
+            return
         log, topic = place
         self.chosen.setdefault((log, topic.name), (topic, []))[1].append(signal)
 

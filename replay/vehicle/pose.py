@@ -49,6 +49,11 @@ class Odometry(Section):
     ``crosscue fit odometry`` writes this section.
     """
 
+    kind: Literal["auto", "wheels", "visual"] = "auto"
+    """Source of the speed. ``wheels``: wheel speeds, or a topic with the car's speed. ``visual``:
+    the pictures, by ``camera.focal_px`` and ``camera.z_m``. ``auto``: the pictures only where no
+    log has a speed."""
+
     track_width_m: Positive = 1.55
     wheelbase_m: Positive = 2.7
     wheel_scale: Positive = 1.0
