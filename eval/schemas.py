@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
-import crosscue
+from crosscue.datasets.truth.truth import truth_schema
+from crosscue.eval.pipeline.run import run_schema
 from crosscue.replay.errors import OutputError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
@@ -26,7 +27,7 @@ def run(*, output: SchemaFile = None, overwrite: bool = False) -> dict[str, Any]
         output: File to write (default: print it).
         overwrite: Replace the output.
     """
-    return _written(crosscue.run_schema(), output, overwrite)
+    return _written(run_schema(), output, overwrite)
 
 
 def truth(*, output: SchemaFile = None, overwrite: bool = False) -> dict[str, Any] | None:
@@ -41,7 +42,7 @@ def truth(*, output: SchemaFile = None, overwrite: bool = False) -> dict[str, An
         output: File to write (default: print it).
         overwrite: Replace the output.
     """
-    return _written(crosscue.truth_schema(), output, overwrite)
+    return _written(truth_schema(), output, overwrite)
 
 
 def _written(schema: dict[str, Any], output: Path | None, overwrite: bool) -> dict[str, Any] | None:

@@ -143,6 +143,10 @@ class LossWarning(UserWarning):
     """Rows of a log were dropped; the message is one line."""
 
 
+class PluginWarning(UserWarning):
+    """An installed plug-in does not load and is ignored."""
+
+
 def split_address(scheme: str, rest: str) -> tuple[str, str, str]:
     """Split what follows ``SCHEME://`` into user with ``@``, host with path, and query with ``?``.
 

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Final, Literal, TypeVar
 
+from crosscue.replay.errors import PluginWarning
+
 Kind = Literal["detector", "cue", "reader", "dataset"]
 T = TypeVar("T")
 
@@ -26,10 +28,6 @@ GROUPS: Final[dict[Kind, str]] = {
     "reader": "crosscue.readers",
     "dataset": "crosscue.datasets",
 }
-
-
-class PluginWarning(UserWarning):
-    """An installed plug-in does not load and is ignored."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,8 @@
 """Reference pages made from the code itself: public names, commands, settings, tables.
 
-``{crosscue-names}`` prints every public name in a line, ``{crosscue-commands}`` the help of every
-command, ``{crosscue-settings} MODULE:CLASS`` every field of a settings file with its type, default
+``{crosscue-names}`` prints every public name in a line, ``{crosscue-functions}``,
+``{crosscue-values}`` and ``{crosscue-errors}`` their signatures and docstrings with the records that
+functions take and return, ``{crosscue-commands}`` the help of every command, ``{crosscue-settings} MODULE:CLASS`` every field of a settings file with its type, default
 and meaning, ``{crosscue-tables}`` every column of the tables in a run folder, and
 ``{crosscue-columns}`` every column that a query can use. Nothing of it is written by hand, so none
 can be outdated.
@@ -16,13 +17,15 @@ import inspect
 import io
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from docutils import nodes
 from pydantic import BaseModel
 from sphinx.util.docutils import SphinxDirective
+
+from crosscue.results import Result
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -73,14 +76,94 @@ class Names(SphinxDirective):
         }
         records = {name for name, one in found.items() if isinstance(one, type)} - errors
         blocks: list[nodes.Node] = []
+        modules = {name for name, one in found.items() if inspect.ismodule(one)}
         for title, names in (
-            ("functions", found.keys() - records - errors),
+            ("functions", found.keys() - records - errors - modules),
             ("records", records),
             ("errors", errors),
         ):
             rows = [(f"crosscue.{name}", first_line(found[name])) for name in sorted(names)]
             blocks.append(_table((title, ""), rows))
         return blocks
+
+
+def _function_lines() -> Iterator[str]:
+    """Directives for every public function, with the records that it takes and returns."""
+    import crosscue
+
+    known = {getattr(crosscue, name) for name in crosscue.__all__}
+    for name in sorted(crosscue.__all__):
+        found = getattr(crosscue, name)
+        if not inspect.isfunction(found):
+            continue
+        yield f".. autofunction:: crosscue.{name}"
+        for record in _records(found.__annotations__.values()):
+            if record not in known:
+                known.add(record)
+                yield from _class_lines(f"{record.__module__}.{record.__name__}", record)
+
+
+def _value_lines() -> Iterator[str]:
+    """Directives for every public class that is no error, and what reading a log returns."""
+    import crosscue
+
+    for name in sorted(crosscue.__all__):
+        found = getattr(crosscue, name)
+        if isinstance(found, type) and not issubclass(found, BaseException):
+            yield from _class_lines(f"crosscue.{name}", found)
+    module = import_module(crosscue.Log.__module__)
+    for name in ("Topics", "LogTopic", "CameraFrame", "Signals", "UnopenedLog"):
+        yield from _class_lines(f"{module.__name__}.{name}", getattr(module, name))
+
+
+def _error_lines() -> Iterator[str]:
+    """Directives for every error, in the order in which they are defined."""
+    from crosscue.replay import errors
+
+    for name, found in vars(errors).items():
+        if isinstance(found, type) and issubclass(found, Exception):
+            yield f".. autoexception:: crosscue.errors.{name}"
+
+
+def _class_lines(place: str, found: type) -> Iterator[str]:
+    """A class, its properties, and its methods but those for the printer."""
+    yield f".. autoclass:: {place}()"
+    members = [
+        name
+        for name, member in vars(found).items()
+        if not name.startswith("_")
+        and (inspect.isroutine(member) or isinstance(member, property | functools.cached_property))
+        and name not in ("lines", "messages", "cells", "as_dict", "exit_status", "reported")
+    ]
+    if members:
+        yield f"   :members: {', '.join(members)}"
+    if "__call__" in vars(found):
+        yield "   :special-members: __call__"
+
+
+def _records(annotations: Iterable[object]) -> Iterator[type]:
+    """The records of ours in some annotations."""
+    for one in annotations:
+        yield from _records(typing.get_args(one))
+        is_ours = isinstance(one, type) and one.__module__.startswith("crosscue.")
+        if is_ours and (dataclasses.is_dataclass(one) or issubclass(one, Result)):
+            yield one
+
+
+GENERATED: Final = {
+    "crosscue-functions": _function_lines,
+    "crosscue-values": _value_lines,
+    "crosscue-errors": _error_lines,
+}
+
+
+def _write_reference(app: Sphinx, page: str, source: list[str]) -> None:
+    """Replace the directives of the generated reference by those of autodoc."""
+    for name, lines in GENERATED.items():
+        mark = f"```{{{name}}}\n```"
+        if mark in source[0]:
+            block = "\n".join(["```{eval-rst}", *lines(), "```"])
+            source[0] = source[0].replace(mark, block)
 
 
 def first_line(documented: object) -> str:
@@ -257,6 +340,7 @@ def setup(app: Sphinx) -> dict[str, object]:
     app.add_directive("crosscue-columns", Columns)
     app.connect("autodoc-process-docstring", _keep_examples, priority=400)
     app.connect("builder-inited", _show_plain_types)
+    app.connect("source-read", _write_reference)
     app.add_directive("crosscue-commands", Commands)
     app.add_directive("crosscue-names", Names)
     app.add_directive("crosscue-settings", SettingsFile)

@@ -13,6 +13,7 @@ import torch
 import crosscue
 from crosscue.detectors.networks.mask_rcnn.checkpoint import load_checkpoint
 from crosscue.detectors.training.annotations import mask_of, read_training_coco
+from crosscue.eval.training.mask_rcnn import MaskRcnnTrainingSettings
 from support.mask_rcnn import write_bars
 
 MASK_HEAD = ("roi_heads.mask_head.", "roi_heads.mask_predictor.")
@@ -51,7 +52,7 @@ def test_annotation_without_mask_is_read(tmp_path: Path, absent: object) -> None
 
 @pytest.mark.slow
 def test_previously_trained_mask_head_keeps_its_masks(tmp_path: Path) -> None:
-    masked = crosscue.MaskRcnnTrainingSettings(
+    masked = MaskRcnnTrainingSettings(
         data=write_bars(tmp_path / "a", 2),
         images=tmp_path / "a" / "images",
         classes=["car"],
@@ -64,7 +65,7 @@ def test_previously_trained_mask_head_keeps_its_masks(tmp_path: Path) -> None:
     first = crosscue.train_mask_rcnn(masked, tmp_path / "first.safetensors")
     bare = write_bars(tmp_path / "b", 2)
     _without_masks(bare)
-    later = crosscue.MaskRcnnTrainingSettings(
+    later = MaskRcnnTrainingSettings(
         data=bare,
         images=tmp_path / "b" / "images",
         init=first.path,

@@ -285,7 +285,7 @@ def test_card_that_contradicts_its_weights_is_refused(
     assert old in text
     card.write_text(text.replace(old, new), encoding="utf-8")
 
-    with pytest.raises(crosscue.VehicleError) as error:
+    with pytest.raises(crosscue.errors.VehicleError) as error:
         build(card=str(card))
 
     assert message in str(error.value)
@@ -325,7 +325,9 @@ def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     state[MEAN] = torch.full((672,), torch.nan)
     torch.save(state, tmp_path / "my.pth")
 
-    with pytest.raises(crosscue.VehicleError, match=f"{MEAN}: holds values that are not finite"):
+    with pytest.raises(
+        crosscue.errors.VehicleError, match=f"{MEAN}: holds values that are not finite"
+    ):
         crosscue.draft_card(tmp_path / "my.pth", class_names=NAMES)
 
     assert sorted(one.name for one in tmp_path.iterdir()) == ["my.pth"]

@@ -12,6 +12,7 @@ import crosscue
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.cli import run
+from crosscue.eval.drives.many import find_drives
 from crosscue.replay.logs.log_part import LogPart
 from crosscue.replay.progress import Progress, watching
 
@@ -84,7 +85,7 @@ def test_replay_drives_function_matches_the_command(
     assert reported[-1] == Progress("replaying, 1 failed", 2, 2, "drives")
     assert "drives   1 of 2, 1 failed" in repr(done)
     assert done.merged == out / "merged"
-    assert crosscue.find_drives(drives).is_many
+    assert find_drives(drives).is_many
     pattern = str(drives / "monday" / "*.mcap")
     assert run(["replay", pattern, "-o", str(out), "--to", "2.0", "--json"]) == 0
     assert [one["earlier"] for one in json.loads(capsys.readouterr().out)["drives"]] == [True]

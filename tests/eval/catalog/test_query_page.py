@@ -8,6 +8,7 @@ import pytest
 
 import crosscue
 from crosscue.eval import cli
+from crosscue.eval.catalog.query.catalog import Catalog
 from crosscue.eval.runs.account import Account, Line
 from support.catalog_runs import add_run, runs_below
 from support.manifests import detected
@@ -28,7 +29,7 @@ PAGE_QUERIES: Final = re.findall(r"```sql\n(.*?)```", PAGE.read_text(encoding="u
 
 
 @pytest.fixture(scope="module")
-def catalog(tmp_path_factory: pytest.TempPathFactory) -> crosscue.Catalog:
+def catalog(tmp_path_factory: pytest.TempPathFactory) -> Catalog:
     """Small runs with data for all queries: one approach each, in rain, within 30 m."""
     folder = tmp_path_factory.mktemp("fleet")
     runs = runs_below(folder / "runs")
@@ -53,11 +54,11 @@ def catalog(tmp_path_factory: pytest.TempPathFactory) -> crosscue.Catalog:
 
 
 @pytest.mark.parametrize("sql", PAGE_QUERIES, ids=range(1, len(PAGE_QUERIES) + 1))
-def test_query_of_the_page_returns_rows(catalog: crosscue.Catalog, sql: str) -> None:
+def test_query_of_the_page_returns_rows(catalog: Catalog, sql: str) -> None:
     assert catalog.query(sql).num_rows > 0
 
 
-def test_queries_of_the_page_return_expected_rows(catalog: crosscue.Catalog) -> None:
+def test_queries_of_the_page_return_expected_rows(catalog: Catalog) -> None:
     def rows(number: int) -> list[dict[str, Any]]:
         return list(catalog.query(PAGE_QUERIES[number - 1]).to_pylist())
 

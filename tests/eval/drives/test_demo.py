@@ -12,6 +12,7 @@ import crosscue
 from crosscue.datasets.real import annotate_pandaset, recordings
 from crosscue.detectors.catalog import places
 from crosscue.eval.cli import run
+from crosscue.eval.drives.demo import fetch_drive
 from support.data import shared
 from support.range_server import serving
 from support.stand_in import StandIn, stand_in
@@ -53,7 +54,7 @@ def test_file_of_wrong_checksum_is_not_kept(stand_in_drive: StandIn, name: str) 
     stand_in_drive.server.files[name] = stand_in_drive.server.files[name][:-1] + b"\0"
 
     with pytest.raises(crosscue.CrosscueError, match="expected SHA-256"):
-        crosscue.fetch_drive()
+        fetch_drive()
 
     below = (recordings.recording_folder(stand_in_drive.known), places.model_folder())
     names = [path.name for folder in below for path in folder.rglob("*")]

@@ -13,10 +13,12 @@ import pytest
 import crosscue
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.detectors.training.annotations import read_training_coco as read_to_train
+from crosscue.eval.failures.imported_truth import ImportedLabels
 from crosscue.eval.failures.record import Failure
 from crosscue.eval.fit.truth_check import check_truth
 from crosscue.eval.runs.folder import write_manifest
 from crosscue.eval.runs.manifest import EstimateManifest
+from crosscue.eval.training.mask_rcnn import MaskRcnnTrainingSettings
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.progress import watching
 from support.scene_run import SIZE, scene_run
@@ -77,7 +79,7 @@ def test_corrected_boxes_are_imported_and_used_for_training_and_fitting(
 
     corrected_file = write_corrected(exported, tmp_path / "corrected.json", wider)
     found = crosscue.import_truth(corrected_file, tmp_path / "labelled", export=exported.parent)
-    assert isinstance(found, crosscue.ImportedLabels)
+    assert isinstance(found, ImportedLabels)
 
     (drive,) = found.drives.values()
     assert found.missing == 0
@@ -97,7 +99,7 @@ def test_corrected_boxes_are_imported_and_used_for_training_and_fitting(
     assert [one.name for one in fitted.classes] == ["car"]
     assert fitted.fitted_to + fitted.held_out == len(objects.pictures)
     # One step of training uses the same file.
-    settings = crosscue.MaskRcnnTrainingSettings(
+    settings = MaskRcnnTrainingSettings(
         data=found.coco, images=found.images, classes=("car",), steps=1, batch=1, check_images=1
     )
     small = replace(settings, width_px=SIZE[0], window_px=(64, 64), device="cpu")

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import crosscue
+from crosscue.eval.failures.browse import Site
 from support.scene_run import scene_run
 from support.scoring import truth_folder
 
@@ -31,14 +32,14 @@ class Links(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def site_of_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, crosscue.Site]:
+def site_of_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Site]:
     folder = tmp_path_factory.mktemp("site")
     run, truth = scene_run(folder).path, truth_folder(folder / "truth")
     return folder, crosscue.browse(run, folder / "site", truth=truth)
 
 
 def test_all_links_resolve_and_each_failure_has_page_and_picture(
-    site_of_run: tuple[Path, crosscue.Site],
+    site_of_run: tuple[Path, Site],
 ) -> None:
     folder, site = site_of_run
     pages = sorted((folder / "site").rglob("*.html"))
@@ -51,14 +52,14 @@ def test_all_links_resolve_and_each_failure_has_page_and_picture(
     assert small == large
 
 
-def test_names_are_escaped_in_pages(site_of_run: tuple[Path, crosscue.Site]) -> None:
+def test_names_are_escaped_in_pages(site_of_run: tuple[Path, Site]) -> None:
     folder, _ = site_of_run
     for page in (folder / "site").rglob("*.html"):
         assert "<img src=x" not in page.read_text()
 
 
 def test_site_of_failure_table_has_only_its_failures(
-    site_of_run: tuple[Path, crosscue.Site], tmp_path: Path
+    site_of_run: tuple[Path, Site], tmp_path: Path
 ) -> None:
     folder, _ = site_of_run
     truth = folder / "truth"

@@ -213,8 +213,8 @@ def test_class_without_labelled_box_is_not_labelled(tmp_path: Path) -> None:
             "class 7, but 2 class names",
         ),
         ({"frame_1.txt": "0 .5 .5 nan .2"}, {}, crosscue.CrosscueError, "expected numbers"),
-        ({"frame_1.txt": "0 5 5 .2 .2"}, {}, crosscue.EmptyResultError, "no box of a class"),
-        ({"frame_1.txt": ""}, {}, crosscue.EmptyResultError, "no box of a class"),
+        ({"frame_1.txt": "0 5 5 .2 .2"}, {}, crosscue.errors.EmptyResultError, "no box of a class"),
+        ({"frame_1.txt": ""}, {}, crosscue.errors.EmptyResultError, "no box of a class"),
         ({}, {}, crosscue.CrosscueError, "no labels of boxes"),
     ],
 )

@@ -82,7 +82,7 @@ def test_signals_are_tables_by_message_with_units(drive: DriveFiles) -> None:
         assert [*log.signals(dbc, messages=[name])] == [name]
         with pytest.raises(crosscue.UsageError, match="messages"):
             log.signals(dbc, messages=["NOT_THERE"])
-        with pytest.raises(crosscue.MissingTopicError, match="did you mean"):
+        with pytest.raises(crosscue.errors.MissingTopicError, match="did you mean"):
             signals[name + "x"]
 
 
@@ -107,7 +107,7 @@ def test_losses_raise_warning_and_are_recorded_in_table_metadata(
     [
         ((), crosscue.UsageError),
         (("gone.mcap",), crosscue.LogError),
-        (("x.unknown",), crosscue.UnknownFormatError),
+        (("x.unknown",), crosscue.errors.UnknownFormatError),
     ],
 )
 def test_unreadable_paths_raise_crosscue_errors(

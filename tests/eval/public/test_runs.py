@@ -7,6 +7,7 @@ import pytest
 
 import crosscue
 from crosscue.datasets.simulated.log_files import DriveFiles
+from crosscue.detectors.signs.templates import draw_sign
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def test_run_exposes_its_tables_and_notices(run: crosscue.Run) -> None:
     assert notes
     assert [line.split()[0] for line in lines[: -len(notes)]] == list(run.tables)
     assert lines[-len(notes) :] == notes
-    with pytest.raises(crosscue.RunError, match="there are: "):
+    with pytest.raises(crosscue.errors.RunError, match="there are: "):
         run["nonsense"]
 
 
@@ -72,13 +73,13 @@ def test_estimate_with_other_settings_is_written_to_another_folder(
     assert crosscue.compare_runs(run, run.path).tables_same == len(before)
     longer = other.pose["travelled_m"][-1].as_py() / run.pose["travelled_m"][-1].as_py()
     assert longer == pytest.approx(1.1, rel=1e-3)
-    with pytest.raises(crosscue.OutputError, match="exists"):
+    with pytest.raises(crosscue.errors.OutputError, match="exists"):
         crosscue.estimate_run(run, vehicle, other.path)
     with pytest.raises(crosscue.UsageError, match="next to the run"):
         crosscue.estimate_run(run, vehicle, run.path / "inside")
 
 
 def test_known_sign_is_drawn_and_unknown_sign_refused() -> None:
-    assert crosscue.draw_sign("one way left", 48).ndim == 2
+    assert draw_sign("one way left", 48).ndim == 2
     with pytest.raises(crosscue.UsageError, match="one way left"):
-        crosscue.draw_sign("one way up", 48)
+        draw_sign("one way up", 48)

@@ -9,6 +9,8 @@ import pytest
 
 import crosscue
 from crosscue.eval.cli import run
+from crosscue.eval.training.mask_rcnn import MaskRcnnTrainingSettings
+from crosscue.eval.training.road import RoadTrainingSettings
 from crosscue.replay.progress import Progress, watching
 
 
@@ -37,13 +39,13 @@ def test_training_frames_equal_those_of_the_command(
 
 
 def test_invalid_training_settings_are_refused_before_writing(tmp_path: Path) -> None:
-    road = crosscue.RoadTrainingSettings(layouts=["L1"], width_px=130)
-    masks = crosscue.MaskRcnnTrainingSettings(data="gone", images="gone", window_px=(65, 64))
+    road = RoadTrainingSettings(layouts=["L1"], width_px=130)
+    masks = MaskRcnnTrainingSettings(data="gone", images="gone", window_px=(65, 64))
 
     with pytest.raises(crosscue.UsageError, match="multiple of 16"):
         crosscue.train_road(road, tmp_path / "a.safetensors")
     with pytest.raises(crosscue.UsageError, match="multiples of 32"):
         crosscue.train_mask_rcnn(masks, tmp_path / "a.safetensors")
     with pytest.raises(crosscue.UsageError, match="expected --test-layouts"):
-        crosscue.train_road(crosscue.RoadTrainingSettings(), measure="embedded")
+        crosscue.train_road(RoadTrainingSettings(), measure="embedded")
     assert not [*tmp_path.iterdir()]
