@@ -1,9 +1,10 @@
 """Reference pages made from the code itself: public names, commands, settings, tables.
 
-``{crosscue-names}`` prints every public name in a line, ``{crosscue-functions}``,
-``{crosscue-values}`` and ``{crosscue-errors}`` their signatures and docstrings with the records that
-functions take and return, ``{crosscue-commands}`` the help of every command, ``{crosscue-settings} MODULE:CLASS`` every field of a settings file with its type, default
-and meaning, ``{crosscue-tables}`` every column of the tables in a run folder, and
+``{crosscue-names}`` prints every public name in a line; ``{crosscue-functions}``,
+``{crosscue-values}`` and ``{crosscue-errors}`` their signatures and docstrings, with the records
+that functions take and return; ``{crosscue-commands}`` the help of every command;
+``{crosscue-settings} MODULE:CLASS`` every field of a settings file with its type, default and
+meaning; ``{crosscue-tables}`` every column of the tables in a run folder; and
 ``{crosscue-columns}`` every column that a query can use. Nothing of it is written by hand, so none
 can be outdated.
 """
@@ -112,7 +113,7 @@ def _value_lines() -> Iterator[str]:
         if isinstance(found, type) and not issubclass(found, BaseException):
             yield from _class_lines(f"crosscue.{name}", found)
     module = import_module(crosscue.Log.__module__)
-    for name in ("Topics", "LogTopic", "CameraFrame", "Signals", "UnopenedLog"):
+    for name in ("Topics", "LogTopic", "CameraFrame", "Signals"):
         yield from _class_lines(f"{module.__name__}.{name}", getattr(module, name))
 
 
@@ -323,16 +324,19 @@ def _show_plain_types(app: Sphinx) -> None:
     # Before the types are replaced: the help of commands needs the options in them.
     for command in COMMANDS:
         _help(command)
+    records: set[type] = set()
     for found in map(crosscue.__getattr__, crosscue.__all__):
         if isinstance(found, types.FunctionType):
             found.__annotations__ = types_of(found)
-        elif dataclasses.is_dataclass(found):
-            for kind in filter(dataclasses.is_dataclass, found.__mro__):
-                # A class with types that only type checkers know has no options either.
-                with contextlib.suppress(NameError):
-                    plain = typing.get_type_hints(kind)
-                    kind.__annotations__ = {name: plain[name] for name in kind.__annotations__}
-                    kind.__init__.__annotations__ = plain
+            records |= {*_records(found.__annotations__.values())}
+        elif dataclasses.is_dataclass(found) and isinstance(found, type):
+            records.add(found)
+    for kind in {kind for one in records for kind in one.__mro__ if dataclasses.is_dataclass(kind)}:
+        # A class with types that only type checkers know has no options either.
+        with contextlib.suppress(NameError):
+            plain = typing.get_type_hints(kind)
+            kind.__annotations__ = {name: plain[name] for name in kind.__annotations__}
+            kind.__init__.__annotations__ = plain
 
 
 def setup(app: Sphinx) -> dict[str, object]:
