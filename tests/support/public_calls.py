@@ -12,6 +12,7 @@ import types
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any, Final
 
 import crosscue
@@ -53,6 +54,12 @@ class Check:
                     self.known[alias.asname or "crosscue"] = crosscue
             return
         if isinstance(node, ast.ImportFrom):
+            homes = crosscue._former_names()
+            # A record or a helper that the reference describes under its module.
+            if all(homes.get(alias.name) == node.module for alias in node.names):
+                module = import_module(node.module or "")
+                self.known |= {one.name: getattr(module, one.name) for one in node.names}
+                return
             self._import(node, node.module or "")
             module = PUBLIC.get(node.module or "")
             for alias in node.names if module else ():
