@@ -14,7 +14,6 @@ with the count None. The log is then incomplete, and the summary reports "at lea
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -23,7 +22,8 @@ from typing import Final, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import AccountError, LossWarning
+from .errors import AccountError
+from .losses import warn_of_loss
 
 # Maximum number of skips and losses stored with their details; counts stay exact beyond it.
 DETAILS_KEPT: Final = 1000
@@ -299,12 +299,14 @@ class Ledger:
             self.details.append(detail)
 
 
-def warn_of(ledger: Ledger) -> None:
-    """Issue a ``LossWarning`` for each recorded loss of a log."""
+def warn_of(ledger: Ledger, topic: str | None = None) -> None:
+    """Issue a ``LossWarning`` for each recorded loss of a log, or of one topic and unknown ones."""
     for drop in ledger.drops():
+        if topic is not None and drop.topic not in (topic, ""):
+            continue
         detail = f" ({drop.detail})" if drop.detail else ""
         text = f"{ledger.log}: {drop.topic or 'unknown topics'}: {drop.reason}{detail}"
-        warnings.warn(text, LossWarning, stacklevel=3)
+        warn_of_loss(text)
 
 
 class ReversedTimes:

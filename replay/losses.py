@@ -6,6 +6,7 @@ and exits with status 3.
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -30,7 +31,15 @@ def with_losses(work: Callable[[T], R], one: T) -> tuple[R, tuple[str, ...]]:
 def warn_again(losses: Iterable[str]) -> None:
     """Issue warnings for losses that were collected in another process."""
     for loss in losses:
-        warnings.warn(loss, LossWarning, stacklevel=3)
+        warn_of_loss(loss)
+
+
+def warn_of_loss(loss: str) -> None:
+    """Issue a ``LossWarning`` at the line outside crosscue that led to it."""
+    level, frame = 1, inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").startswith("crosscue."):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(loss, LossWarning, stacklevel=level)
 
 
 @contextmanager

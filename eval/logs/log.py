@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -19,7 +18,7 @@ from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.decode.packets import PacketDecoder, is_stream
-from crosscue.replay.errors import LossWarning, MissingTopicError, SchemaError, UsageError
+from crosscue.replay.errors import MissingTopicError, SchemaError, UsageError
 from crosscue.replay.files.closing import Closing
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger, TopicAccount, warn_of
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits, LimitsGiven
@@ -27,6 +26,7 @@ from crosscue.replay.logs.log_part import LogPart, select_part
 from crosscue.replay.logs.opening import open_log as open_one
 from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.logs.topic_part import topic_columns
+from crosscue.replay.losses import warn_of_loss
 from crosscue.results import listing
 from crosscue.verb import Option
 
@@ -565,11 +565,11 @@ def _account(of: TopicAccount) -> dict[str, object]:
 
 def _warn(ledger: Ledger, topic: str) -> None:
     """Warn about rows that are dropped or cannot be decoded."""
-    warn_of(ledger)
+    warn_of(ledger, topic)
     for reason, count in sorted(ledger.topic(topic).skipped.items()):
         if reason not in NOT_ASKED:
             text = f"{ledger.log}: {topic}: {count} rows skipped: {reason}"
-            warnings.warn(text, LossWarning, stacklevel=4)
+            warn_of_loss(text)
 
 
 def vehicle_of(log: Log | UnopenedLog | Path | str, given: Vehicle | Path | str | None) -> Vehicle:

@@ -412,13 +412,6 @@ def test_error_names_topic_and_both_counts() -> None:
     )
 
 
-def _opened_by_user(ledger: Ledger) -> None:
-    def opened() -> None:
-        warn_of(ledger)
-
-    opened()
-
-
 def test_each_loss_is_one_warning() -> None:
     ledger = Ledger("a.log")
     ledger.skip("/t", "not a loss")
@@ -427,20 +420,10 @@ def test_each_loss_is_one_warning() -> None:
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        _opened_by_user(ledger)
+        warn_of(ledger)
 
     assert [str(one.message) for one in caught] == [
         "a.log: /t: cut (at byte 9)",
         "a.log: unknown topics: torn",
     ]
     assert {one.category for one in caught} == {LossWarning}
-
-
-def test_warning_is_at_the_line_of_the_user_who_opened_the_log() -> None:
-    ledger = Ledger("a.log")
-    ledger.drop("/t", "cut", 1)
-
-    with pytest.warns(LossWarning) as caught:
-        _opened_by_user(ledger)
-
-    assert {one.lineno for one in caught} == {_opened_by_user.__code__.co_firstlineno + 4}

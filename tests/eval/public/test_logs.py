@@ -93,8 +93,13 @@ def test_losses_raise_warning_and_are_recorded_in_table_metadata(
     recorded = drive.log.read_bytes()
     cut.write_bytes(recorded[: len(recorded) // 2])
 
-    with crosscue.open(cut) as log, pytest.warns(crosscue.LossWarning):
+    with crosscue.open(cut) as log, pytest.warns(crosscue.LossWarning) as caught:
         table = log["/can"].table()
+
+    # At the user's line, and about nothing that the user did not read.
+    assert {Path(one.filename).name for one in caught} == {Path(__file__).name}
+    about = [str(one.message).removeprefix(f"{cut}: ") for one in caught]
+    assert all(text.startswith(("/can: ", "unknown topics: ")) for text in about)
 
     reported = json.loads(table.schema.metadata[b"crosscue"])[str(cut)]
     assert reported["used"] == len(table)
