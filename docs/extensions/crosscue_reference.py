@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from docutils import nodes
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 from sphinx.util.docutils import SphinxDirective
 
 from crosscue.results import Result
@@ -223,8 +224,15 @@ def _fields(model: type[BaseModel]) -> Iterator[tuple[str, str, str, str]]:
             name,
             _type_name(field.annotation),
             default,
-            " ".join((field.description or "").split()),
+            _meaning(field),
         )
+
+
+def _meaning(field: FieldInfo) -> str:
+    """What the field is; of a section, its summary."""
+    described = " ".join((field.description or "").split())
+    inner = _models_in(field.annotation)
+    return described or (_summary(inner[0]) if inner else "")
 
 
 def _type_name(annotation: Any) -> str:

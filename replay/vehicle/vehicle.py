@@ -314,7 +314,9 @@ class Vehicle(Section):
     """A complete vehicle file."""
 
     version: Literal[1]
+    """Version of the file's format."""
     name: str = "unnamed"
+    """Name of the car, for reports."""
     topics: Topics = Topics()
     can: Can = Can()
     mobileye: Mobileye = Mobileye()
@@ -333,6 +335,7 @@ class Vehicle(Section):
     past: Past = Past()
     fusion: Annotated[Fusion, Field(validate_default=True)] = Fusion()
     detectors: dict[str, DetectorSection] = Field(default_factory=dict)
+    """Settings of each detector, by its name."""
     lost_above_m: Positive = 100.0
     """Maximum full major axis of the 2-sigma ellipse; above it, the pose is reported as lost."""
 
