@@ -306,6 +306,7 @@ def _manifest(
             *_without_thresholds(tables.detectors, vehicle),
             *_without_masks(tables.boxes_only, vehicle),
             *tables.notices,
+            *tables.size_notices(),
         ),
     )
 
@@ -463,7 +464,7 @@ class _Tables:
     is_for_signs: Sequence[bool]
     timeline: Timeline
     clock: LogClock
-    notices: list[str] = field(default_factory=list)
+    notices: list[str]
     visual: VisualPass | None = None
     objects: dict[str, int] = field(default_factory=dict)
     masked: dict[str, set[str]] = field(default_factory=dict)
@@ -474,7 +475,7 @@ class _Tables:
     _open: ExitStack = field(default_factory=ExitStack)
     roles: dict[str, DetectorRole] = field(default_factory=dict)
     _held: dict[str, list[dict[str, object]]] = field(default_factory=dict)
-    _size: tuple[int, int] | None = None
+    _sizes: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
     _frame: int = -1
     _meanings: dict[str, str] = field(default_factory=dict)
     _min_scores: list[dict[str, float]] = field(default_factory=list)
@@ -505,14 +506,18 @@ class _Tables:
             for name in self._sinks:
                 self._write(name)
 
+    def size_notices(self) -> list[str]:
+        """Return a notice on the sizes of the pictures, if there are several."""
+        each = [
+            f"{number:,} of {wide} x {high} px from {first_ns} ns on"
+            for (wide, high), (number, first_ns) in self._sizes.items()
+        ]
+        return [f"{self.camera}: pictures of several sizes: {', '.join(each)}"] if each[1:] else []
+
     def add(self, result: FrameResult) -> None:
         """Add the rows of one frame."""
-        if self._size not in (None, result.size_px):
-            self.notices.append(
-                f"{self.camera}: pictures of {self._size} became {result.size_px} px at "
-                f"{result.t_ns} ns"
-            )
-        self._size = result.size_px
+        number, first_ns = self._sizes.get(result.size_px, (0, result.t_ns))
+        self._sizes[result.size_px] = number + 1, first_ns
         self._frame += 1
         if self._frame == 0:
             self.vehicle.camera.check_size(result.size_px)

@@ -182,7 +182,9 @@ def test_change_of_picture_size_is_handled_and_reported(tmp_path: Path) -> None:
 
     found = open_run(out).table("detections")
     assert found["picture_width_px"].to_pylist() == [64, 64, 64, 64, 128]
-    assert "(64, 48) became (128, 96)" in open_run(out).drive_manifest().notices[0]
+    (notice,) = [one for one in open_run(out).drive_manifest().notices if "sizes" in one]
+    assert "pictures of several sizes: 4 of 64 x 48 px from" in notice
+    assert "1 of 128 x 96 px from" in notice
 
 
 OTHER_SIZES = {
