@@ -13,6 +13,8 @@ from . import rle
 
 # Score above which a detection is a cue, where vehicle file and detector set no other.
 MIN_SCORE: Final = 0.5
+# Decision on a detection whose track over frames is accepted.
+ACCEPTED: Final = "accepted"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,10 @@ class Detections:
             other than traffic lights; an empty tuple where lenses were not examined.
         min_scores: Shape (N,): the score that each must exceed to be a cue, as set by its
             detector; None where the detector sets no thresholds.
+        looks: N results of the second look at stop signs (``detectors.signs.second_look``), empty
+            for other objects; an empty tuple where there was none.
+        decisions: N decisions by tracks over frames: ``ACCEPTED``, or why the detection is no cue;
+            empty for objects that are decided by their score. An empty tuple without tracks.
     """
 
     t_ns: int
@@ -84,6 +90,8 @@ class Detections:
     masks: tuple[bytes, ...]
     lenses: tuple[str, ...] = ()
     min_scores: NDArray[np.float64] | None = None
+    looks: tuple[str, ...] = ()
+    decisions: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Reject columns of unequal length and values that are not finite.
@@ -98,8 +106,9 @@ class Detections:
             raise ValueError(f"scores: expected ({n},), got {self.scores.shape}")
         if len(self.masks) != n:
             raise ValueError(f"masks: expected {n}, got {len(self.masks)}")
-        if len(self.lenses) not in (0, n):
-            raise ValueError(f"lenses: expected {n} or none, got {len(self.lenses)}")
+        for name in ("lenses", "looks", "decisions"):
+            if len(getattr(self, name)) not in (0, n):
+                raise ValueError(f"{name}: expected {n} or none, got {len(getattr(self, name))}")
         if self.min_scores is not None and self.min_scores.shape != (n,):
             raise ValueError(f"min_scores: expected ({n},), got {self.min_scores.shape}")
         if not (np.isfinite(self.boxes_px).all() and np.isfinite(self.scores).all()):
@@ -138,13 +147,18 @@ class Detections:
         return self.taken(self.scores >= score)
 
     def are_sure(self, setting: float | None) -> NDArray[np.bool_]:
-        """Mark the detections whose score is high enough to be a cue, shape (N,).
+        """Mark the detections that are a cue, by their score or by a track's decision, shape (N,).
 
         Args:
             setting: The vehicle file's threshold; None uses the detector's.
         """
         min_score = self.min_scores if setting is None else setting
-        return np.asarray(self.scores > (MIN_SCORE if min_score is None else min_score))
+        are_sure = np.asarray(self.scores > (MIN_SCORE if min_score is None else min_score))
+        if not self.decisions:
+            return are_sure
+        decided = np.array([one == ACCEPTED for one in self.decisions], np.bool_)
+        is_open = np.array([not one for one in self.decisions], np.bool_)
+        return np.where(is_open, are_sure, decided)
 
     def with_min_scores(self, by_label: Mapping[str, float]) -> Self:
         """The same detections with their detector's thresholds, by label."""
@@ -165,12 +179,26 @@ class Detections:
             tuple(self.masks[i] for i in keep),
             tuple(self.lenses[i] for i in keep) if self.lenses else (),
             None if self.min_scores is None else self.min_scores[keep],
+            tuple(self.looks[i] for i in keep) if self.looks else (),
+            tuple(self.decisions[i] for i in keep) if self.decisions else (),
         )
 
 
 def nothing_found(frame: Frame) -> Detections:
     """Return an empty result for a frame."""
     return Detections(frame.t_ns, frame.size_px, np.empty((0, 4)), np.empty(0), (), ())
+
+
+def is_repeated(before: Sequence[Detections], now: Sequence[Detections]) -> bool:
+    """Whether two frames have the same results and at least one detection: one picture, twice."""
+    if len(before) != len(now) or not any(map(len, now)):
+        return False
+    return all(
+        one.labels == other.labels
+        and np.array_equal(one.boxes_px, other.boxes_px)
+        and np.array_equal(one.scores, other.scores)
+        for one, other in zip(before, now, strict=True)
+    )
 
 
 @dataclass(frozen=True, slots=True)

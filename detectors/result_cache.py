@@ -124,6 +124,7 @@ def _as_json(found: Found) -> dict[str, Any]:
         "labels": found.labels,
         "masks": [mask.decode("ascii") for mask in found.masks],
         "lenses": found.lenses,
+        "looks": found.looks,
     }
 
 
@@ -141,4 +142,5 @@ def _from_json(kept: dict[str, Any]) -> Found:
         tuple(kept["labels"]),
         tuple(mask.encode("ascii") for mask in kept["masks"]),
         tuple(kept["lenses"]),
+        looks=tuple(kept["looks"]),
     )

@@ -12,8 +12,9 @@ from crosscue.replay.errors import CrosscueError, LogError, UsageError, one_line
 
 from .base import Detections, Detector, Found, Frame, View, fault_of, reportable
 from .images import NOT_DECODED, Encoded, decode, encoded, picture_size, reduction
-from .ranging.lens import VERSION, with_lenses
+from .ranging import lens
 from .result_cache import ResultCache, picture_key
+from .signs import second_look
 
 # Number of pictures decoded and passed to a detector at a time.
 BATCH: Final = 8
@@ -78,6 +79,7 @@ class Runner:
         depth_bits: Number of bits that the camera uses in a 16-bit picture.
         on_skip: Called with the time and reason of each picture that cannot be decoded.
         light_labels: Labels of traffic lights, whose lenses are examined.
+        sign_labels: Labels of stop signs, at which a second look is taken.
         is_one_size: True to skip pictures of another size than the first, because the camera's
             intrinsics are for one size.
         counts: Account of all frames so far.
@@ -89,6 +91,7 @@ class Runner:
     depth_bits: int
     on_skip: Callable[[int, str, str], None]
     light_labels: tuple[str, ...] = ()
+    sign_labels: tuple[str, ...] = ()
     is_one_size: bool = False
     counts: FrameCounts = field(default_factory=FrameCounts)
     _size_px: tuple[int, int] | None = None
@@ -183,13 +186,21 @@ class Runner:
             if fault is not None:
                 raise UsageError(f"detector {named.name}: frame at {frame.t_ns} ns: {fault}")
         return [
-            with_lenses(one, frame, self.light_labels) if isinstance(one, Detections) else one
+            self._examined(one, frame) if isinstance(one, Detections) else one
             for one, frame in zip(found, frames, strict=True)
         ]
 
+    def _examined(self, found: Detections, frame: Frame) -> Detections:
+        """Add what the pixels of lights and signs show."""
+        found = lens.with_lenses(found, frame, self.light_labels)
+        return second_look.with_looks(found, frame, self.sign_labels)
+
     def _identity(self, named: Named) -> str:
-        """Identify all that determines a result: the detector, and the rule for its lights."""
-        return f"{named.detector.identity} lens {VERSION} {' '.join(self.light_labels)}"
+        """Identify all that determines a result: the detector, and the rules of ``_examined``."""
+        return (
+            f"{named.detector.identity} lens {lens.VERSION} {' '.join(self.light_labels)} "
+            f"look {second_look.VERSION} {' '.join(self.sign_labels)}"
+        )
 
     def _count(self, name: str, ran: int, from_cache: int) -> None:
         self.counts.ran[name] = self.counts.ran.get(name, 0) + ran

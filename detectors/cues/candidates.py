@@ -6,6 +6,7 @@ candidates are counted, and the highest score is recorded.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
@@ -24,6 +25,7 @@ CUT_OR_FAR: Final = "cut by the picture's edge or too far"
 TOO_FEW_FRAMES: Final = "not followed over frames enough"
 ELSEWHERE: Final = "not at the intersection, as far as its place is known"
 NO_CURVE: Final = "no range curve"
+TOO_LITTLE_EVIDENCE: Final = "not enough evidence over frames"
 NOT_COUNTED: Final = "not counted by its rule"
 
 Unit = Literal["detections", "frames"]
@@ -79,12 +81,15 @@ def label_scores(boxes: Sequence[Detections], labels: Sequence[str]) -> list[flo
     ]
 
 
-def unsure_of(boxes: Sequence[Detections], labels: Sequence[str], setting: float | None) -> int:
-    """Number of detections with one of the labels whose score is too low for a cue."""
-    return sum(
-        label in labels and not is_sure
+def unsure_of(
+    boxes: Sequence[Detections], labels: Sequence[str], setting: float | None
+) -> Counter[str]:
+    """Numbers of detections with one of the labels that are no cue, by reason."""
+    return Counter(
+        (found.decisions[i] if found.decisions else "") or BELOW_SCORE
         for found in boxes
-        for label, is_sure in zip(found.labels, found.are_sure(setting).tolist(), strict=True)
+        for i, is_sure in enumerate(found.are_sure(setting).tolist())
+        if found.labels[i] in labels and not is_sure
     )
 
 

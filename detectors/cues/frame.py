@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.cues.tracked.judge import cars_past, count_cars
 from crosscue.detectors.cues.tracked.motion import CarMotion
 from crosscue.detectors.cues.tracked.tracks import CarTracks
+from crosscue.detectors.ranging.control_tracks import ControlTracks
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -27,24 +29,34 @@ from .tally import CueTally
 
 @dataclass(slots=True)
 class CuePass:
-    """Computes the cues of each frame; it remembers the cars of earlier frames.
+    """Computes the cues of each frame; it remembers the objects of earlier frames.
 
     Attributes:
         vehicle: Regions and thresholds.
         tracker: Pairs cars of two frames, if the vehicle file has ``cars.kind = "pairs"``.
         tally: Account of all candidates; None to skip it.
         not_followed: Number of frames in which cars could not be tracked, by reason.
+        controls: Tracks of stop signs and traffic lights.
     """
 
     vehicle: Vehicle
     tracker: Tracker = pair_cars
     tally: CueTally | None = None
     not_followed: Counter[str] = field(default_factory=Counter)
+    controls: ControlTracks = field(init=False)
     _before: CarShapes | None = None
     _tracks: CarTracks | None = None
+    _last_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        self.controls = ControlTracks(self.vehicle)
 
     def __call__(
-        self, frame: FrameDetections, ego: CarStep | None = None, place: Place | None = None
+        self,
+        frame: FrameDetections,
+        ego: CarStep | None = None,
+        place: Place | None = None,
+        heights_px: Sequence[NDArray[np.float64]] | None = None,
     ) -> FrameCues:
         """Compute the cues of the next frame.
 
@@ -52,10 +64,16 @@ class CuePass:
             frame: Detections in the frame.
             ego: The ego vehicle's motion since the previous frame; None where unknown.
             place: Estimated position of the intersection; None where unknown.
+            heights_px: Number of rows that each mask spans, by detector of objects; by default
+                heights are those of boxes.
         """
         counts: dict[str, int] = {}
         pairs: Pairs | None = None
+        passed_s = 0.0 if self._last_ns is None else (frame.t_ns - self._last_ns) * 1e-9
+        self._last_ns = frame.t_ns
         if frame.objects:
+            motion = CarStep(None, 0.0, 0.0, max(passed_s, 0.0)) if ego is None else ego
+            frame = replace(frame, objects=self.controls(frame.objects, motion, heights_px))
             counts |= counts_of("objects", frame.objects, self.vehicle)
             pairs = self._cars(frame.objects, ego, place)
             if pairs is not None:
@@ -81,14 +99,15 @@ class CuePass:
             )
         if road is not None:
             counts |= counts_of("road", road, self.vehicle)
-        found = FrameCues(counts, road)
+        found = FrameCues(counts, road, frame.objects)
         if self.tally is not None:
             self._explain(self.tally, frame, pairs, found)
         return found
 
     def restart(self) -> None:
-        """Forget the cars of earlier frames."""
-        self._before = self._tracks = None
+        """Forget the objects of earlier frames."""
+        self._before = self._tracks = self._last_ns = None
+        self.controls.restart()
 
     def followed(self) -> list[CarMotion]:
         """Cars of the newest frame, if they are tracked over frames."""

@@ -199,7 +199,9 @@ class FrameCues:
         counts: Count of each evaluated cue, including the user's own; 0 means searched for and not
             found.
         road: Fractions of road, if a detector segments the road.
+        objects: Detections of objects, with the decisions of tracks over frames.
     """
 
     counts: Mapping[str, int]
     road: RoadFractions | None
+    objects: tuple[Detections, ...] = ()

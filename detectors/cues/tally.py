@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -57,7 +58,7 @@ class CueTally:
             labels = self.vehicle.labels_of(cue) if cue.observed_by == observed_by else ()
             if labels and cue.name in counts:
                 setting, threshold = self.vehicle.threshold_of(cue)
-                low = 0 if setting is None else unsure_of(boxes, labels, threshold)
+                low = Counter() if setting is None else unsure_of(boxes, labels, threshold)
                 self._count(cue.name, label_scores(boxes, labels), low, counts, setting)
                 if setting is not None:
                     self.by_cue[cue.name].meet(thresholds_met(boxes, labels, threshold))
@@ -159,18 +160,19 @@ class CueTally:
         self,
         name: str,
         scores: Sequence[float],
-        low: int,
+        low: Counter[str],
         counts: Mapping[str, int],
         setting: str | None,
     ) -> None:
-        high = len(scores) - low
-        skipped = {BELOW_SCORE: low, NOT_COUNTED: high - min(counts[name], high)}
+        high = len(scores) - low.total()
+        skipped = {**low, NOT_COUNTED: high - min(counts[name], high)}
         self._of(name, "detections", setting, None).take(scores, skipped)
 
     def _cars(self, boxes: Sequence[Detections]) -> tuple[list[float], int]:
         """Scores of all cars, and the number of scores that are too low."""
         cars = self.vehicle.cars
-        return label_scores(boxes, cars.labels), unsure_of(boxes, cars.labels, cars.score)
+        low = unsure_of(boxes, cars.labels, cars.score).total()
+        return label_scores(boxes, cars.labels), low
 
     def _of_cars(self, cue: CueSpec, boxes: Sequence[Detections]) -> Candidates:
         cars = self.vehicle.cars

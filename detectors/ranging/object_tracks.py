@@ -5,6 +5,10 @@ picture's centre and grows by the ratio of the ranges before and after. As the c
 sideways. Two adjacent lights therefore remain two tracks, and no range mixes their heights.
 Housings seen from behind or from the side are tracked, too; ``ObjectTrack.facing`` distinguishes
 them by their lit lenses.
+
+A track is accepted by Wald's sequential probability ratio test (A. Wald, *Sequential Analysis*,
+1947): each frame adds the log likelihood ratio of its box, or of its absence. Successive frames
+resemble each other, so a frame counts less the sooner it follows the last one.
 """
 
 from __future__ import annotations
@@ -19,8 +23,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .lens import HUES
-from .range_from_motion import MotionRange, range_from_motion
+from .range_from_motion import MotionRange, range_from_motion, range_from_size
 from .standard_sizes import BOX_SPREAD, SizePrior, size_prior
 
 # Maximum distance of a box from a track's predicted box, in heights of the box: the car's pitch
@@ -37,6 +40,9 @@ MAX_OBSERVATIONS: Final = 400
 GONE_M: Final = 5.0
 # A track ends after this time (and the distance ``GONE_M``) without an observation.
 GONE_S: Final = 1.0
+# Colours of a lit lens. Yellow is also the paint of housings seen from behind, and it is lit for a
+# few seconds only.
+SIGNALS: Final = ("red", "green")
 MIN_LIT: Final = 2
 # A light faces the car if a lens was lit in ``MIN_LIT`` frames and in this fraction of the frames
 # where the box was large enough. The fraction is low because lamps flicker, hoods hide them, and
@@ -59,6 +65,16 @@ MIN_INFORMATION: Final = 0.25
 MIN_SEEN: Final = 5
 # Turn after which a track restarts, because range from motion assumes a straight path.
 STRAIGHT_RAD: Final = 0.15
+# Correlation time of a detector's errors on one object. Evidence of a second is the same at any
+# frame rate above 10 Hz, and about 5 independent frames.
+RESEMBLE_S: Final = 0.1
+# Evidence of an accepted track, and of one that is given up.
+ACCEPTED: Final = math.log(0.95 / 0.05)
+GIVEN_UP: Final = -2.0
+# Minimum number of frames of an accepted track.
+MIN_HITS: Final = 3
+# Evidence of a frame in which the object is not found.
+MISSED: Final = -0.35
 
 
 class Facing(StrEnum):
@@ -106,8 +122,6 @@ class ObjectTrack:
         number: Number of the track, from 1.
         box_px: Current box, observed or predicted.
         height_px: Current height of the box, observed or predicted.
-        estimate: Range and height at the last observation, from this object and similar ones.
-        alone: Range and height at the last observation, from this object only.
         size: Prior of its height, from its aspect.
         seen: Number of frames with an observation.
         is_seen: True if it was observed in the newest frame.
@@ -117,15 +131,19 @@ class ObjectTrack:
         lit: Number of frames in which a lens was lit.
         dark: Number of frames in which no lens was lit although the box was large enough.
         way_scale_sd: Relative standard deviation of the odometer's scale.
+        evidence: Log likelihood ratio of an object against none, from all frames so far.
+        hits: Number of frames with an observation and a new picture.
+        is_accepted: True once the evidence was sufficient; a track remains accepted.
+        is_way_unknown: True if the distance travelled to the newest frame is unknown.
+        looks: Number of boxes by the result of the second look at them.
     """
 
     number: int
     box_px: NDArray[np.float64]
     height_px: float
-    estimate: MotionRange
-    alone: MotionRange
     size: SizePrior
-    seen: int = 1
+    lens: Lens
+    seen: int = 0
     is_seen: bool = True
     since_m: float = 0.0
     unseen_m: float = 0.0
@@ -133,6 +151,11 @@ class ObjectTrack:
     lit: int = 0
     dark: int = 0
     way_scale_sd: float = 0.0
+    evidence: float = 0.0
+    hits: int = 0
+    is_accepted: bool = False
+    is_way_unknown: bool = False
+    looks: Counter[str] = field(default_factory=Counter)
     _way_m: list[float] = field(default_factory=list)
     _height_px: list[float] = field(default_factory=list)
     _aspect: list[float] = field(default_factory=list)
@@ -140,6 +163,23 @@ class ObjectTrack:
     _at_m: float = 0.0
     _way_var_m2: float = 0.0
     _turned_rad: float = 0.0
+    _alone: MotionRange | None = None
+    _weighed: MotionRange | None = None
+
+    @property
+    def alone(self) -> MotionRange:
+        """Range and height at the last observation, from this object only.
+
+        It is computed when it is first needed, and from the size alone until the track is accepted.
+        """
+        if self._alone is None:
+            self._alone = self._ranged(self.size)
+        return self._alone
+
+    @property
+    def estimate(self) -> MotionRange:
+        """Range and height at the last observation, from this object and similar ones."""
+        return self.alone if self._weighed is None else self._weighed
 
     @property
     def range_m(self) -> float:
@@ -156,8 +196,11 @@ class ObjectTrack:
         return Facing.AWAY if is_away else Facing.UNKNOWN
 
     def add_lens(self, lens: str) -> None:
-        """Count the lens of the newest box (by ``lens_of``; empty if it was not examined)."""
-        self.lit += lens in HUES
+        """Count the lens of the newest box (by ``lens_of``; empty if it was not examined).
+
+        Yellow is evidence for neither.
+        """
+        self.lit += lens in SIGNALS
         self.dark += lens == "dark"
 
     @property
@@ -191,12 +234,13 @@ class ObjectTrack:
         mean = (found.log_height - prior.log_mean) / (found.log_height_var * precision)
         return mean, 1.0 / precision + self._stretch() ** 2
 
-    def predict(self, motion: CarStep, lens: Lens) -> None:
+    def predict(self, motion: CarStep) -> None:
         """Predict the track to the next frame."""
-        way_m = motion.way_m or 0.0
-        scale = self.range_m / max(self.range_m - way_m, 0.1 * self.range_m, 1e-3)
-        shift_px = lens.focal_px * math.tan(max(min(motion.turned_rad, 1.0), -1.0))
-        center = np.array([*lens.center_px, *lens.center_px])
+        way_m, scale = motion.way_m or 0.0, 1.0
+        if way_m:
+            scale = self.range_m / max(self.range_m - way_m, 0.1 * self.range_m, 1e-3)
+        shift_px = self.lens.focal_px * math.tan(max(min(motion.turned_rad, 1.0), -1.0))
+        center = np.array([*self.lens.center_px, *self.lens.center_px])
         self.box_px = center + (self.box_px - center) * scale
         self.box_px += np.array([shift_px, 0.0, shift_px, 0.0])
         self.height_px *= scale
@@ -207,11 +251,35 @@ class ObjectTrack:
         self._at_m += way_m
         self._way_var_m2 += motion.var_m2
         self._turned_rad += motion.turned_rad
+        self.is_way_unknown = motion.way_m is None
         if motion.way_m is None or abs(self._turned_rad) > STRAIGHT_RAD:
             self._forget()
 
-    def observe(self, box_px: NDArray[np.float64], height_px: float, cue: str, lens: Lens) -> None:
-        """Update the track with the box of the newest frame."""
+    def weigh_evidence(self, log_ratio: float, worth: float) -> None:
+        """Add the evidence of a frame, which is worth so many independent ones."""
+        self.evidence += worth * log_ratio
+        self.hits += self.is_seen and worth > 0.0
+        if self.evidence >= ACCEPTED and self.hits >= MIN_HITS:
+            self.accept()
+
+    def accept(self) -> None:
+        """Accept the track; its range is then by all observations."""
+        if not self.is_accepted:
+            self.is_accepted, self._alone = True, None
+
+    def observe(self, box_px: NDArray[np.float64], height_px: float, cue: str) -> None:
+        """Update the track with the box of the newest frame.
+
+        Args:
+            box_px: The box.
+            height_px: Height of the object; 0 where the picture's edge cuts it.
+            cue: Cue of the object.
+        """
+        self.seen += 1
+        self.is_seen, self.unseen_m, self.unseen_s = True, 0.0, 0.0
+        self.box_px = box_px.copy()
+        if height_px <= 0.0:
+            return
         width_px = float(box_px[2] - box_px[0])
         if width_px > 0.0:
             self._aspect.append(height_px / width_px)
@@ -225,23 +293,25 @@ class ObjectTrack:
             self._merged = 1
             del self._way_m[:-MAX_OBSERVATIONS], self._height_px[:-MAX_OBSERVATIONS]
         self.size = size_prior(cue, self.aspect if self._aspect else None)
-        self.alone = self.estimate = self._ranged(self.size, lens)
+        self._alone = self._weighed = None
         self.since_m = self._at_m - self._way_m[-1]
-        self.box_px, self.height_px = box_px.copy(), height_px
-        self.seen += 1
-        self.is_seen, self.unseen_m, self.unseen_s = True, 0.0, 0.0
+        self.height_px = height_px
 
-    def weigh(self, size: SizePrior, lens: Lens) -> None:
+    def weigh(self, size: SizePrior) -> None:
         """Update the estimate with a size prior from similar objects."""
-        self.estimate = self._ranged(size, lens)
+        self._weighed = self._ranged(size)
 
-    def _ranged(self, size: SizePrior, lens: Lens) -> MotionRange:
+    def _ranged(self, size: SizePrior) -> MotionRange:
+        if not self.is_accepted:
+            return range_from_size(self._height_px[-1], self.lens.focal_px, size)
         return range_from_motion(
-            np.array(self._way_m), np.array(self._height_px), lens.focal_px, size
+            np.array(self._way_m), np.array(self._height_px), self.lens.focal_px, size
         )
 
     def _forget(self) -> None:
         """Discard earlier heights, which are not of a straight path; the estimate remains."""
+        if len(self._way_m) > 1:
+            self._alone = self.alone
         self._way_m, self._height_px, self._merged = [self._at_m], [self.height_px], 0
         self._way_var_m2 = self._turned_rad = 0.0
 
@@ -251,6 +321,7 @@ class ObjectTracks:
 
     Attributes:
         tracks: Tracks, in the order of their first observation.
+        of_boxes: Track of each box of the newest frame; None for a second box of one object.
         counts: Number of boxes by outcome.
     """
 
@@ -262,7 +333,9 @@ class ObjectTracks:
         way_scale_sd: float = 0.0,
     ) -> None:
         self.tracks: list[ObjectTrack] = []
+        self.of_boxes: list[ObjectTrack | None] = []
         self.counts: Counter[str] = Counter()
+        self._begun = 0
         self._cue = cue
         self._way_scale_sd = way_scale_sd
         self._lens = Lens(focal_px, center_px)
@@ -273,62 +346,85 @@ class ObjectTracks:
         boxes_px: NDArray[np.float64],
         heights_px: NDArray[np.float64],
         lenses: Sequence[str] = (),
+        evidence: NDArray[np.float64] | None = None,
+        *,
+        is_new: bool = True,
     ) -> Sequence[ObjectTrack]:
         """Update the tracks with the boxes of the next frame.
 
         Args:
             motion: Motion of the car since the previous frame.
             boxes_px: Shape (N, 4): x0, y0, x1, y1.
-            heights_px: Shape (N,), positive.
+            heights_px: Shape (N,); 0 for an object that the picture's edge cuts.
             lenses: N lenses, or empty if they were not examined.
+            evidence: Shape (N,): log likelihood ratio of each box; None where one box is enough to
+                accept a track.
+            is_new: False for a repeated picture, which is no further evidence.
 
         Returns:
             All tracks; those without an observation in this frame are predicted.
         """
         for track in self.tracks:
-            track.predict(motion, self._lens)
-        lenses = lenses or [""] * len(boxes_px)
-        taken = self._assign(boxes_px, heights_px, lenses)
-        for i in range(len(boxes_px)):
-            if i in taken:
-                continue
-            if any(iou(boxes_px[i], boxes_px[j]) > SAME_IOU for j in taken):
-                self.counts["boxes of an object already found"] += 1
-                continue
-            self._begin(boxes_px[i], float(heights_px[i]), lenses[i])
-            taken.append(i)
+            track.predict(motion)
+        worth = math.tanh(0.5 * motion.seconds / RESEMBLE_S) if is_new else 0.0
+        self.of_boxes = self._assign(boxes_px, heights_px)
+        order = range(len(boxes_px)) if evidence is None else np.argsort(-evidence, kind="stable")
+        for i in map(int, order):
+            if self.of_boxes[i] is None and not self._is_found(boxes_px, i) and heights_px[i] > 0.0:
+                self.of_boxes[i] = self._begin(boxes_px[i], float(heights_px[i]))
+        followed = sum(one.is_accepted for one in self.tracks)
+        for i, one in enumerate(self.of_boxes):
+            if one is not None:
+                one.add_lens(lenses[i] if lenses else "")
+                if evidence is None:
+                    one.accept()
+                else:
+                    one.weigh_evidence(float(evidence[i]), 1.0 if one.seen == 1 else worth)
+        self.counts["objects followed"] += sum(one.is_accepted for one in self.tracks) - followed
+        for one in self.tracks:
+            if not one.is_seen:
+                one.weigh_evidence(MISSED, worth)
         self.tracks = [one for one in self.tracks if not _is_over(one)]
         self._share_sizes()
         return self.tracks
 
     def _assign(
-        self, boxes_px: NDArray[np.float64], heights_px: NDArray[np.float64], lenses: Sequence[str]
-    ) -> list[int]:
-        """Assign boxes to tracks, nearest pairs first; return the indices of assigned boxes."""
+        self, boxes_px: NDArray[np.float64], heights_px: NDArray[np.float64]
+    ) -> list[ObjectTrack | None]:
+        """Assign boxes to tracks, nearest pairs first; return the track of each box."""
+        spans_px = np.where(heights_px > 0.0, heights_px, boxes_px[:, 3] - boxes_px[:, 1])
         pairs = [
             (away, i, j)
             for j, track in enumerate(self.tracks)
             for i in range(len(boxes_px))
-            if (away := _cost_of(track, boxes_px[i], float(heights_px[i]))) < NEAR_HEIGHTS
+            if (away := _cost_of(track, boxes_px[i], float(spans_px[i]))) < NEAR_HEIGHTS
         ]
-        boxes: list[int] = []
-        tracks: set[int] = set()
+        found: list[ObjectTrack | None] = [None] * len(boxes_px)
         for _, i, j in sorted(pairs):
-            if i not in boxes and j not in tracks:
-                self.tracks[j].observe(boxes_px[i], float(heights_px[i]), self._cue, self._lens)
-                self.tracks[j].add_lens(lenses[i])
-                boxes.append(i)
-                tracks.add(j)
-        return boxes
+            track = self.tracks[j]
+            if found[i] is None and not track.is_seen:
+                track.observe(boxes_px[i], float(heights_px[i]), self._cue)
+                found[i] = track
+        return found
+
+    def _is_found(self, boxes_px: NDArray[np.float64], i: int) -> bool:
+        """Return whether a box without a track is of an object with another box."""
+        is_again = any(
+            one is not None and iou(boxes_px[i], boxes_px[j]) > SAME_IOU
+            for j, one in enumerate(self.of_boxes)
+        )
+        self.counts["boxes of an object already found"] += is_again
+        return is_again
 
     def _share_sizes(self) -> None:
         """Combine each object's size with the sizes by motion of similar objects."""
+        tracks = [one for one in self.tracks if one.is_accepted]
         said = [
             (one, by_motion)
-            for one in self.tracks
+            for one in tracks
             if one.seen >= MIN_SEEN and (by_motion := one.size_by_motion()) is not None
         ]
-        for one in self.tracks:
+        for one in tracks:
             own = one.size_by_motion()
             others = [
                 by_motion
@@ -338,19 +434,15 @@ class ObjectTracks:
                 and (own is None or may_be_one_make(own, by_motion))
             ]
             if others and one.is_seen:
-                one.weigh(shared_size(one.size, others), self._lens)
+                one.weigh(shared_size(one.size, others))
 
-    def _begin(self, box_px: NDArray[np.float64], height_px: float, lens: str) -> None:
-        self.counts["objects followed"] += 1
-        size = size_prior(self._cue)
-        first = range_from_motion(np.zeros(1), np.array([height_px]), self._lens.focal_px, size)
-        number = self.counts["objects followed"]
-        track = ObjectTrack(number, box_px.copy(), height_px, first, first, size)
+    def _begin(self, box_px: NDArray[np.float64], height_px: float) -> ObjectTrack:
+        self._begun += 1
+        track = ObjectTrack(self._begun, box_px, height_px, size_prior(self._cue), self._lens)
         track.way_scale_sd = self._way_scale_sd
-        track.observe(box_px, height_px, self._cue, self._lens)
-        track.add_lens(lens)
-        track.seen = 1
+        track.observe(box_px, height_px, self._cue)
         self.tracks.append(track)
+        return track
 
 
 def is_alike(aspect: float, other: float) -> bool:
@@ -413,5 +505,7 @@ def _cost_of(track: ObjectTrack, box_px: NDArray[np.float64], height_px: float) 
 
 
 def _is_over(track: ObjectTrack) -> bool:
-    is_gone = track.unseen_m > GONE_M and track.unseen_s > GONE_S
-    return is_gone or track.range_m <= 0.0
+    if not track.is_accepted and track.evidence <= GIVEN_UP:
+        return True
+    has_moved = track.unseen_m > GONE_M or track.is_way_unknown
+    return (has_moved and track.unseen_s > GONE_S) or track.range_m <= 0.0

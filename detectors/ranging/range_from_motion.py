@@ -123,6 +123,19 @@ def range_from_motion(
     )
 
 
+def range_from_size(height_px: float, focal_px: float, size: SizePrior) -> MotionRange:
+    """Estimate the range of one box from the prior of the size alone, in closed form.
+
+    Args:
+        height_px: Height of the box, positive.
+        focal_px: Focal length, in the same pixels.
+        size: Prior of the object's height.
+    """
+    mean_m = focal_px * size.mean_m / height_px
+    var_m2 = (size.spread * mean_m) ** 2
+    return MotionRange(mean_m, var_m2, size.mean_m, 0.0, size.log_mean, size.log_var)
+
+
 @dataclass(frozen=True, slots=True)
 class _Observations:
     """All observations, as arrays of shape (N,).

@@ -153,6 +153,7 @@ def detect_into(
             vehicle.camera.depth_bits,
             reading.spoil,
             vehicle.cues.traffic_light_labels,
+            vehicle.cues.stop_sign_labels,
             is_one_size=vehicle.camera.focal_px is not None,
         )
         tables = _Tables(
@@ -630,6 +631,7 @@ class _Tables:
                     "mask": found.masks[i] or None,
                     "height_px": height,
                     "lens": (found.lenses[i] or None) if found.lenses else None,
+                    "look": (found.looks[i] or None) if found.looks else None,
                     "same_as": None if again[i] == KEPT else self.detectors[again[i]].name,
                     "range_m": None if ranged is None else ranged.mean_m,
                     "range_sd_m": None if ranged is None else ranged.sd_m,
@@ -684,6 +686,7 @@ def detect_schemas() -> dict[str, pa.Schema]:
                 ("mask", pa.binary()),
                 ("height_px", number),
                 ("lens", text),
+                ("look", text),
                 ("same_as", text),
                 ("range_m", number),
                 ("range_sd_m", number),

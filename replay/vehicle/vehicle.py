@@ -187,6 +187,11 @@ SIMULATED_CAR: Final = "crosscue simulated car"
 class Cues(Section):
     """Conditions under which a detection is a cue."""
 
+    kind: Literal["frames", "tracks"] | None = None
+    """Rule for stop signs and traffic lights. ``frames``: a score above the threshold, in every
+    frame by itself, as published. ``tracks``: the evidence of all frames so far, from weak
+    detections on, with a second look at stop signs. Default: ``frames`` in a simulated vehicle's
+    file and where one of their scores is specified, else ``tracks``."""
     stop_sign_labels: tuple[str, ...] = ("stop sign",)
     stop_sign_score: Proportion | None = None
     """Minimum score. Default: the threshold in the detector's model card, which ``crosscue fit
@@ -328,7 +333,7 @@ class Vehicle(Section):
     camera: Camera = Camera()
     landmarks: Landmarks = Landmarks()
     regions: Annotated[Regions, Field(validate_default=True)] = Regions()
-    cues: Cues = Cues()
+    cues: Annotated[Cues, Field(validate_default=True)] = Cues()
     cars: Annotated[Cars, Field(validate_default=True)] = Cars()
     ranges: Ranges = Ranges()
     range_filter: RangeFilter = RangeFilter()
@@ -347,6 +352,15 @@ class Vehicle(Section):
         is_drawn = not regions.model_fields_set.isdisjoint(("left", "straight", "right"))
         kind = "picture" if is_drawn or _is_simulated(info) else "ground"
         return regions.model_copy(update={"kind": kind})
+
+    @field_validator("cues")
+    @classmethod
+    def _kind_of_cues(cls, cues: Cues, info: ValidationInfo) -> Cues:
+        if cues.kind is not None:
+            return cues
+        has_score = not (cues.stop_sign_score is None and cues.traffic_light_score is None)
+        kind = "frames" if has_score or _is_simulated(info) else "tracks"
+        return cues.model_copy(update={"kind": kind})
 
     @field_validator("cars")
     @classmethod

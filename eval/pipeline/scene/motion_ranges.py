@@ -5,41 +5,36 @@ The object that defines a range is chosen as follows:
 * **Traffic lights** are on both sides of the intersection. Among those facing the vehicle, the
   farthest marks the **end**: no other may be clearly (two standard deviations) farther. A light of
   a nearer group, which may be seen from behind, marks the **start**. A light known not to face the
-  vehicle never marks the end, and a light of unknown facing never marks the start. If only one
-  group was seen, the run reports it. Lights are set back from the intersection
-  (``Ranges.light_setback_m``).
+  vehicle never marks the end. If only one group was seen, the run reports it. Lights are set back
+  from the intersection (``Ranges.light_setback_m``).
 * **Stop signs** mark the **start**: one such that no other is clearly nearer. They take precedence
   over lights.
 
 The choice is kept while these conditions hold. Groups are never averaged, and every range is the
-posterior of a single object. Lights of unknown facing count as facing if no other light does.
+posterior of a single object. It is written only if a second source confirms it: the object's
+growth, or another object. A light of unknown facing marks nothing.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from crosscue.detectors.base import Detections
-from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.detectors.ranging.object_tracks import (
     CarStep,
     Facing,
     ObjectTrack,
-    ObjectTracks,
     difference_var_m2,
 )
-from crosscue.fusion.evidence import FrameEvidence, RangePosterior
+from crosscue.detectors.ranging.usable import source_of
+from crosscue.fusion.evidence import RangePosterior
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.vehicle import TRAFFIC_LIGHT, Vehicle
 
-from .usable import MEASURED, Usable, source_of, usable
+from .sign_ranges import MEASURED
 
 # Min difference of two clearly different ranges, in standard deviations.
 CLEARLY: Final = 2.0
@@ -50,6 +45,12 @@ NARROWEST_M: Final = 8.0
 # Observations after which an object competes with any other. Below, it competes only with objects
 # observed at most twice as often.
 PERSISTS: Final = 10
+# Minimum fraction of the variance that growth removes for it to confirm an assumed size.
+GROWN: Final = 0.25
+# Fraction of objects that are no light or sign of a standard size, and the spread of their sizes.
+LOOK_ALIKES: Final = 0.05
+LOOK_ALIKE_SPREAD: Final = 0.5
+UNCONFIRMED: Final = "ranges not written: one object of assumed size"
 ONE_GROUP: Final = "frames with only one group of lights"
 ONLY_AWAY: Final = "frames with only lights that do not face the ego vehicle"
 
@@ -84,8 +85,8 @@ class MotionRanges:
 
     Attributes:
         vehicle: Settings.
-        counts: Numbers of objects followed, duplicate boxes, changes of choice, and frames with
-            only one group.
+        counts: Numbers of changes of choice, of frames with only one group, and of ranges that
+            nothing confirmed.
         objects: Objects observed in the newest frame.
     """
 
@@ -96,39 +97,30 @@ class MotionRanges:
 
     def __call__(
         self,
-        evidence: FrameEvidence,
-        seconds: float,
-        found: Sequence[Detections],
-        heights_px: Sequence[NDArray[np.float64]],
+        tracks: Mapping[str, Sequence[ObjectTrack]],
+        motion: CarStep,
         without: frozenset[str] = frozenset(),
     ) -> tuple[RangePosterior, ...]:
         """Process the next frame; return at most one range for each reference.
 
         Args:
-            evidence: Evidence of the frame; only the vehicle's motion is used.
-            seconds: Time since the previous frame.
-            found: Detections of each detector of objects.
-            heights_px: Number of rows that each mask spans, by detector.
+            tracks: Accepted tracks by cue.
+            motion: Motion of the car since the previous frame.
             without: Cues to leave out.
         """
-        turned_rad = evidence.turned_rad or 0.0
-        # The variance of slip_per_sqrt_m is not used: the tracks have scale_sd of the distance.
-        slip_m2 = self.vehicle.odometry.slip_per_sqrt_m**2 * abs(evidence.travelled_m or 0.0)
-        var_m2 = max(evidence.travelled_var_m2 - slip_m2, 0.0)
-        motion = CarStep(evidence.travelled_m, var_m2, turned_rad, seconds)
         ranges: dict[Reference, RangePosterior] = {}
         objects: list[RangedObject] = []
-        for row, (cue, _) in enumerate(MEASURED):
-            if cue.name in without or source_of(self.vehicle, cue.name) != "motion":
-                continue
-            boxes = usable(self.vehicle, row, found, heights_px)
-            if not len(boxes.boxes_px) and cue.name not in self._chains:
+        for cue, _ in MEASURED:
+            is_wanted = cue.name not in without and cue.name in tracks
+            if not is_wanted or source_of(self.vehicle, cue.name) != "motion":
                 continue
             if cue.name not in self._chains:
-                self._chains[cue.name] = self._chain(cue.name, found[0].size_px)
-            for one in self._chains[cue.name](motion, boxes):
+                choices = {one: _Choice(self.vehicle, one, self.counts) for one in Reference}
+                self._chains[cue.name] = _Chain(self.vehicle, cue.name, self.counts, choices)
+            chain = self._chains[cue.name]
+            for one in chain(motion, tracks[cue.name]):
                 ranges.setdefault(one.reference, one)
-            objects += self._chains[cue.name].objects()
+            objects += chain.objects(tracks[cue.name])
         self.objects = tuple(objects)
         return tuple(ranges.values())
 
@@ -137,42 +129,32 @@ class MotionRanges:
         self._chains.clear()
         self.objects = ()
 
-    def _chain(self, cue: str, size_px: tuple[int, int]) -> _Chain:
-        camera = self.vehicle.camera
-        center_px = GroundPlane.of(camera, size_px).ahead_px()
-        scale_sd = self.vehicle.odometry.scale_sd
-        tracks = ObjectTracks(cue, camera.focal_px or 0.0, center_px, scale_sd)
-        tracks.counts = self.counts
-        choices = {
-            reference: _Choice(self.vehicle, reference, self.counts) for reference in Reference
-        }
-        return _Chain(self.vehicle, cue, tracks, self.counts, choices)
-
 
 @dataclass(slots=True)
 class _Chain:
-    """Tracks of one kind of object, and the choice of those that define ranges."""
+    """Choice of the objects of one kind that define ranges."""
 
     vehicle: Vehicle
     cue: str
-    tracks: ObjectTracks
     counts: Counter[str]
     choices: dict[Reference, _Choice]
 
-    def __call__(self, motion: CarStep, boxes: Usable) -> list[RangePosterior]:
-        tracks = self.tracks(motion, boxes.boxes_px, boxes.heights_px, boxes.lenses)
+    def __call__(self, motion: CarStep, tracks: Sequence[ObjectTrack]) -> list[RangePosterior]:
         for choice in self.choices.values():
             choice.go_on(motion)
         if self.cue != TRAFFIC_LIGHT.name:
-            return self._posteriors({Reference.START: self.choices[Reference.START](tracks)})
-        end = self.choices[Reference.END](_end_candidates(tracks))
+            return self._posteriors(
+                {Reference.START: self.choices[Reference.START](tracks)}, tracks
+            )
+        facing = [one for one in tracks if one.facing is Facing.EGO]
+        end = self.choices[Reference.END](facing)
         start = self.choices[Reference.START](_start_candidates(tracks, end))
         is_seen = any(one.is_seen for one in tracks)
         self.counts[ONE_GROUP] += is_seen and end is not None and start is None
         self.counts[ONLY_AWAY] += is_seen and end is None and start is not None
-        return self._posteriors({Reference.END: end, Reference.START: start})
+        return self._posteriors({Reference.END: end, Reference.START: start}, tracks)
 
-    def objects(self) -> list[RangedObject]:
+    def objects(self, tracks: Sequence[ObjectTrack]) -> list[RangedObject]:
         """Return the objects observed in the newest frame, by number."""
         marks = {choice.chosen: reference for reference, choice in self.choices.items()}
         return [
@@ -186,16 +168,22 @@ class _Chain:
                 one.estimate.height_m,
                 tuple(one.box_px.tolist()),
             )
-            for one in self.tracks.tracks
+            for one in tracks
             if one.is_seen
         ]
 
-    def _posteriors(self, chosen: dict[Reference, ObjectTrack | None]) -> list[RangePosterior]:
+    def _posteriors(
+        self, chosen: dict[Reference, ObjectTrack | None], tracks: Sequence[ObjectTrack]
+    ) -> list[RangePosterior]:
         """Return the ranges of the chosen objects that were observed in this frame."""
         camera, ranges = self.vehicle.camera, self.vehicle.ranges
         found = []
         for reference, one in chosen.items():
             if one is None or not one.is_seen:
+                continue
+            others = [other for other in tracks if other is not one]
+            if not _is_confirmed(one, others):
+                self.counts[UNCONFIRMED] += 1
                 continue
             shift_m, place_var_m2 = camera.x_m, 0.0
             if self.cue == TRAFFIC_LIGHT.name:
@@ -207,17 +195,42 @@ class _Chain:
                 RangePosterior(
                     reference,
                     one.range_m + shift_m,
-                    one.var_m2 + place_var_m2,
+                    _widened_m2(one, others) + place_var_m2,
                     measured_m + shift_m,
                 )
             )
         return found
 
 
-def _end_candidates(tracks: Sequence[ObjectTrack]) -> list[ObjectTrack]:
-    """Return the lights facing the vehicle, or, if none does, those of unknown facing."""
-    facing = [one for one in tracks if one.facing is Facing.EGO]
-    return facing or [one for one in tracks if one.facing is Facing.UNKNOWN]
+def _is_confirmed(one: ObjectTrack, others: Sequence[ObjectTrack]) -> bool:
+    """Return whether a range has a second source besides the assumed size of one object.
+
+    This is the growth of the object, if it agrees with the size, or another object that agrees.
+    """
+    by_motion = one.size_by_motion()
+    if by_motion is not None and one.estimate.by_motion >= GROWN:
+        mean, var = by_motion
+        return abs(mean) <= CLEARLY * math.sqrt(var + one.size.log_var)
+    is_alike = (other for other in others if other.facing is one.facing)
+    return any(not _is_apart(one, other) for other in is_alike)
+
+
+def _widened_m2(one: ObjectTrack, others: Sequence[ObjectTrack]) -> float:
+    """Return the variance of a range with what can be wrong about its object.
+
+    As long as its size is assumed, it may be a look-alike of any size. And if other objects that
+    face the same way are clearly at another range, but too close to be on the other side of the
+    intersection, then the interval is widened until it contains them.
+    """
+    assumed = 1.0 - one.estimate.by_motion
+    var_m2 = one.var_m2 + LOOK_ALIKES * assumed * (LOOK_ALIKE_SPREAD * one.range_m) ** 2
+    off_m = [
+        abs(other.range_m - one.range_m)
+        for other in others
+        if other.facing is one.facing and _is_apart(one, other)
+    ]
+    widest_m = max((off for off in off_m if off <= NARROWEST_M), default=0.0)
+    return max(var_m2, (widest_m / CLEARLY) ** 2)
 
 
 def _start_candidates(tracks: Sequence[ObjectTrack], end: ObjectTrack | None) -> list[ObjectTrack]:

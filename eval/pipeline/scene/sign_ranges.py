@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +13,13 @@ from numpy.typing import NDArray
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.candidates import Candidates, label_scores, thresholds_met
 from crosscue.detectors.ranging.height_to_range import range_of
-from crosscue.eval.pipeline.scene.usable import MEASURED, source_of, why_not
+from crosscue.detectors.ranging.usable import source_of, why_not
 from crosscue.fusion.evidence import SignRange
-from crosscue.replay.vehicle.vehicle import RangeCurve, Vehicle
+from crosscue.fusion.intersection_range import Reference
+from crosscue.replay.vehicle.vehicle import STOP_SIGN, TRAFFIC_LIGHT, RangeCurve, Vehicle
+
+# Cues of the dissertation whose detections measure a range, with its reference.
+MEASURED: Final = ((STOP_SIGN, Reference.START), (TRAFFIC_LIGHT, Reference.END))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
+from crosscue.detectors.base import is_repeated
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections, Place
 from crosscue.detectors.cues.tally import CueTally
@@ -21,7 +20,7 @@ from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.eval.pipeline.progress import report_time
 from crosscue.eval.pipeline.scene.looked_for import needing_masks, not_looked_for
 from crosscue.eval.pipeline.scene.motion_ranges import MotionRanges, RangedObject
-from crosscue.eval.pipeline.scene.sign_ranges import SignRanges
+from crosscue.eval.pipeline.scene.sign_ranges import MEASURED, SignRanges
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
@@ -35,7 +34,6 @@ from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .outcome import ApproachSummary, SceneOutcome
-from .usable import MEASURED
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -106,7 +104,10 @@ def estimate_scene(
         scene.frames,
         dict(sorted(scene.positive.items())),
         tuple(scene.summaries.values()),
-        scene.approaches.counts + scene.motion.counts + scene.cues.notes(),
+        scene.approaches.counts
+        + scene.motion.counts
+        + scene.cues.controls.counts
+        + scene.cues.notes(),
         scene.ego.without_odometry,
         {cue: one for cue, one in scene.tally.by_cue.items() if cue not in boxes_only},
         scene.signs.by_cue,
@@ -210,15 +211,15 @@ class _Scene:
     def step(self, frame: StoredFrame, past: PastCues | None, without: frozenset[str]) -> None:
         seen = frame.seen
         evidence, ego = self.ego(seen.t_ns)
-        found = self.cues(seen, ego, self._place(ego))
+        found = self.cues(seen, ego, self._place(ego), frame.heights_px)
         counts = {cue: count for cue, count in found.counts.items() if cue not in without}
         signs = tuple(
             sign
-            for sign in self.signs(seen.objects, frame.heights_px)
+            for sign in self.signs(found.objects, frame.heights_px)
             if _MEASURES[sign.reference] not in without
         )
         evidence = replace(evidence, counts=counts, signs=signs)
-        posteriors = self.motion(evidence, ego.seconds, seen.objects, frame.heights_px, without)
+        posteriors = self.motion(self.cues.controls.tracks, ego, without)
         evidence = replace(evidence, posteriors=posteriors, is_new_picture=self._is_new(seen))
         self.rows.add_objects(seen.t_ns, self.motion.objects)
         step = (
@@ -247,7 +248,7 @@ class _Scene:
         if self.vehicle.fusion.kind not in ("persistent", "temporal"):
             return True
         before, self._before = self._before, seen
-        return before is None or not _is_repeated(before, seen)
+        return before is None or not is_repeated(before.boxes, seen.boxes)
 
     def restart(self, t_ns: int) -> None:
         """Know nothing of what was before ``t_ns``."""
@@ -298,18 +299,6 @@ def intersection_place(ranges: Sequence[RangeRow], way_m: float, length_m: float
     if end_m is None:
         end_m = start_m + length_m
     return Place(start_m, end_m, max(one.var_m2 for one in ranges) ** 0.5)
-
-
-def _is_repeated(before: FrameDetections, now: FrameDetections) -> bool:
-    """Return whether both frames have the same results and at least one detection."""
-    if len(before.boxes) != len(now.boxes) or not any(map(len, now.boxes)):
-        return False
-    return all(
-        one.labels == other.labels
-        and np.array_equal(one.boxes_px, other.boxes_px)
-        and np.array_equal(one.scores, other.scores)
-        for one, other in zip(before.boxes, now.boxes, strict=True)
-    )
 
 
 _MEASURES: Final = {reference: cue.name for cue, reference in MEASURED}

@@ -72,7 +72,9 @@ class _Rows:
             if batch is None:
                 return False
             self._frames = batch["frame"].to_pylist()
-            columns = (batch[name].to_pylist() for name in self.names)
+            # Runs of older versions lack the newest columns.
+            known, nothing = batch.schema.names, [None] * len(self._frames)
+            columns = (batch[one].to_pylist() if one in known else nothing for one in self.names)
             self._rows, self._next = list(zip(*columns, strict=True)), 0
         return True
 
@@ -89,6 +91,7 @@ FOUND: Final = (
     "height_px",
     "lens",
     "same_as",
+    "look",
 )
 SHARES: Final = ("fraction_left", "fraction_straight", "fraction_right")
 MASK: Final = ("mask", "mask_width_px", "mask_height_px")
@@ -164,6 +167,7 @@ def _detections(t_ns: int, size: tuple[int, int], rows: list[tuple[Any, ...]]) -
         tuple(row[1] for row in rows),
         tuple(row[7] or b"" for row in rows),
         tuple(row[9] or "" for row in rows),
+        looks=tuple(row[11] or "" for row in rows),
     )
 
 

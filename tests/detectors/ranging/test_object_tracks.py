@@ -89,7 +89,9 @@ def test_two_boxes_of_one_object_make_one_track() -> None:
         ([""] * 30, Facing.UNKNOWN),
         (["dark"] * 28 + ["red"], Facing.AWAY),
         (["dark"] * 18 + ["red"] * 2, Facing.UNKNOWN),
-        (["dark"] * 8 + ["yellow"] * 2, Facing.EGO),
+        (["dark"] * 8 + ["green"] * 2, Facing.EGO),
+        (["yellow"] * 30, Facing.UNKNOWN),
+        (["dark"] * 10 + ["yellow"] * 5, Facing.AWAY),
     ],
 )
 def test_facing_requires_enough_consistent_frames(lenses: list[str], facing: Facing) -> None:

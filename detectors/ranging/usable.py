@@ -1,0 +1,52 @@
+"""Conditions under which a detection can measure the range to an intersection."""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.candidates import BELOW_SCORE, NO_CURVE
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+# Margin at the picture's edge; the height of a sign within it is truncated.
+BORDER_PX: Final = 2.0
+
+Source = Literal["curve", "motion"]
+NO_HEIGHT: Final = "no height"
+CUT: Final = "cut by the picture's edge"
+
+
+def source_of(vehicle: Vehicle, cue: str) -> Source | None:
+    """Return the source of ranges to a cue's objects; None without a curve and a camera."""
+    chosen = vehicle.ranges.kind
+    if chosen != "motion" and getattr(vehicle.ranges, cue) is not None:
+        return "curve"
+    return None if chosen == "curve" or vehicle.camera.focal_px is None else "motion"
+
+
+def is_cut(found: Detections, i: int) -> bool:
+    """Return whether the picture's edge cuts a detection's box."""
+    width, height = found.size_px
+    x0, y0, x1, y1 = found.boxes_px[i].tolist()
+    is_outside = x1 > width - BORDER_PX or y1 > height - BORDER_PX
+    return bool(min(x0, y0) < BORDER_PX or is_outside)
+
+
+def why_not(
+    found: Detections,
+    heights_px: NDArray[np.float64],
+    i: int,
+    are_sure: NDArray[np.bool_],
+    source: Source | None,
+) -> str | None:
+    """Return why a detection has no range; None if it or its track has one."""
+    if not are_sure[i]:
+        return BELOW_SCORE
+    if heights_px[i] <= 0.0:
+        return NO_HEIGHT
+    if is_cut(found, i):
+        return CUT
+    return NO_CURVE if source is None else None

@@ -1,0 +1,225 @@
+"""Laws of the decision on stop signs and traffic lights by their tracks over frames."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from crosscue.detectors.base import ACCEPTED, Detections
+from crosscue.detectors.cues.candidates import TOO_LITTLE_EVIDENCE
+from crosscue.detectors.cues.frame import CuePass
+from crosscue.detectors.cues.observed import FrameDetections
+from crosscue.detectors.cues.tally import CueTally
+from crosscue.detectors.ranging.control_tracks import ControlTracks
+from crosscue.detectors.ranging.object_tracks import CarStep
+from crosscue.replay.vehicle.vehicle import Vehicle, parse
+
+SIZE = (1280, 720)
+STEP = CarStep(None, 0.0, 0.0, 0.1)
+# Place (x, y), score, and what the pixels show.
+Seen = tuple[float, float, float, str]
+LIGHT, SIGN = "traffic light", "stop sign"
+
+
+def car(text: str = "") -> Vehicle:
+    return parse("version = 1\n" + text, "v.toml")
+
+
+def frame(seen: Sequence[Seen], label: str = LIGHT, jitter: float = 0.0) -> Detections:
+    n = len(seen)
+    boxes = np.array([[x - 6, y - 15, x + 6, y + 15] for x, y, *_ in seen]).reshape(-1, 4)
+    shown = tuple(one[3] for one in seen)
+    return Detections(
+        0,
+        SIZE,
+        boxes + jitter,
+        np.array([one[2] for one in seen]),
+        (label,) * n,
+        (b"",) * n,
+        lenses=shown if label == LIGHT else (),
+        looks=shown if label == SIGN else (),
+    )
+
+
+def decided(
+    frames: Sequence[Sequence[Seen]],
+    label: str = LIGHT,
+    step: CarStep = STEP,
+    vehicle: Vehicle | None = None,
+) -> list[tuple[str, ...]]:
+    """Decisions on the boxes of each frame; the boxes move a little, as no picture is repeated."""
+    tracks = ControlTracks(vehicle or car())
+    return [
+        tracks([frame(seen, label, 0.01 * i)], step)[0].decisions for i, seen in enumerate(frames)
+    ]
+
+
+def test_fifty_weak_consistent_frames_are_accepted() -> None:
+    found = decided([[(600.0, 140.0, 0.35, "unknown")]] * 50)
+
+    assert found[0] == (TOO_LITTLE_EVIDENCE,)
+    assert found[-1] == (ACCEPTED,)
+
+
+@pytest.mark.parametrize("score", [0.6, 0.9, 0.999])
+def test_isolated_strong_boxes_are_not_accepted(score: float) -> None:
+    rng = np.random.default_rng(3)
+    frames: list[list[Seen]] = [
+        [(float(rng.uniform(20, 1260)), float(rng.uniform(20, 700)), score, "red")]
+        if i % 5 == 0
+        else []
+        for i in range(100)
+    ]
+
+    assert {one for said in decided(frames) for one in said} == {TOO_LITTLE_EVIDENCE}
+
+
+def test_clear_light_is_accepted_in_the_third_frame() -> None:
+    found = decided([[(600.0, 140.0, 0.8, "unknown")]] * 3)
+
+    assert found == [(TOO_LITTLE_EVIDENCE,), (TOO_LITTLE_EVIDENCE,), (ACCEPTED,)]
+
+
+def test_noise_at_the_lowest_scores_is_never_accepted() -> None:
+    found = decided([[(600.0, 140.0, 0.15, "unknown")]] * 300)
+
+    assert {one for said in found for one in said} == {TOO_LITTLE_EVIDENCE}
+
+
+def test_decisions_do_not_depend_on_the_order_of_boxes_and_detectors() -> None:
+    rng = np.random.default_rng(5)
+    places = [(100.0 + 90.0 * k, 140.0) for k in range(8)]
+    one, other, apart = (ControlTracks(car()) for _ in range(3))
+    for i in range(30):
+        seen: list[Seen] = [
+            (x + rng.normal(), y, float(rng.uniform(0.1, 0.7)), "unknown") for x, y in places
+        ]
+        order = rng.permutation(len(seen))
+        (said,) = one([frame(seen)], STEP)
+        (turned,) = other([frame([seen[k] for k in order])], STEP)
+        halves = apart([frame(seen[4:]), frame(seen[:4])], STEP)
+        assert [said.decisions[k] for k in order] == list(turned.decisions), i
+        assert said.decisions == halves[1].decisions + halves[0].decisions, i
+
+
+def test_decision_uses_nothing_of_later_frames() -> None:
+    rng = np.random.default_rng(7)
+    frames: list[list[Seen]] = [
+        [(600.0, 140.0, float(rng.uniform(0.1, 0.6)), "unknown")] for _ in range(40)
+    ]
+
+    whole = decided(frames)
+    for n in (1, 7, 25):
+        assert decided(frames[:n]) == whole[:n]
+
+
+def test_repeated_picture_adds_no_evidence() -> None:
+    one = ControlTracks(car())
+    seen = frame([(600.0, 140.0, 0.8, "red")])
+
+    found = [one([seen], STEP)[0].decisions for _ in range(100)]
+
+    assert set(found) == {(TOO_LITTLE_EVIDENCE,)}
+
+
+def test_pause_of_the_log_neither_adds_evidence_nor_takes_a_decision_back() -> None:
+    weak, strong = [(600.0, 140.0, 0.3, "unknown")], [(600.0, 140.0, 0.9, "unknown")]
+    for before, after in ((weak, TOO_LITTLE_EVIDENCE), (strong, ACCEPTED)):
+        one = ControlTracks(car())
+        for i in range(4):
+            one([frame(before, jitter=0.01 * i)], STEP)
+        (said,) = one([frame(before, jitter=1.0)], STEP._replace(seconds=600.0))
+        assert said.decisions == (after,)
+
+
+@pytest.mark.parametrize("rate_hz", [10, 20, 50])
+def test_evidence_of_a_second_is_the_same_at_any_frame_rate(rate_hz: int) -> None:
+    seconds = 1.0 / rate_hz
+    frames = [[(600.0, 140.0, 0.4, "unknown")]] * (6 * rate_hz)
+    found = decided(frames, step=STEP._replace(seconds=seconds))
+
+    first_s = seconds * next(i for i, one in enumerate(found) if one == (ACCEPTED,))
+    assert first_s == pytest.approx(0.6, abs=0.15)
+
+
+def test_light_that_is_missed_in_every_other_frame_is_still_found() -> None:
+    light: Seen = (600.0, 140.0, 0.6, "unknown")
+    found = decided([[light] if i % 2 else [] for i in range(60)])
+
+    assert found[-1] == (ACCEPTED,)
+
+
+def test_dark_housing_needs_more_frames_than_a_lit_one() -> None:
+    first = {}
+    for lens in ("red", "unknown", "dark"):
+        found = decided([[(600.0, 140.0, 0.5, lens)]] * 40)
+        first[lens] = found.index((ACCEPTED,))
+
+    assert first["red"] < first["unknown"] < first["dark"]
+
+
+@pytest.mark.parametrize(
+    ("look", "why"),
+    [
+        ("bar", "looks like another sign: a white bar"),
+        ("orange", "looks like another sign: orange"),
+        ("yellow", "looks like another sign: yellow"),
+        ("pale", "looks like another sign: not red"),
+    ],
+)
+def test_sign_that_looks_like_another_one_is_rejected_with_the_reason(look: str, why: str) -> None:
+    found = decided([[(600.0, 140.0, 0.95, look)]] * 100, SIGN)
+    mostly = [(600.0, 140.0, 0.95, look if i % 3 else "unknown") for i in range(100)]
+
+    assert set(found) == {(why,)}
+    assert decided([[one] for one in mostly], SIGN)[-1] == (why,)
+    assert decided([[(600.0, 140.0, 0.95, "stop")]] * 4, SIGN)[-1] == (ACCEPTED,)
+    assert decided([[(600.0, 140.0, 0.95, "unknown")]] * 4, SIGN)[-1] == (ACCEPTED,)
+
+
+def test_cue_counts_accepted_tracks_and_the_rest_is_accounted_for() -> None:
+    vehicle = car()
+    tally = CueTally(vehicle)
+    cues = CuePass(vehicle, tally=tally)
+    counts = []
+    for i in range(20):
+        seen = frame(
+            [(600.0, 140.0, 0.4, "unknown"), (900.0, 200.0, 0.12, "dark")], jitter=0.01 * i
+        )
+        counts.append(cues(FrameDetections(i * 10**8, (seen,))).counts["traffic_light"])
+
+    assert counts[0] == 0
+    assert counts[-1] == 1
+    found = tally.by_cue["traffic_light"]
+    assert (found.seen, found.used) == (40, sum(counts))
+    assert found.skipped == {TOO_LITTLE_EVIDENCE: 40 - sum(counts)}
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("", "tracks"),
+        ("[cues]\ntraffic_light_score = 0.6\n", "frames"),
+        ("[cues]\nstop_sign_score = 0.6\n", "frames"),
+        ("[cues]\nkind = 'tracks'\nstop_sign_score = 0.6\n", "tracks"),
+        ("name = 'crosscue simulated car'\n", "frames"),
+    ],
+)
+def test_published_rule_decides_every_frame_by_itself(text: str, kind: str) -> None:
+    vehicle = car(text)
+    seen = frame([(600.0, 140.0, 0.95, "unknown")])
+
+    assert vehicle.cues.kind == kind
+    (said,) = ControlTracks(vehicle)([seen], STEP)
+    assert (said is seen) == (kind == "frames")
+
+
+def test_other_labels_are_left_to_their_score() -> None:
+    both = frame([(600.0, 140.0, 0.95, "unknown"), (200.0, 400.0, 0.95, "")])
+    both = replace(both, labels=(LIGHT, "car"))
+
+    (said,) = ControlTracks(car())([both], STEP)
+
+    assert said.decisions == (TOO_LITTLE_EVIDENCE, "")
+    assert said.are_sure(None).tolist() == [False, True]
