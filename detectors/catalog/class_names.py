@@ -35,10 +35,11 @@ def _coco_90() -> tuple[str, ...]:
 # Class names by COCO's own numbers, which have gaps: number n is at index n - 1.
 COCO_90: Final = _coco_90()
 
+# Labels whose weak detections are kept, because tracks over frames decide on them.
+CONTROL_LABELS: Final = ("stop sign", "traffic light")
 # Labels that the default cues count.
 CUE_LABELS: Final = (
-    "stop sign",
-    "traffic light",
+    *CONTROL_LABELS,
     "car",
     "truck",
     "bus",

@@ -11,6 +11,7 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Found, Frame, View
 from crosscue.detectors.boxes import non_maximum_suppression
 from crosscue.detectors.catalog.card import ModelCard
+from crosscue.detectors.catalog.class_names import CONTROL_LABELS
 from crosscue.detectors.decoders.base import Array, BoxCandidates, BoxOutput
 from crosscue.replay.columns import Bytes, Floats, Int64s
 from crosscue.replay.errors import VehicleError
@@ -46,10 +47,12 @@ class BoxModel:
 
     Attributes:
         card: The model card.
-        output: Decoder of the network's output, with the minimum score of a detection.
+        output: Decoder of the network's output, with the minimum score of a traffic light or stop
+            sign.
         network: The loaded network.
         where: The card's file, for errors.
         identity: Text that changes with card, settings and back end.
+        score: Minimum score of any other detection.
     """
 
     card: ModelCard
@@ -57,6 +60,7 @@ class BoxModel:
     network: Network
     where: str
     identity: str
+    score: float
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -127,8 +131,16 @@ class BoxModel:
         )
         if bad:
             raise ValueError(f"{bad} of {len(some)} candidates are not finite numbers")
+        lowest = [
+            self.output.score if label in CONTROL_LABELS else self.score for label in self.labels
+        ]
+        is_above = some.scores >= np.array(lowest)[some.classes]
         keep = non_maximum_suppression(
-            some.boxes_px, some.scores, some.classes, self.output.score, self.output.overlap
+            some.boxes_px,
+            np.where(is_above, some.scores, -1.0),
+            some.classes,
+            self.output.score,
+            self.output.overlap,
         )
         boxes = placement.to_picture(some.boxes_px[keep])
         if part.corner is not None:

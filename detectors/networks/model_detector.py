@@ -1,6 +1,6 @@
 """Build a detector of boxes or of road from a model card.
 
-Settings: ``card``, ``backend``, ``threads``, ``score``.
+Settings: ``card``, ``backend``, ``threads``, ``score``, ``candidate_score``.
 """
 
 from __future__ import annotations
@@ -39,6 +39,9 @@ class ModelSettings(Settings):
     threads: int = 1
     score: Proportion | None = None
     """Minimum score of a detection; the card's by default."""
+    candidate_score: Proportion = 0.1
+    """Minimum score of a traffic light or stop sign where ``score`` is not specified: weak
+    detections become evidence over frames (``cues.kind = "tracks"``)."""
 
 
 def build(**given: Any) -> Detector:
@@ -55,12 +58,12 @@ def build(**given: Any) -> Detector:
         network = _network(card, weights, settings, 0.0)
         identity = _identity(card, settings, network)
         return _tried(RoadModel(card, card.output, network, str(path), identity), card, path)
-    output = card.output
-    if settings.score is not None:
-        output = output.model_copy(update={"score": settings.score})
+    usual = card.output.score if settings.score is None else settings.score
+    lowest = min(usual, settings.candidate_score) if settings.score is None else usual
+    output = card.output.model_copy(update={"score": lowest})
     network = _network(card, weights, settings, output.score)
     identity = _identity(card, settings, network)
-    return _tried(BoxModel(card, output, network, str(path), identity), card, path)
+    return _tried(BoxModel(card, output, network, str(path), identity, usual), card, path)
 
 
 def _network(card: ModelCard, weights: Weights, settings: ModelSettings, score: float) -> Network:

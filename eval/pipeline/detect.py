@@ -404,16 +404,11 @@ def _uncounted(
 def _without_thresholds(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
     """Return notices about labels without a threshold, fitted or set in the vehicle file."""
     cues, cars = vehicle.cues, vehicle.cars
-    open_labels = {
-        label
-        for labels, score in (
-            (cues.stop_sign_labels, cues.stop_sign_score),
-            (cues.traffic_light_labels, cues.traffic_light_score),
-            (cars.labels, cars.score),
-        )
-        if score is None
-        for label in labels
-    }
+    by_score = [(cars.labels, cars.score)]
+    if cues.kind != "tracks":
+        by_score.append((cues.stop_sign_labels, cues.stop_sign_score))
+        by_score.append((cues.traffic_light_labels, cues.traffic_light_score))
+    open_labels = {label for labels, score in by_score if score is None for label in labels}
     notices = []
     for one in named:
         missing = open_labels.intersection(reportable(one.detector) or ())

@@ -171,6 +171,7 @@ def _read_part(
 def _log_marks(
     recording: rr.RecordingStream, time: DriveTime, run: RunFolder, manifest: DriveManifest
 ) -> None:
+    from crosscue.detectors.cues.frame import CuePass
     from crosscue.eval.runs.tables.stored_frames import stored_frames
 
     from .anchored import Anchored
@@ -183,10 +184,12 @@ def _log_marks(
     marks = Overlays(manifest.settings)
     has_odometry = run.file("measurements.parquet").exists()
     anchored = Anchored(run, manifest, marks) if has_odometry else None
+    cues = CuePass(manifest.settings)
     frames = stored_frames(run, detected.detectors, with_road_masks=True)
     for number, frame in enumerate(frames):
-        marks.add(frame)
-        if anchored is not None:
+        if anchored is None:
+            marks.add(frame, cues(frame.seen).objects)
+        else:
             anchored.add(frame)
         if number % FRAMES_HELD == FRAMES_HELD - 1:
             marks.send(recording, time)

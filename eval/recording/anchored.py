@@ -65,7 +65,7 @@ class Anchored:
         self._ranges = _ranges_of(self.run)
 
     def add(self, frame: StoredFrame) -> None:
-        """Draw one frame that the marks have already begun."""
+        """Draw one frame, with the decisions of tracks on its detections."""
         seen, vehicle = frame.seen, self.manifest.settings
         fresh_ns = self._restarts.before(seen.t_ns)
         if fresh_ns is not None:
@@ -77,7 +77,8 @@ class Anchored:
         if ego.way_m is not None:
             place = intersection_place(self._before, ego.way_m, vehicle.fusion.length_m)
         self._before = self._ranges.get(seen.t_ns, [])
-        found = self._cues(seen, ego, place)
+        found = self._cues(seen, ego, place, frame.heights_px)
+        self.marks.add(frame, found.objects)
         if vehicle.regions.kind == "ground" and isinstance(seen.road, RoadMask):
             fractions = found.road
             polygons = outlines(vehicle.camera, vehicle.regions, place, frame.size_px)

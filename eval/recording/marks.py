@@ -6,7 +6,7 @@ of a mask's bytes and keeps the picture visible.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -15,7 +15,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from crosscue.detectors import rle
-from crosscue.detectors.base import Detections, RoadMask
+from crosscue.detectors.base import ACCEPTED, Detections, RoadMask
 from crosscue.detectors.cues.cars import (
     CarShapes,
     Pairs,
@@ -69,12 +69,17 @@ class Overlays:
     cars: Shapes = field(default_factory=lambda: Shapes("camera/cars", arrows))
     _before: CarShapes | None = None
 
-    def add(self, frame: StoredFrame) -> None:
-        """Draw one frame."""
+    def add(self, frame: StoredFrame, objects: Sequence[Detections]) -> None:
+        """Draw one frame.
+
+        Args:
+            frame: The frame.
+            objects: Its detections of objects, with the decisions of tracks on them.
+        """
         seen = frame.seen
         for shapes in self.all():
             shapes.begin(seen.t_ns)
-        for found in seen.objects:
+        for found in objects:
             self._objects(found)
         for found in seen.signs:
             for box, text, _ in _report_text(found):
@@ -164,7 +169,9 @@ class Overlays:
 def _report_text(found: Detections) -> Iterator[tuple[NDArray[np.float64], str, int]]:
     """Yield box, text and row of each detection."""
     for row, (label, score) in enumerate(zip(found.labels, found.scores.tolist(), strict=True)):
-        yield found.boxes_px[row], f"{label} {score:.2f}", row
+        why = found.decisions[row] if found.decisions else ""
+        text = f"{label} {score:.2f}" + (f", {why}" if why not in ("", ACCEPTED) else "")
+        yield found.boxes_px[row], text, row
 
 
 def road_lines(road: RoadMask) -> list[NDArray[np.float64]]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from statistics import median
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -101,21 +102,37 @@ class CarMotion(NamedTuple):
         return 0.5 * (x0 + x1), 0.5 * (y0 + y1)
 
 
-def motion_of(seen: Sequence[Observation], aside_mps: float = USUAL_MPS) -> CarMotion:
-    """Fit a constant velocity to one or more observations of a car.
+def motions_of(
+    cars: Sequence[Sequence[Observation]], aside_mps: float = USUAL_MPS
+) -> list[CarMotion]:
+    """Fit a constant velocity to one or more observations of each car, for all cars at once.
 
     Args:
-        seen: Observations, oldest first.
-        aside_mps: Prior standard deviation of its sideways speed. It is small for a car on the ego
+        cars: Observations of each car, oldest first.
+        aside_mps: Prior standard deviation of their sideways speed. It is small for cars on the ego
             vehicle's road. The change of bearing then determines the speed along the road far
             sooner than the change of size.
     """
+    if not cars:
+        return []
+    fits = zip(*(of.tolist() for of in _fit(cars, aside_mps)), strict=True)
+    return [_motion(seen, *fit) for seen, fit in zip(cars, fits, strict=True)]
+
+
+def motion_of(seen: Sequence[Observation], aside_mps: float = USUAL_MPS) -> CarMotion:
+    """Fit a constant velocity to one car, as in ``motions_of``."""
+    return motions_of([seen], aside_mps)[0]
+
+
+def _motion(
+    seen: Sequence[Observation],
+    speed_mps: Sequence[Sequence[float]],
+    sd_mps: Sequence[Sequence[float]],
+    misfit: Sequence[float],
+) -> CarMotion:
+    """Combine the fits of a car's two ends."""
     newest = seen[-1]
-    ends = [_fit(seen, side, aside_mps) for side in (0, 1)]
-    (left, left_sd, *_), (right, right_sd, *_) = ends
-    agree = left * right > 0.0
-    right_mps = math.copysign(min(abs(left), abs(right)), left) if agree else 0.0
-    ahead_mps, ahead_sd = (0.5 * (ends[0][k] + ends[1][k]) for k in (2, 3))
+    (ahead, left), (ahead_too, right) = speed_mps
     passed_s = newest.t_s - seen[0].t_s
     way_m = math.dist(newest.pose[:2], seen[0].pose[:2])
     scale_sd = HEIGHT_FRACTION * way_m / passed_s if passed_s > 0.0 else USUAL_MPS
@@ -125,36 +142,66 @@ def motion_of(seen: Sequence[Observation], aside_mps: float = USUAL_MPS) -> CarM
         frames=len(seen),
         distance_m=newest.distance_m,
         bearing=0.5 * sum(map(math.tan, newest.edges_rad)),
-        right_mps=right_mps,
-        right_sd_mps=max(left_sd, right_sd),
-        ahead_mps=ahead_mps,
-        ahead_sd_mps=math.hypot(ahead_sd, scale_sd),
-        is_steady=max(ends[0][4], ends[1][4]) <= MAX_MISFIT,
-        long=float(np.median([one.long for one in seen])),
+        right_mps=math.copysign(min(abs(left), abs(right)), left) if left * right > 0.0 else 0.0,
+        right_sd_mps=max(sd_mps[0][1], sd_mps[1][1]),
+        ahead_mps=0.5 * (ahead + ahead_too),
+        ahead_sd_mps=math.hypot(0.5 * (sd_mps[0][0] + sd_mps[1][0]), scale_sd),
+        is_steady=max(misfit) <= MAX_MISFIT,
+        long=median([one.long for one in seen]),
         nose=sum(noses) / len(noses) if noses else 0.0,
         is_hidden=newest.is_hidden,
     )
 
 
 def _fit(
-    seen: Sequence[Observation], side: int, aside_mps: float
-) -> tuple[float, float, float, float, float]:
-    """Fit one end of a car: speed to the right with s.d., speed ahead with s.d., and misfit."""
-    newest = seen[-1]
-    places = np.array([place_of_end(one, side, newest) for one in seen])
-    weights = _weights(seen, side, newest)
-    late_s = np.array([one.t_s - newest.t_s for one in seen])
-    models = np.concatenate(
-        [np.tile(np.eye(2), (len(seen), 1, 1)), late_s[:, None, None] * np.eye(2)], axis=2
+    cars: Sequence[Sequence[Observation]], aside_mps: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Fit both ends of C cars, each in the axes of the camera pose at its newest observation.
+
+    Returns:
+        Speed ahead and to the right of each end, shape (C, 2, 2), their standard deviations, and
+        the misfit of each end, shape (C, 2).
+    """
+    counts = np.array([len(seen) for seen in cars])
+    most = int(counts.max())
+    # Shorter tracks are padded with their newest observation, without weight.
+    table = np.array(
+        [
+            [(one.t_s, *one.pose, one.distance_m, one.error, *one.edges_rad) for one in seen]
+            + [(seen[-1].t_s, *seen[-1].pose, 1.0, 1.0, 0.0, 0.0)] * (most - len(seen))
+            for seen in cars
+        ]
     )
-    weighted = np.swapaxes(models, 1, 2) @ weights
-    prior = np.diag([0.0, 0.0, USUAL_MPS**-2, aside_mps**-2])
-    covariance = np.linalg.inv(prior + (weighted @ models).sum(axis=0))
-    state = covariance @ np.einsum("nij,nj->i", weighted, places)
-    off = places - models @ state
-    misfit = float(np.einsum("ni,nij,nj->", off, weights, off)) / max(2 * len(seen) - 4, 1)
-    sd = np.sqrt(np.diagonal(covariance))
-    return float(state[3]), float(sd[3]), float(state[2]), float(sd[2]), misfit
+    is_real = (np.arange(most) < counts[:, None])[:, None, :]
+    newest = np.array([(seen[-1].t_s, *seen[-1].pose) for seen in cars])
+    late_s, x, y, heading = np.moveaxis(table[:, :, :4] - newest[:, None, :], 2, 0)[:, :, None, :]
+    distance_m, error = table[:, None, :, 4], table[:, None, :, 5]
+    edge = np.swapaxes(table[:, :, 6:], 1, 2)
+    far_m, sight = distance_m / np.cos(edge), heading - edge
+    cos, sin = np.cos(newest[:, 3, None, None]), np.sin(newest[:, 3, None, None])
+    c, s = np.cos(sight), np.sin(sight)
+    places = np.stack([x * cos + y * sin + far_m * c, x * sin - y * cos - far_m * s])
+    # Inverse covariances: the errors are large along the line of sight and small across it.
+    along, across = is_real / (error * far_m) ** 2, is_real / (error * CAR_HEIGHT_M) ** 2
+    turned = (across - along) * c * s
+    weights = np.array(
+        [[along * c**2 + across * s**2, turned], [turned, along * s**2 + across * c**2]]
+    )
+    powers = late_s ** np.arange(3)[:, None, None, None]
+    normal = np.einsum("abkin,mkin->mkiab", weights, np.broadcast_to(powers, (3, *far_m.shape)))
+    weighted = np.einsum("abkin,bkin->akin", weights, places)
+    pulled = [
+        np.einsum("akin,kin->kia", weighted, np.broadcast_to(p, far_m.shape)) for p in powers[:2]
+    ]
+    information = np.block([[normal[0], normal[1]], [normal[1], normal[2]]])
+    information[..., 2:, 2:] += np.diag([USUAL_MPS**-2, aside_mps**-2])
+    covariance = np.linalg.inv(information)
+    state = np.einsum("kiab,kib->kia", covariance, np.concatenate(pulled, axis=2))
+    predicted = state[..., :2, None] + state[..., 2:, None] * late_s[:, :, None, :]
+    off = places - np.moveaxis(predicted, 2, 0)
+    squares = np.einsum("akin,abkin,bkin->ki", off, weights, off)
+    sd = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
+    return state[..., 2:], sd[..., 2:], squares / np.maximum(2 * counts - 4, 1)[:, None]
 
 
 def place_of_end(one: Observation, side: int, newest: Observation) -> tuple[float, float]:
@@ -166,20 +213,3 @@ def place_of_end(one: Observation, side: int, newest: Observation) -> tuple[floa
     north = y - newest.pose[1] + far_m * math.sin(sight)
     cos, sin = math.cos(newest.pose[2]), math.sin(newest.pose[2])
     return east * cos + north * sin, east * sin - north * cos
-
-
-def _weights(seen: Sequence[Observation], side: int, newest: Observation) -> NDArray[np.float64]:
-    """Inverse covariances of ``place_of_end``, shape (N, 2, 2): large along the line of sight."""
-    rows = [
-        (newest.pose[2] - one.pose[2] + one.edges_rad[side], one.error, one.distance_m)
-        for one in seen
-    ]
-    angle, error, distance_m = np.array(rows).T
-    along = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    along_sd = error * distance_m / np.cos([one.edges_rad[side] for one in seen])
-    across_sd = error * CAR_HEIGHT_M
-    return np.asarray(
-        along[:, :, None] * along[:, None, :] / along_sd[:, None, None] ** 2
-        + across[:, :, None] * across[:, None, :] / across_sd[:, None, None] ** 2
-    )

@@ -24,7 +24,7 @@ from crosscue.detectors.cues.tracked.motion import (
     USUAL_MPS,
     CarMotion,
     Observation,
-    motion_of,
+    motions_of,
     place_of_end,
 )
 from crosscue.detectors.ranging.ground_plane import GroundPlane
@@ -126,7 +126,7 @@ class CarTracks:
         within_m = self._settings.within_m
         self.seen = sum(one.is_sure and one.distance_m <= within_m for _, one in cars)
         self._again = [track for track in again if track.seen[-1].is_sure]
-        return [_motion(track, self._settings.max_frames) for track in self._again]
+        return _motions(self._again, [self._settings.max_frames] * len(self._again))
 
     def longer(self) -> list[CarMotion]:
         """Fit the same cars to their newest ``past_frames``, because distant cars grow slowly.
@@ -136,10 +136,7 @@ class CarTracks:
         to move, or two cars were confused.
         """
         settings = self._settings
-        return [
-            _steady_motion(track, settings.past_frames, settings, ALONG_ASIDE_MPS)
-            for track in self._again
-        ]
+        return _steady_motions(self._again, settings.past_frames, settings, ALONG_ASIDE_MPS)
 
     def standing(self) -> list[CarMotion]:
         """Fit the same cars to their newest ``parked_frames``, because standing shows late.
@@ -147,7 +144,7 @@ class CarTracks:
         If no constant velocity fits all frames, fewer are used, as in ``longer``.
         """
         settings = self._settings
-        return [_steady_motion(track, settings.parked_frames, settings) for track in self._again]
+        return _steady_motions(self._again, settings.parked_frames, settings)
 
     def _observed(
         self, found: Sequence[Detections]
@@ -247,10 +244,17 @@ def are_hidden(boxes_px: NDArray[np.float64], are_sure: NDArray[np.bool_]) -> li
     return [bool(one) for one in is_covered.any(axis=1)]
 
 
-def _motion(track: _Track, frames: int, aside_mps: float = USUAL_MPS) -> CarMotion:
-    x0, y0, x1, y1 = track.box_px.tolist()
-    found = motion_of(track.seen[-frames:], aside_mps)
-    return found._replace(number=track.number, box_px=(x0, y0, x1, y1), step_px=track.step_px)
+def _motions(
+    tracks: Sequence[_Track], frames: Sequence[int], aside_mps: float = USUAL_MPS
+) -> list[CarMotion]:
+    """Fit the motion of each track to its newest frames, of a number for each track."""
+    seen = [track.seen[-number:] for track, number in zip(tracks, frames, strict=True)]
+    return [
+        found._replace(
+            number=track.number, box_px=tuple(track.box_px.tolist()), step_px=track.step_px
+        )
+        for track, found in zip(tracks, motions_of(seen, aside_mps), strict=True)
+    ]
 
 
 def _moved(axle: tuple[float, float, float], motion: CarStep) -> tuple[float, float, float]:
@@ -264,13 +268,17 @@ def _moved(axle: tuple[float, float, float], motion: CarStep) -> tuple[float, fl
     )
 
 
-def _steady_motion(
-    track: _Track, frames: int, settings: Cars, aside_mps: float = USUAL_MPS
-) -> CarMotion:
-    found = _motion(track, frames, aside_mps)
-    while not found.is_steady and found.frames > settings.max_frames:
-        frames = max(found.frames // 2, settings.max_frames)
-        found = _motion(track, frames, aside_mps)
+def _steady_motions(
+    tracks: Sequence[_Track], frames: int, settings: Cars, aside_mps: float = USUAL_MPS
+) -> list[CarMotion]:
+    found = _motions(tracks, [frames] * len(tracks), aside_mps)
+    while again := [
+        i for i, one in enumerate(found) if not one.is_steady and one.frames > settings.max_frames
+    ]:
+        fewer = [max(found[i].frames // 2, settings.max_frames) for i in again]
+        refitted = _motions([tracks[i] for i in again], fewer, aside_mps)
+        for i, one in zip(again, refitted, strict=True):
+            found[i] = one
     return found
 
 

@@ -222,8 +222,7 @@ def _widened_m2(one: ObjectTrack, others: Sequence[ObjectTrack]) -> float:
     face the same way are clearly at another range, but too close to be on the other side of the
     intersection, then the interval is widened until it contains them.
     """
-    assumed = 1.0 - one.estimate.by_motion
-    var_m2 = one.var_m2 + LOOK_ALIKES * assumed * (LOOK_ALIKE_SPREAD * one.range_m) ** 2
+    var_m2 = one.var_m2 + _look_alike_m2(one)
     off_m = [
         abs(other.range_m - one.range_m)
         for other in others
@@ -231,6 +230,12 @@ def _widened_m2(one: ObjectTrack, others: Sequence[ObjectTrack]) -> float:
     ]
     widest_m = max((off for off in off_m if off <= NARROWEST_M), default=0.0)
     return max(var_m2, (widest_m / CLEARLY) ** 2)
+
+
+def _look_alike_m2(one: ObjectTrack) -> float:
+    """Return the variance of an object of assumed size that may be of any other size."""
+    assumed = 1.0 - one.estimate.by_motion
+    return LOOK_ALIKES * assumed * (LOOK_ALIKE_SPREAD * one.range_m) ** 2
 
 
 def _start_candidates(tracks: Sequence[ObjectTrack], end: ObjectTrack | None) -> list[ObjectTrack]:
@@ -245,7 +250,7 @@ def _start_candidates(tracks: Sequence[ObjectTrack], end: ObjectTrack | None) ->
         for one in tracks
         if one.facing is not Facing.UNKNOWN
         and end.range_m - one.range_m > NARROWEST_M
-        and _is_apart(one, end)
+        and (one.facing is Facing.AWAY or _is_apart(one, end))
     ]
 
 
@@ -305,7 +310,7 @@ class _Choice:
         if kept:
             return kept[0]
         often = 0.5 * max(one.seen for one in group)
-        return max((one for one in group if one.seen >= often), key=lambda one: sign * one.range_m)
+        return min((one for one in group if one.seen >= often), key=lambda one: one.var_m2)
 
     def _is_eligible(self, one: ObjectTrack) -> bool:
         settings = self.vehicle.range_filter
@@ -323,4 +328,5 @@ class _Choice:
 
 def _is_apart(one: ObjectTrack, other: ObjectTrack) -> bool:
     """Return whether two tracks are clearly at different ranges."""
-    return abs(one.range_m - other.range_m) > CLEARLY * math.sqrt(difference_var_m2(one, other))
+    var_m2 = difference_var_m2(one, other) + _look_alike_m2(one) + _look_alike_m2(other)
+    return abs(one.range_m - other.range_m) > CLEARLY * math.sqrt(var_m2)

@@ -108,8 +108,8 @@ def test_scores_and_thresholds_are_those_of_the_labels() -> None:
     both, labels = (FEW, MORE), ("car", "van")
 
     assert label_scores(both, labels) == [0.6, 0.5, 0.2, 0.7]
-    assert unsure_of(both, labels, 0.5) == 2
-    assert unsure_of(both, labels, None) == 3
+    assert unsure_of(both, labels, 0.5) == {BELOW_SCORE: 2}
+    assert unsure_of(both, labels, None) == {BELOW_SCORE: 3}
     assert count_labels(both, labels, 0.5) == 2
     assert count_labels(both, labels, None) == 1
     assert thresholds_met(both, labels, 0.4) == [0.4]
