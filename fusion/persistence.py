@@ -13,6 +13,10 @@ first-order autoregression with correlation ``rho = exp(-distance / fade)``, a f
 (1 - rho) / (1 + rho) independent ones (``effective_sample_fraction``); for moving objects, time
 replaces distance. A frame at the position of the previous one therefore adds nothing, and a cue
 that remains over a whole approach counts a few times. Dissent is discounted in the same way.
+
+A cue with ``at_most`` cannot give more than this probability, however long it is seen, until
+another cue of the approach supports a feature, too: a light may be a pedestrian crossing's, and no
+number of frames tells. Its messages beyond are held back until then.
 """
 
 from __future__ import annotations
@@ -76,6 +80,8 @@ class _Sent:
 
     positive_at: float = -math.inf
     dissent_at: float = -math.inf
+    held_back: float = 0.0
+    given: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +107,7 @@ class PersistentMessageModel:
         self._lines = _lines_of(graph, dissent)
         self._way_m = 0.0
         self._time_s = 0.0
+        self._speaking: set[str] = set()
 
     def __call__(self, situation: Situation) -> list[float]:
         """Return the sum of the messages of one frame, in log odds."""
@@ -120,6 +127,12 @@ class PersistentMessageModel:
                     self.silent[line.cue.name] = why
                 continue
             self._add_messages(line, count > 0, situation.may_dissent, out)
+        for line in self._lines:
+            # What a cue held back is sent once another cue of the approach has spoken.
+            if line.sent.held_back and self._speaking - {line.cue.name}:
+                for feature, odds in line.detected:
+                    out[feature] += line.sent.held_back * odds
+                line.sent.held_back = 0.0
         return out
 
     def _add_messages(
@@ -135,6 +148,14 @@ class PersistentMessageModel:
             line.sent.dissent_at = at
         else:
             return
+        if is_positive and line.detected:
+            self._speaking.add(line.cue.name)
+            limit, says = line.cue.at_most, log_odds(line.cue.precision)
+            if limit is not None and says > 0.0 and self._speaking == {line.cue.name}:
+                room = max(log_odds(limit) - line.sent.given, 0.0)
+                wanted, worth = worth, min(worth, room / says)
+                line.sent.held_back += wanted - worth
+                line.sent.given += worth * says
         for feature, odds in line.detected if is_positive else line.absent:
             out[feature] += worth * odds
 

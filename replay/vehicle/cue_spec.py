@@ -46,6 +46,8 @@ class CueSpec:
         of_frames: For the persistent belief, the number of most recent frames considered.
         within_m: For the persistent belief, the maximum distance of the intersection. The source's
             runs begin 100 m before the intersections, so no cue was validated beyond that.
+        at_most: For the persistent belief, the probability that this cue can give a feature as long
+            as no other cue speaks for the intersection; None for no limit.
         fade_m: Distance over which its errors are correlated, for stationary objects.
         fade_s: Time over which its errors are correlated, for moving objects; replaces ``fade_m``.
     """
@@ -70,6 +72,7 @@ class CueSpec:
     seen_frames: int = 3
     of_frames: int = 5
     within_m: float = 100.0
+    at_most: float | None = None
     fade_m: float = 10.0
     fade_s: float | None = None
 

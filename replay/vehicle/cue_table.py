@@ -13,7 +13,12 @@ from crosscue.replay.plugins import loaded
 from .cue_spec import FEATURE_COLOURS, CueSpec
 
 
-def _control(name: str, precision: float) -> CueSpec:
+# Assumed proportion of lights that are at an intersection; the others are at pedestrian crossings,
+# railways and exits. No count is available.
+AT_INTERSECTIONS: Final = 0.95
+
+
+def _control(name: str, precision: float, at_most: float | None = None) -> CueSpec:
     return CueSpec(
         name=name,
         group=name,
@@ -24,6 +29,7 @@ def _control(name: str, precision: float) -> CueSpec:
         supports=("intersection",),
         can_start=True,
         settings=name,
+        at_most=at_most,
     )
 
 
@@ -130,7 +136,7 @@ def _one_way(side: str, other: str) -> CueSpec:
 
 
 STOP_SIGN: Final = _control("stop_sign", 0.97)
-TRAFFIC_LIGHT: Final = _control("traffic_light", 0.95)
+TRAFFIC_LIGHT: Final = _control("traffic_light", 0.95, AT_INTERSECTIONS)
 DO_NOT_ENTER: Final = CueSpec(
     name="do_not_enter",
     group="do_not_enter",

@@ -104,6 +104,9 @@ class CueEntry(Section):
     within_m: Positive = 100.0
     """With ``kind = "persistent"``: maximum range of the intersection, because the cue was not
     validated beyond. It does not apply where the range is unknown."""
+    at_most: Probability | None = None
+    """With ``kind = "persistent"``: probability that it can give a feature as long as no other cue
+    speaks for the intersection. A light may be a pedestrian crossing's, however long it is seen."""
     fade: Fade = Fade(way_m=10.0)
     """With ``kind = "persistent"``: correlation length of its errors."""
     use: bool = True
@@ -138,6 +141,7 @@ def usual_cues() -> dict[str, CueEntry]:
             seen_frames=cue.seen_frames,
             of_frames=cue.of_frames,
             within_m=cue.within_m,
+            at_most=cue.at_most,
             fade=Fade(way_m=cue.fade_m) if cue.fade_s is None else Fade(time_s=cue.fade_s),
         )
         for name, cue in CUES.items()

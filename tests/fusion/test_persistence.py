@@ -300,3 +300,35 @@ def test_source_kind_counts_every_frame_and_detection() -> None:
     total = sum(model(situation(counts, new_picture=False, moved_m=0.0))[place] for _ in range(7))
 
     assert total == pytest.approx(7 * 2 * log_odds(0.86))
+
+
+def test_light_alone_gives_no_more_than_its_limit_until_another_cue_speaks() -> None:
+    """A light of 9/10 over many independent frames, at most 19/20, then with a road of 3/4."""
+    model = PersistentMessageModel(
+        FactorGraph(
+            (Feature("intersection"), Feature("left")),
+            (
+                CueNode("light", 0.9, can_start=True, at_most=0.95),
+                CueNode("road", 0.75, can_start=True),
+            ),
+            (Edge("light", "intersection"), Edge("road", "left")),
+        ),
+        0.49,
+    )
+    alone = [model(situation({"light": 1}, moved_m=1e6))[0] for _ in range(20)]
+    both = model(situation({"light": 1, "road": 1}, moved_m=1e6))
+
+    assert sum(alone) == pytest.approx(math.log(19.0))
+    assert alone[0] == pytest.approx(math.log(9.0))
+    assert sum(alone) + both[0] == pytest.approx(21.0 * math.log(9.0))
+    assert both[1] == pytest.approx(LOG_3)
+
+
+def test_real_light_is_believed_but_certain_only_with_a_road_or_traffic() -> None:
+    light = frames_of("traffic_light", [1] * 100)
+    crossing = frames_of("cross_traffic_left", [1] * 10, begin=100)
+    last = fusion_steps([*light, *crossing])
+
+    assert 0.9 < last[99].probabilities["intersection"] == pytest.approx(0.95)
+    assert last[-1].probabilities["intersection"] > 0.99
+    assert 0.9 < fusion_steps(frames_of("stop_sign", [1] * 100))[-1].probabilities["intersection"]
