@@ -32,9 +32,6 @@ DATA: Final = Path(os.environ.get("CROSSCUE_DATA", "../shared/data"))
 FEATURES: Final = ("left", "right", "straight")
 BELIEVED: Final = 0.9
 DETECTORS: Final = """
-[cues]
-stop_sign_score = 0.5
-traffic_light_score = 0.5
 [cars]
 labels = ["car", "truck", "bus"]
 score = 0.5

@@ -63,8 +63,8 @@ class CueNode:
         seen_frames: With persistence: minimum number of positive frames.
         of_frames: With persistence: number of last frames among which ``seen_frames`` are counted.
         within_m: With persistence: distance of the intersection beyond which it sends no message.
-        at_most: With persistence: probability that it can give a feature alone; None for no limit.
         fade: With persistence: distance or time over which its errors become independent.
+        at_most: With persistence: probability that it can give a feature alone; None for no limit.
     """
 
     name: str
@@ -75,8 +75,8 @@ class CueNode:
     seen_frames: int = 1
     of_frames: int = 1
     within_m: float = math.inf
-    at_most: float | None = None
     fade: Fade = USUAL_FADE
+    at_most: float | None = None
 
     @property
     def moves(self) -> bool:
@@ -165,8 +165,8 @@ def graph_of(fusion: Fusion) -> FactorGraph:
                 c.seen_frames,
                 c.of_frames,
                 c.within_m,
-                c.at_most,
                 c.fade,
+                c.at_most,
             )
             for name, c in cues.items()
         ),

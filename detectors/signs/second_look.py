@@ -68,7 +68,8 @@ def look_at_sign(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Look
 
     face = cv2.resize(_cut(pixels, box_px), (2 * GRID, 2 * GRID), interpolation=cv2.INTER_AREA)
     y, x = _grid(2 * GRID)
-    hue, saturation, value = (part[x**2 + y**2 < 0.8] for part in _hsv(face))
+    # Inside a circle, without the corners beyond the octagon.
+    hue, saturation, value = np.asarray(cv2.cvtColor(face, cv2.COLOR_BGR2HSV))[x**2 + y**2 < 0.8].T
     if np.median(value) < MIN_LIGHT:
         return "unknown"
     is_coloured = (saturation >= MIN_SATURATION) & (value >= MIN_VALUE)
@@ -138,12 +139,6 @@ def _cut(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> NDArray[np.u
     rows = np.clip(np.arange(y0, max(y1, y0 + 1)), 0, height - 1)
     columns = np.clip(np.arange(x0, max(x1, x0 + 1)), 0, width - 1)
     return np.asarray(pixels[np.ix_(rows, columns)])
-
-
-def _hsv(face: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
-    import cv2
-
-    return tuple(cv2.split(cv2.cvtColor(face, cv2.COLOR_BGR2HSV)))
 
 
 def _grid(side: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

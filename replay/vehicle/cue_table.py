@@ -12,7 +12,6 @@ from crosscue.replay.plugins import loaded
 
 from .cue_spec import FEATURE_COLOURS, CueSpec
 
-
 # Assumed proportion of lights that are at an intersection; the others are at pedestrian crossings,
 # railways and exits. No count is available.
 AT_INTERSECTIONS: Final = 0.95

@@ -325,10 +325,12 @@ def test_light_alone_gives_no_more_than_its_limit_until_another_cue_speaks() -> 
 
 
 def test_real_light_is_believed_but_certain_only_with_a_road_or_traffic() -> None:
-    light = frames_of("traffic_light", [1] * 100)
-    crossing = frames_of("cross_traffic_left", [1] * 10, begin=100)
-    last = fusion_steps([*light, *crossing])
+    light = frames_of("traffic_light", [1] * 60)
+    crossing = frames_of("cross_traffic_left", [1] * 10, begin=60)
+    steps = fusion_steps([*light, *crossing])
+    signs = fusion_steps(frames_of("stop_sign", [1] * 60))
 
-    assert 0.9 < last[99].probabilities["intersection"] == pytest.approx(0.95)
-    assert last[-1].probabilities["intersection"] > 0.99
-    assert 0.9 < fusion_steps(frames_of("stop_sign", [1] * 100))[-1].probabilities["intersection"]
+    assert steps[59].probabilities["intersection"] == pytest.approx(0.95)
+    assert steps[59].established
+    assert steps[-1].probabilities["intersection"] > 0.99
+    assert signs[-1].probabilities["intersection"] > 0.99

@@ -38,6 +38,8 @@ from .sign_ranges import MEASURED
 
 # Min difference of two clearly different ranges, in standard deviations.
 CLEARLY: Final = 2.0
+# Max ratio of the relative standard deviations of equally good ranges.
+SURELY: Final = 1.25
 # Max distance of a light behind the nearest one at the same intersection.
 WIDEST_M: Final = 60.0
 # Min distance between two groups, the width of a two-lane street with its kerbs.
@@ -222,20 +224,23 @@ def _widened_m2(one: ObjectTrack, others: Sequence[ObjectTrack]) -> float:
     face the same way are clearly at another range, but too close to be on the other side of the
     intersection, then the interval is widened until it contains them.
     """
-    var_m2 = one.var_m2 + _look_alike_m2(one)
     off_m = [
         abs(other.range_m - one.range_m)
         for other in others
         if other.facing is one.facing and _is_apart(one, other)
     ]
     widest_m = max((off for off in off_m if off <= NARROWEST_M), default=0.0)
-    return max(var_m2, (widest_m / CLEARLY) ** 2)
+    return max(one.var_m2 + _look_alike_m2(one), (widest_m / CLEARLY) ** 2)
 
 
 def _look_alike_m2(one: ObjectTrack) -> float:
     """Return the variance of an object of assumed size that may be of any other size."""
     assumed = 1.0 - one.estimate.by_motion
     return LOOK_ALIKES * assumed * (LOOK_ALIKE_SPREAD * one.range_m) ** 2
+
+
+def _relative_sd(one: ObjectTrack) -> float:
+    return math.sqrt(one.var_m2 + _look_alike_m2(one)) / one.range_m
 
 
 def _start_candidates(tracks: Sequence[ObjectTrack], end: ObjectTrack | None) -> list[ObjectTrack]:
@@ -310,7 +315,10 @@ class _Choice:
         if kept:
             return kept[0]
         often = 0.5 * max(one.seen for one in group)
-        return min((one for one in group if one.seen >= often), key=lambda one: one.var_m2)
+        sure = {one.number: _relative_sd(one) for one in group if one.seen >= often}
+        limit = SURELY * min(sure.values())
+        best = (one for one in group if sure.get(one.number, math.inf) <= limit)
+        return max(best, key=lambda one: sign * one.range_m)
 
     def _is_eligible(self, one: ObjectTrack) -> bool:
         settings = self.vehicle.range_filter

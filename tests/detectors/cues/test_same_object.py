@@ -13,9 +13,9 @@ from crosscue.detectors.cues.observed import FrameDetections
 from crosscue.detectors.cues.same_object import KEPT, MIN_IOU, label_meanings, same_objects
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import iou
-from crosscue.replay.vehicle.vehicle import Cars, Vehicle
+from crosscue.replay.vehicle.vehicle import Cars, Cues, Vehicle
 
-VEHICLE = Vehicle(version=1, cars=Cars(labels=("car", "truck")))
+VEHICLE = Vehicle(version=1, cues=Cues(kind="frames"), cars=Cars(labels=("car", "truck")))
 MEANING = label_meanings(VEHICLE)
 Object = tuple[str, float, float]
 OBJECTS = st.lists(
