@@ -40,7 +40,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "street.jpg").write_bytes(picture(0, ".jpg"))
     (place / "names.txt").write_text("\n".join(CLASSES))
     (place / HOME).mkdir(parents=True)
-    (place / HOME / "vehicle.toml").write_text("version = 1\n")
+    (place / HOME / "vehicle.toml").write_text('version = 1\n[cues]\nkind = "frames"\n')
     start_ns, end_ns = round(1e9 * (START_S - 1.0)), round(1e9 * (START_S + 1.0))
     cue = CueTruth(cue="stop_sign", present=True, start_ns=start_ns, end_ns=end_ns)
     save(Truth(version=1, start_ns=start_ns, end_ns=end_ns, cues=(cue,)), place / HOME)
