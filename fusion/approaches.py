@@ -16,6 +16,7 @@ ahead is seen everywhere. Staleness depends on distance, not on time, so the app
 waits at the stop line remains open. While it stands, only cues of moving objects are evidence; only
 the published belief (``source``) counts every frame. Without odometry, the distance is estimated
 with ``RangeFilter.unseen_mps``, which also widens the ranges; a range that is too wide is dropped.
+Only the published belief lets this distance end an approach whose evidence is still in view.
 """
 
 from __future__ import annotations
@@ -266,7 +267,9 @@ class Approaches:
         has = (current.start.belief is not None) + (current.end.belief is not None)
         if has < had:
             self.counts["ranges dropped: too uncertain"] += had - has
-        current.way_m += moved_m
+        if self._is_published or (evidence.travelled_m is not None and _has_way(evidence)):
+            # An assumed distance ends no approach whose evidence is in view: the car may stand.
+            current.way_m += moved_m
         current.since_evidence_m += max(moved_m - evidence.assumed_m, 0.0)
         current.since_dissent_m += moved_m
         if evidence.turned_rad is not None and math.isfinite(evidence.turned_rad):

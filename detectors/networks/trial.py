@@ -50,4 +50,4 @@ def _oddity_on(detector: BoxModel, pixels: Bytes) -> str | None:
         found = every.candidates(outputs, placement.size_px)
     except ValueError as error:
         return str(error)
-    return oddity(found, placement.size_px, detector.output.score)
+    return oddity(found, placement.size_px, detector.score)

@@ -490,10 +490,13 @@ def shared_size(size: SizePrior, others: Sequence[tuple[float, float]]) -> SizeP
 
 def iou(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """Intersection over union of two boxes."""
-    low, high = np.maximum(one[:2], other[:2]), np.minimum(one[2:], other[2:])
-    inside = float(np.prod(np.maximum(high - low, 0.0)))
-    both = float(np.prod(one[2:] - one[:2]) + np.prod(other[2:] - other[:2]))
-    return inside / (both - inside) if both > inside else 0.0
+    # Plain numbers: this is called for all pairs of boxes, and arrays of four would take most of it.
+    left, top, right, bottom = one.tolist()
+    x0, y0, x1, y1 = other.tolist()
+    wide, high = min(right, x1) - max(left, x0), min(bottom, y1) - max(top, y0)
+    inside = max(wide, 0.0) * max(high, 0.0)
+    both = (right - left) * (bottom - top) + (x1 - x0) * (y1 - y0)
+    return float(inside / (both - inside)) if both > inside else 0.0
 
 
 def _cost_of(track: ObjectTrack, box_px: NDArray[np.float64], height_px: float) -> float:

@@ -607,3 +607,20 @@ def test_range_errors_over_drives_match_reported_variance() -> None:
 
     # The gate at 16 rejects one good measurement in 16,000.
     assert np.mean(nees) == pytest.approx(1.0, abs=4 * math.sqrt(2 / 300))
+
+
+def test_wait_of_unknown_length_at_a_light_in_view_is_one_approach() -> None:
+    """A minute without odometry: nothing says that the car has driven on."""
+    fusion = Fusion(kind="persistent")
+    end = RangePosterior(Reference.END, 80.0, 100.0, 80.0)
+    without = [
+        FrameEvidence(i * FRAME_NS, None, 0.0, (), {**NONE_SEEN, "traffic_light": 1})
+        for i in range(600)
+    ]
+    ranged = [replace(one, posteriors=(end,)) for one in without]
+    at_times = [ranged[i] if i % 40 == 0 else one for i, one in enumerate(without)]
+
+    for evidence in (without, ranged, at_times):
+        loop = Approaches(graph_of(fusion), fusion, RangeFilter())
+        numbers = {loop(one).approach for one in evidence}
+        assert numbers - {None} == {1}

@@ -288,10 +288,10 @@ def _cost_moving(track: _Track, box_px: NDArray[np.float64], one: Observation) -
     A car that was seen only once has no prediction.
     """
     last = track.seen[-1]
-    predicted = track.box_px + (one.t_s - last.t_s) * track.edges_pxps
-    grown = one.distance_m / last.distance_m
-    overlap = iou(predicted, box_px)
-    return 1.0 - overlap if overlap > MIN_OVERLAP and 1.0 / GROWTH < grown < GROWTH else math.inf
+    if not 1.0 / GROWTH < one.distance_m / last.distance_m < GROWTH:
+        return math.inf
+    overlap = iou(track.box_px + (one.t_s - last.t_s) * track.edges_pxps, box_px)
+    return 1.0 - overlap if overlap > MIN_OVERLAP else math.inf
 
 
 def _cost_standing(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float:
