@@ -490,7 +490,7 @@ def shared_size(size: SizePrior, others: Sequence[tuple[float, float]]) -> SizeP
 
 def iou(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """Intersection over union of two boxes."""
-    # Plain numbers: this is called for all pairs of boxes, and arrays of four would take most of it.
+    # Plain numbers: this is called for all pairs of boxes, and small arrays would be slow.
     left, top, right, bottom = one.tolist()
     x0, y0, x1, y1 = other.tolist()
     wide, high = min(right, x1) - max(left, x0), min(bottom, y1) - max(top, y0)
