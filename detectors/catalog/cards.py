@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, ClassVar, Final
 
@@ -16,7 +16,8 @@ from crosscue.detectors.catalog.class_names import class_names_given
 from crosscue.detectors.catalog.draft import Draft, draft_card_text
 from crosscue.detectors.catalog.places import card_named
 from crosscue.detectors.catalog.recognise import closed, guesses, plausible, read_interface
-from crosscue.detectors.decoders.base import Guess, Interface
+from crosscue.detectors.decoders.base import Guess, Interface, decoder_name
+from crosscue.detectors.decoders.table import DECODERS
 from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.networks.trial import fault_seen
@@ -103,8 +104,10 @@ class CardSettings:
     Attributes:
         output: Card to write, in the folder of the weights (default: their name with .toml).
         kind: Network, or layout of its outputs, if several fit.
-        class_names: Class names in the order of the outputs, one per line, for a file without them.
+        class_names: Class names in the order of the outputs, for a file without them: one per line,
+            or the data.yaml of YOLO.
         classes: The same names in one argument: road,curb,mark.
+        first_class: Number of the first class, where a network returns numbers: 0 or 1.
         size_px: Input size, such as 1280x736, for a network that accepts any.
         picture: Draw detections in a copy of this picture, CARD.PICTURE.found.jpg next to the card.
         overwrite: Replace an existing card.
@@ -115,6 +118,7 @@ class CardSettings:
     kind: Annotated[str | None, Option(metavar="KIND")] = None
     class_names: Annotated[Path, Option(metavar="FILE")] | Sequence[str] | str | None = None
     classes: Annotated[str | None, Option(metavar="NAME,NAME")] = None
+    first_class: int | None = None
     size_px: Annotated[str, Option("--size", metavar="WxH")] | tuple[int, int] | None = None
     picture: Path | str | None = None
     overwrite: bool = False
@@ -124,7 +128,7 @@ class CardSettings:
 def draft_card(
     weights: Annotated[Path | str, Option(metavar="MODEL")], settings: CardSettings
 ) -> CardDraft:
-    """Write a model card for an ONNX or OpenVINO file, or for weights.
+    """Write a model card for an ONNX, OpenVINO or TFLite file, or weights.
 
     The network, or the layout of its outputs, is recognised from names, shapes and metadata, and
     the network runs with the card before it is written. Properties that the file does not record
@@ -138,7 +142,7 @@ def draft_card(
         crosscue replay drive.mcap --vehicle car.toml --detectors my.toml -o run
 
     Args:
-        weights: .onnx, OpenVINO .xml, .pth, .pt or .safetensors.
+        weights: .onnx, OpenVINO .xml, .tflite, .pth, .pt or .safetensors.
         settings: What the file does not say.
 
     Raises:
@@ -169,6 +173,8 @@ def draft_card(
     else:
         model = read_interface(path)
         guess = _guess(path, closed(path, model, size), settings.kind, len(names))
+    if settings.first_class is not None:
+        guess = _with_first_class(guess, settings.first_class)
     written = draft_card_text(path, model, guess, names, size)
     if settings.picture is None:
         _try(place, written)
@@ -241,7 +247,7 @@ def _guess(path: Path, model: Interface, kind: str | None, names: int) -> Guess:
     found = guesses(model)
     if kind is not None:
         found = [guess for guess in found if guess.settings["kind"] == kind]
-    elif len(found) > 1:
+    if len(found) > 1:
         found = plausible(path, model, found)
         found = [one for one in found if names and one.class_count == names] or found
     if len(found) == 1:
@@ -255,6 +261,17 @@ def _guess(path: Path, model: Interface, kind: str | None, names: int) -> Guess:
         )
     listed = "; ".join(f"{g.settings['kind']} ({', '.join(g.reasons)})" for g in found)
     raise UsageError(f"{path}: several kinds fit: {listed}; choose one with --kind")
+
+
+def _with_first_class(guess: Guess, first_class: int) -> Guess:
+    able = {decoder_name(one): "first_class" in one.model_fields for one in DECODERS}
+    if not able.get(kind := str(guess.settings["kind"])):
+        kinds = ", ".join(name for name, is_able in able.items() if is_able)
+        raise UsageError(f"first_class: {first_class}, expected only for {kinds}; not {kind}")
+    settings = {**guess.settings, "first_class": first_class}
+    # What was assumed is now known.
+    assumed = [why for why in guess.assumptions if "--first-class" not in why]
+    return replace(guess, settings=settings, assumptions=tuple(assumed))
 
 
 def _shape(shape: tuple[int | str | None, ...]) -> str:

@@ -9,6 +9,7 @@ from typing import Final
 
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.tree_text import yaml_tree
 from crosscue.replay.limits import MIB
 
 COCO_80: Final = (
@@ -75,7 +76,7 @@ def cue_label(name: str) -> str | None:
 
 
 def class_names_given(given: Sequence[str] | Path | str) -> tuple[str, ...]:
-    """Return class names, or read them from a file with one name per line.
+    """Return class names, or read them from a file: one per line, or ``names`` of a .yaml file.
 
     Raises:
         UsageError: The file cannot be read, or is empty.
@@ -87,11 +88,21 @@ def class_names_given(given: Sequence[str] | Path | str) -> tuple[str, ...]:
         content = read_at_most(path, MIB)
         if content is None:
             raise UsageError(f"{path}: over 1 MiB; expected class names, one per line")
-        lines = content.decode("utf-8").splitlines()
+        text = content.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise UsageError(f"{path}: {why}; expected class names, one per line") from None
-    names = tuple(line.strip() for line in lines if line.strip())
+    if path.suffix in (".yaml", ".yml"):
+        return _yaml_names(path, text)
+    names = tuple(line.strip() for line in text.splitlines() if line.strip())
     if not names:
         raise UsageError(f"{path}: contains no names; expected class names, one per line")
     return names
+
+
+def _yaml_names(path: Path, text: str) -> tuple[str, ...]:
+    try:
+        names = yaml_tree(text)["names"]
+        return tuple(str(names[i]) for i in range(len(names)))
+    except (ValueError, KeyError, TypeError):
+        raise UsageError(f"{path}: expected class names under names") from None

@@ -10,11 +10,11 @@ from typing import Final
 
 import tomlkit
 
-from crosscue.detectors.decoders.base import DEFAULT_SCORE, Guess, Interface, static
+from crosscue.detectors.decoders.base import DEFAULT_SCORE, Guess, Interface
 from crosscue.replay.errors import UsageError
 
 from .class_names import COCO_80, COCO_90, cue_label
-from .recognise import size_in
+from .recognise import input_settings, size_in
 from .segmentation import drivable
 
 _LINE: Final = 100
@@ -177,13 +177,10 @@ def _input(
     certain: list[str],
     assumed: list[str],
 ) -> dict[str, object]:
-    usual = dict(guess.input or {})
     if guess.network is not None:
-        return usual
-    shape = model.inputs[0].shape
-    layout = _layout(shape) or str(usual.get("layout", "nchw"))
-    rows, columns = {"nchw": (2, 3), "chw": (1, 2), "nhwc": (1, 2)}[layout]
-    declared = (static(shape, columns), static(shape, rows))
+        return dict(guess.input or {})
+    usual = input_settings(model, guess)
+    declared = model.declared_px
     given: dict[str, object] = {}
     width, height = size_px or declared
     if size_px is not None:
@@ -195,18 +192,9 @@ def _input(
     else:
         width, height = size_in(model.metadata) or guess.usual_size_px
         assumed.append(f"its input size is variable; {width} x {height} (--size WxH)")
-    usual.pop("layout", None)
     if "colour" in usual and not model.class_names:
         assumed.append(f"colours are {usual['colour']}, pictures fitted by {usual.get('fit')}")
-    return {"width_px": width, "height_px": height, "layout": layout, **usual, **given}
-
-
-def _layout(shape: Sequence[int | str | None]) -> str | None:
-    if len(shape) == 3:
-        return "chw"
-    if len(shape) == 4 and 3 in (shape[1], shape[3]):
-        return "nchw" if shape[1] == 3 else "nhwc"
-    return None
+    return {"width_px": width, "height_px": height, **usual, **given}
 
 
 def _value(value: object) -> str:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import ast
+import io
 import math
+import zipfile
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -37,14 +41,17 @@ from .segmentation import recognise_segmentation
 
 # Maximum number of brackets in metadata; parsing more is slow.
 _MAX_NAMES_CHARACTERS: Final = 100_000
+# Maximum number of files behind a TFLite file to read.
+_MAX_APPENDED: Final = 8
 # Default side of a network's input, where the file declares no size.
 DEFAULT_SIDE_PX: Final = 640
 # Maximum number of values of one input: the largest picture that a card may specify.
 MAX_INPUT_VALUES: Final = 3 * 8192 * 8192
 # Number of classes to assume where the shapes do not determine it.
 _MANY_CLASSES: Final = 10_000
-# ONNX's numbers of int32 and int64.
+# ONNX's numbers of int32 and int64, and of uint8.
 _ONNX_INTEGERS: Final = frozenset((6, 7))
+_ONNX_BYTE: Final = 2
 # Minimum spread of candidates, as a fraction of the input's sides. If the layout is correct, the
 # candidates of all cells are spread over the whole picture.
 SPREAD_FRACTION: Final = 0.5
@@ -57,7 +64,7 @@ _REFUSED: Final = {
 
 
 def read_interface(path: Path) -> Interface:
-    """Read inputs, outputs and metadata of an ONNX file or an OpenVINO .xml.
+    """Read inputs, outputs and metadata of an ONNX file, an OpenVINO .xml or a TFLite file.
 
     Raises:
         UsageError: The file is of another kind or damaged, or the package to read it is missing.
@@ -102,7 +109,8 @@ def _of_onnx(content: bytes, path: Path) -> Interface:
 def _tensor(value: Any) -> Tensor:
     declared = value.type.tensor_type
     shape = tuple(side.dim_value or side.dim_param or None for side in declared.shape.dim)
-    return Tensor(value.name, shape, declared.elem_type in _ONNX_INTEGERS)
+    kind = declared.elem_type
+    return Tensor(value.name, shape, kind in _ONNX_INTEGERS, kind == _ONNX_BYTE)
 
 
 def _of_openvino(content: bytes, path: Path) -> Interface:
@@ -129,6 +137,49 @@ def _of_openvino(content: bytes, path: Path) -> Interface:
         metadata,
         names,
     )
+
+
+def _of_tflite(content: bytes, path: Path) -> Interface:
+    if find_spec("ai_edge_litert") is None:
+        raise UsageError(f"{path}: needs the package ai-edge-litert: pip install ai-edge-litert")
+    litert: Any = import_module("ai_edge_litert.interpreter")
+    net = litert.Interpreter(model_content=content)
+    net.allocate_tensors()
+
+    def tensor(one: Any) -> Tensor:
+        kind = np.dtype(one["dtype"]).name
+        shape = tuple(map(int, one["shape"]))
+        return Tensor(str(one["name"]), shape, kind in ("int32", "int64"), kind == "uint8")
+
+    metadata, names = _appended(content)
+    return Interface(
+        tuple(map(tensor, net.get_input_details())),
+        tuple(map(tensor, net.get_output_details())),
+        metadata,
+        class_names(metadata) or names,
+    )
+
+
+def _appended(content: bytes) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Metadata of Ultralytics, and labels of TensorFlow, in the ZIP archive after a TFLite file."""
+    metadata: dict[str, str] = {}
+    names: tuple[str, ...] = ()
+    if not zipfile.is_zipfile(io.BytesIO(content)):
+        return metadata, names
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        for name in archive.namelist()[:_MAX_APPENDED]:
+            with archive.open(name) as file:
+                text = file.read(_MAX_NAMES_CHARACTERS).decode("utf-8", "replace")
+            try:
+                # JSON, or the text of a dictionary of Python: both are YAML.
+                tree = yaml_tree(text)
+            except ValueError:
+                tree = None
+            if isinstance(tree, dict):
+                metadata |= {str(key): str(value) for key, value in tree.items()}
+            elif name.endswith(".txt"):
+                names = tuple(filter(None, map(str.strip, text.splitlines())))
+    return metadata, names
 
 
 def _yaml_metadata(path: Path) -> dict[str, str]:
@@ -161,7 +212,7 @@ def _is_flat(value: object) -> bool:
     return not any(isinstance(one, dict | list) for one in values)
 
 
-_READERS: Final = {".onnx": _of_onnx, ".xml": _of_openvino}
+_READERS: Final = {".onnx": _of_onnx, ".xml": _of_openvino, ".tflite": _of_tflite}
 
 
 def class_names(metadata: Mapping[str, str]) -> tuple[str, ...]:
@@ -175,7 +226,8 @@ def class_names(metadata: Mapping[str, str]) -> tuple[str, ...]:
     except (ValueError, SyntaxError, MemoryError, RecursionError):
         return ()
     if isinstance(found, dict):
-        found = [found.get(i) for i in range(len(found))]
+        # JSON has texts for keys.
+        found = [found.get(i, found.get(str(i))) for i in range(len(found))]
     if not isinstance(found, list | tuple) or not all(isinstance(name, str) for name in found):
         return ()
     return tuple(found)
@@ -258,18 +310,20 @@ def plausible(path: Path, model: Interface, found: list[Guess]) -> list[Guess]:
 
 
 def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
-    height, width = (static(model.inputs[0].shape, axis) for axis in (-2, -1))
+    width, height = model.declared_px
     if height is None or width is None:
         return True
     given = Input.model_validate(
-        {"width_px": width, "height_px": height, **dict(guess.input or {})}
+        {"width_px": width, "height_px": height, **input_settings(model, guess)}
     )
     noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
     classes = tuple(str(i) for i in range(guess.class_count or _MANY_CLASSES))
     decoder = next(one for one in DECODERS if decoder_name(one) == guess.settings["kind"])
     output = decoder.model_validate({**guess.settings, "classes": classes, "score": 0.0})
+    batch = prepared(noise, given)[0]
+    outputs = network(batch[0] if given.layout == "chw" else batch)
     try:
-        found = output.candidates(network(prepared(noise, given)[0]), (width, height))
+        found = output.candidates(outputs, (width, height))
     except ValueError:
         return False
     size = np.array([width, height])
@@ -283,11 +337,33 @@ def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
     return bool((high - low > SPREAD_FRACTION * size).all())
 
 
+def input_settings(model: Interface, guess: Guess) -> dict[str, object]:
+    """Return keys of the card's ``[input]`` besides the size: of the layout, or as declared."""
+    usual = dict(guess.input or {})
+    usual["layout"] = model.layout or usual.get("layout", "nchw")
+    if model.inputs[0].is_bytes:
+        # Such a network scales its pixels itself.
+        usual = {key: value for key, value in usual.items() if key not in ("mean", "scale")}
+        usual["dtype"] = "uint8"
+    return usual
+
+
 def guesses(model: Interface) -> list[Guess]:
     """List all layouts that a model file may have, in the order of the table."""
     if not model.inputs or not model.outputs:
         return []
     found = [guess for decoder in DECODERS if (guess := decoder.recognise(model)) is not None]
+    if model.layout == "nhwc":
+        # Ultralytics' TFLite exports have boxes in fractions of the input; the boxes decide.
+        found += [
+            replace(
+                one,
+                settings={**one.settings, "is_fraction": True},
+                assumptions=(*one.assumptions, "boxes are in fractions of the input"),
+            )
+            for one in found
+            if one.settings["kind"] in ("yolov5", "yolov8", "yolov8-seg")
+        ]
     road = recognise_segmentation(model)
     # Integers are class numbers, never boxes.
     is_road = road is not None and (not found or model.outputs[0].is_integer)

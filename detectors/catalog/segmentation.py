@@ -20,7 +20,7 @@ _DRIVABLE: Final = frozenset(
 
 def recognise_segmentation(model: Interface) -> Guess | None:
     """Return the settings with which a model file is a segmentation; None if it cannot be one."""
-    maps = [_classes_of(out, model.inputs[0]) for out in model.outputs]
+    maps = [_classes_of(out, model) for out in model.outputs]
     first = model.outputs[0]
     count = maps[0]
     if count is None or any(out.shape != first.shape for out in model.outputs):
@@ -44,16 +44,18 @@ def recognise_segmentation(model: Interface) -> Guess | None:
     )
 
 
-def _classes_of(output: Tensor, given: Tensor) -> int | None:
+def _classes_of(output: Tensor, model: Interface) -> int | None:
     """Number of an output's scores per pixel, 0 for class numbers; None for another output."""
-    sides = static(output.shape, -2), static(output.shape, -1)
-    of_input = static(given.shape, -2), static(given.shape, -1)
-    if len(given.shape) != 4 or not all(sides) or not all(of_input):
+    # Networks with the channels of the picture last have those of the classes last, too.
+    is_last = model.layout == "nhwc" and len(output.shape) == 4
+    channels, *axes = (3, 1, 2) if is_last else (1, -2, -1)
+    sides = [static(output.shape, axis) for axis in axes]
+    if len(model.inputs[0].shape) != 4 or not all(sides) or not all(model.declared_px):
         return None
-    height, width, rows, columns = (side or 1 for side in sides + of_input)
+    height, width, columns, rows = (side or 1 for side in (*sides, *model.declared_px))
     if rows % height or rows * width != columns * height or rows // height > _COARSEST:
         return None
-    count = static(output.shape, 1)
+    count = static(output.shape, channels)
     if len(output.shape) == 4 and count is not None and 2 <= count <= _MAX_CLASSES:
         return count
     is_numbers = len(output.shape) == 3 or (len(output.shape) == 4 and count == 1)

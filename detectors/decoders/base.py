@@ -65,6 +65,7 @@ class Tensor:
     name: str
     shape: tuple[int | str | None, ...]
     is_integer: bool = False
+    is_bytes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +83,21 @@ class Interface:
     outputs: tuple[Tensor, ...]
     metadata: Mapping[str, str]
     class_names: tuple[str, ...] = ()
+
+    @property
+    def layout(self) -> str | None:
+        """Layout of the picture, as in a card's ``[input]``; None if no axis has three channels."""
+        shape = self.inputs[0].shape
+        if len(shape) == 4 and 3 in (shape[1], shape[3]):
+            return "nchw" if shape[1] == 3 else "nhwc"
+        return "chw" if len(shape) == 3 else None
+
+    @property
+    def declared_px(self) -> tuple[int | None, int | None]:
+        """Width and height of the input; None where variable."""
+        axes = (2, 1) if self.layout == "nhwc" else (-1, -2)
+        width, height = (static(self.inputs[0].shape, axis) for axis in axes)
+        return width, height
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +244,7 @@ def cell_count(size_px: Size, strides: Sequence[int], *, round_up: bool = False)
 
 def grid_cells(model: Interface) -> int | None:
     """Number of cells of strides 8, 16 and 32; None if the input's size is variable."""
-    height, width = (static(model.inputs[0].shape, axis) for axis in (-2, -1))
+    width, height = model.declared_px
     return cell_count((width, height), GRID_STRIDES) if width and height else None
 
 

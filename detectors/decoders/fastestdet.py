@@ -54,9 +54,9 @@ class FastestDetOutput(BoxOutput):
     @override
     @classmethod
     def recognise(cls, model: Interface, /) -> Guess | None:
-        shape, given = model.outputs[0].shape, model.inputs[0].shape
+        shape = model.outputs[0].shape
         channels = static(shape, 1)
-        sides = [(static(shape, axis), static(given, axis)) for axis in (-2, -1)]
+        sides = list(zip((static(shape, 3), static(shape, 2)), model.declared_px, strict=True))
         if len(model.outputs) != 1 or len(shape) != 4 or channels is None or channels < 6:
             return None
         if any(not cells or not side or side // 16 != cells for cells, side in sides):

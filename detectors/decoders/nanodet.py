@@ -45,7 +45,7 @@ class NanodetOutput(BoxOutput):
     @override
     @classmethod
     def recognise(cls, model: Interface, /) -> Guess | None:
-        height, width = (static(model.inputs[0].shape, axis) for axis in (-2, -1))
+        width, height = model.declared_px
         shape = model.outputs[0].shape
         rows, columns = static(shape, 1), static(shape, 2)
         if len(model.outputs) != 1 or len(shape) != 3 or not (width and height and columns):

@@ -61,8 +61,7 @@ class PicodetOutput(BoxOutput):
     @override
     @classmethod
     def recognise(cls, model: Interface, /) -> Guess | None:
-        given = model.inputs[0].shape
-        height, width = static(given, -2), static(given, -1)
+        width, height = model.declared_px
         tables = [out for out in model.outputs if len(out.shape) == 3]
         strides = STRIDES[: len(tables) // 2]
         if width is None or height is None or len(tables) not in (6, 8):

@@ -15,11 +15,20 @@ from .base import (
     Outputs,
     Size,
     class_numbers,
+    is_called,
     named,
     static,
 )
 
 _BOXES: Final = "detection_boxes"
+# Pixels from -1 to 1, of networks that do not scale bytes themselves.
+_AROUND_ZERO: Final = {"mean": (127.5,) * 3, "scale": (1 / 127.5,) * 3}
+_KEYS: Final = ("boxes", "labels", "scores")
+# Ends of the names of boxes, classes and scores in TFLite files, by their beginning.
+_TFLITE_NAMES: Final = {
+    "TFLite_Detection_PostProcess": ("", ":1", ":2"),
+    "StatefulPartitionedCall": (":3", ":2", ":1"),
+}
 
 
 class TensorflowSsdOutput(BoxOutput):
@@ -52,6 +61,8 @@ class TensorflowSsdOutput(BoxOutput):
     @override
     @classmethod
     def recognise(cls, model: Interface, /) -> Guess | None:
+        if (tflite := _of_tflite(model)) is not None:
+            return tflite
         if not any(out.name.split(":")[0] == _BOXES for out in model.outputs):
             return None
         names = {out.name.split(":")[0]: out.name for out in model.outputs}
@@ -70,10 +81,32 @@ class TensorflowSsdOutput(BoxOutput):
             },
             len(model.class_names) or None,
             ("its outputs have the names of TensorFlow's detection API",),
-            ("class numbers start at 1 (TFLite: first_class = 0)",),
+            ("class numbers start at 1 (--first-class)",),
             {"colour": "rgb", "fit": "stretch", "layout": "nhwc", "dtype": "uint8"},
             numbers_as_coco=True,
         )
+
+
+def _of_tflite(model: Interface) -> Guess | None:
+    """Recognise the four outputs of the operation TFLite_Detection_PostProcess."""
+    for begin, ends in _TFLITE_NAMES.items():
+        names = [begin + end for end in ends]
+        if len(model.outputs) == 4 and is_called(model, *names):
+            settings = {"kind": "ssd-tensorflow", **dict(zip(_KEYS, names, strict=True))}
+            return Guess(
+                {**settings, "first_class": 0, "overlap": 1.0},
+                len(model.class_names) or None,
+                (f"its outputs are called {begin}, as TensorFlow's detection API names them",),
+                ("class numbers start at 0 (--first-class)",),
+                {
+                    "colour": "rgb",
+                    "fit": "stretch",
+                    "mean": (127.5,) * 3,
+                    "scale": (1 / 127.5,) * 3,
+                },
+                numbers_as_coco=True,
+            )
+    return None
 
 
 class DetectionOutput(BoxOutput):
@@ -108,7 +141,7 @@ class DetectionOutput(BoxOutput):
             {"kind": "ssd", "name": model.outputs[0].name, "overlap": 1.0},
             len(model.class_names) or None,
             ("rows of 7, as the operation DetectionOutput returns",),
-            ("class 0 is the background, the classes start at 1",),
+            ("class 0 is the background, the classes start at 1 (--first-class)",),
             {"colour": "bgr", "fit": "stretch"},
             numbers_as_coco=True,
         )

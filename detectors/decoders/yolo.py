@@ -31,7 +31,18 @@ YOLOX_PICTURE: Final = {"colour": "bgr", "fit": "letterbox"}
 _COEFFICIENTS: Final = 32
 
 
-class YoloV5Output(BoxOutput):
+class _CentersOutput(BoxOutput):
+    """Boxes as center and size."""
+
+    is_fraction: bool = False
+    """True if boxes are in fractions of the input, as in TFLite files; else in its pixels."""
+
+    def _corners(self, table: NDArray[np.float64], size_px: Size) -> NDArray[np.float64]:
+        corners = from_centers(table)
+        return corners * np.tile(size_px, 2) if self.is_fraction else corners
+
+
+class YoloV5Output(_CentersOutput):
     """YOLOv5, v7: one output (1, N, 5 + classes): center, size, objectness, class scores."""
 
     kind: Literal["yolov5"]
@@ -43,7 +54,7 @@ class YoloV5Output(BoxOutput):
         classes = len(self.classes)
         table = output_rows(named(outputs, self.name), 5 + classes, f"{classes} classes")
         best, numbers = best_class(table[:, 5:])
-        return BoxCandidates(from_centers(table), table[:, 4] * best, numbers)
+        return BoxCandidates(self._corners(table, size_px), table[:, 4] * best, numbers)
 
     @override
     @classmethod
@@ -85,7 +96,7 @@ class YoloV5Output(BoxOutput):
         )
 
 
-class YoloV8Output(BoxOutput):
+class YoloV8Output(_CentersOutput):
     """YOLOv8, v9, v11: one output (1, 4 + classes, N): center, size, class scores."""
 
     kind: Literal["yolov8"]
@@ -96,7 +107,7 @@ class YoloV8Output(BoxOutput):
     def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         table = _columns(named(outputs, self.name), 4 + len(self.classes))
         scores, classes = best_class(table[:, 4:])
-        return BoxCandidates(from_centers(table), scores, classes)
+        return BoxCandidates(self._corners(table, size_px), scores, classes)
 
     @override
     @classmethod
@@ -119,7 +130,7 @@ class YoloV8Output(BoxOutput):
         )
 
 
-class YoloV8SegOutput(BoxOutput):
+class YoloV8SegOutput(_CentersOutput):
     """YOLOv8-seg, v11-seg: as YOLOv8, then 32 mask weights; and prototypes (1, 32, h, w)."""
 
     kind: Literal["yolov8-seg"]
@@ -135,7 +146,7 @@ class YoloV8SegOutput(BoxOutput):
         table = _columns(named(outputs, self.name), 4 + classes + len(prototypes))
         scores, numbers = best_class(table[:, 4 : 4 + classes])
         masks = PrototypeMasks(table[:, 4 + classes :], prototypes)
-        return BoxCandidates(from_centers(table), scores, numbers, masks)
+        return BoxCandidates(self._corners(table, size_px), scores, numbers, masks)
 
     @override
     @classmethod

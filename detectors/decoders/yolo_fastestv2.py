@@ -73,7 +73,7 @@ class YoloFastestV2Output(BoxOutput):
     @override
     @classmethod
     def recognise(cls, model: Interface, /) -> Guess | None:
-        height, width = (static(model.inputs[0].shape, axis) for axis in (-2, -1))
+        width, height = model.declared_px
         shapes = [out.shape for out in model.outputs]
         if len(shapes) != 2 or not height or not width or len(shapes[0]) != 4:
             return None

@@ -59,8 +59,7 @@ class YoloxOutput(BoxOutput):
         if len(model.outputs) != 1 or len(model.outputs[0].shape) != 3:
             return None
         rows, columns = (static(model.outputs[0].shape, axis) for axis in (1, 2))
-        given = model.inputs[0].shape
-        height, width = static(given, -2), static(given, -1)
+        width, height = model.declared_px
         if columns is None or columns < 6 or rows is None or width is None or height is None:
             return None
         if rows != cell_count((width, height), GRID_STRIDES):

@@ -191,11 +191,29 @@ def _in_litert(weights: Weights, threads: int, size_px: Size | None) -> Network:
     given, outputs = net.get_input_details()[0], net.get_output_details()
 
     def call(batch: Array) -> Mapping[str, Array]:
-        net.set_tensor(given["index"], batch)
+        net.set_tensor(given["index"], _quantised(batch, given))
         net.invoke()
-        return {str(out["name"]): np.asarray(net.get_tensor(out["index"])) for out in outputs}
+        return {str(out["name"]): _real(net.get_tensor(out["index"]), out) for out in outputs}
 
     return _Function(f"litert {installed('ai-edge-litert')}", call)
+
+
+def _quantised(batch: Array, given: Any) -> Array:
+    """Convert real numbers to the integers of a quantised input; bytes remain as they are."""
+    (scale, zero), kind = given["quantization"], np.dtype(given["dtype"])
+    if kind.kind not in "iu" or batch.dtype == kind or not scale:
+        return batch
+    limits = np.iinfo(kind)
+    steps: Array = np.rint(np.asarray(batch, np.float64) / scale) + zero
+    return np.asarray(np.clip(steps, limits.min, limits.max), kind)
+
+
+def _real(values: Array, out: Any) -> Array:
+    """Convert the integers of a quantised output to real numbers."""
+    scale, zero = out["quantization"]
+    if values.dtype.kind not in "iu" or not scale:
+        return np.asarray(values)
+    return np.asarray((np.asarray(values, np.float64) - zero) * scale)
 
 
 def _output_name(output: Any, index: int) -> str:

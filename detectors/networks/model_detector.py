@@ -157,13 +157,17 @@ def _identity(card: ModelCard, settings: ModelSettings, network: Network) -> str
 
 
 def class_map(raw: Array, classes: int) -> Array:
-    """Class number of each pixel, shape (h, w), from scores (1, C, h, w) or numbers (1, h, w).
+    """Class number of each pixel, shape (h, w).
+
+    From scores (1, C, h, w) or (1, h, w, C), or from numbers (1, h, w).
 
     Raises:
         ValueError: The shape is different, or a class is not listed.
     """
     if raw.ndim == 4 and raw.shape[0] == 1 and raw.shape[1] == classes:
         return np.asarray(raw[0].argmax(axis=0))
+    if raw.ndim == 4 and raw.shape[0] == 1 and raw.shape[3] == classes > 1:
+        return np.asarray(raw[0].argmax(axis=2))
     squeezed = raw.reshape([side for side in raw.shape if side != 1])
     if squeezed.ndim != 2:
         raise ValueError(f"expected (1, {classes}, h, w) or (1, h, w), got {raw.shape}")

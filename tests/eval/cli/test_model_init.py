@@ -261,7 +261,7 @@ def test_published_yolox_is_recognised_by_running_it(
         ("my.onnx", b"not a model", "not a complete model file"),
         ("my.pkl", b"", "a pickle runs code when it is read"),
         ("my.torchscript", b"", "a TorchScript archive carries code"),
-        ("my.bin", b"", "expected .onnx, .xml, or weights"),
+        ("my.bin", b"", "expected .onnx, .xml, .tflite, or weights"),
     ],
 )
 def test_unsupported_model_file_is_refused_in_one_line(

@@ -1,0 +1,208 @@
+"""Cards are drafted from TFLite files: layout, names, types and quantised numbers are read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import crosscue
+from crosscue.detectors.base import Detections, Frame, RoadMask
+from crosscue.detectors.catalog.card import read_card
+from crosscue.detectors.decoders.base import Size, cell_grid
+from crosscue.detectors.networks.model_detector import build
+from support.data import shared
+from support.decoder_samples import BOX, CLASSES, SIZE, TALL, export
+from support.decoder_samples import EVERY as FAMILIES
+from support.tflite_models import constant_tflite
+
+pytest.importorskip("ai_edge_litert")
+SIZES = pytest.mark.parametrize("size", [SIZE, TALL], ids=["wide", "tall"])
+JSON = {"metadata.json": '{"names": {"0": "person", "1": "car", "2": "stop sign"}, "nms": false}'}
+NAMES = {"temp_meta.txt": "{'names': {0: 'person', 1: 'car', 2: 'stop sign'}, 'task': 'detect'}"}
+
+
+def found_in(card: Path, size: Size) -> Detections:
+    """Detections in a black picture of this size."""
+    width, height = size
+    (found,) = build(card=str(card))(
+        [Frame(0, "", np.zeros((height, width, 3), np.uint8), (width, height))]
+    )
+    assert isinstance(found, Detections)
+    return found
+
+
+def columns(size: Size) -> NDArray[np.float32]:
+    """Ultralytics' TFLite output: boxes in fractions around all cells, one of them known."""
+    corner, stride = cell_grid(size, (8, 16, 32))
+    table = np.hstack(
+        [(corner + 0.5) * stride, stride * [2.0, 2.0], np.full((len(corner), 3), 0.01)]
+    )
+    table[3] = [*(BOX[:2] + BOX[2:]) / 2, *(BOX[2:] - BOX[:2]), 0.1, 0.2, 0.75]
+    table[:, :4] /= np.tile(size, 2)
+    return table.T[None].astype(np.float32)
+
+
+@pytest.mark.parametrize("files", [NAMES, JSON], ids=["text", "JSON"])
+@SIZES
+def test_boxes_in_fractions_are_exact(tmp_path: Path, size: Size, files: dict[str, str]) -> None:
+    net = tmp_path / "net.tflite"
+    shape = (1, size[1], size[0], 3)
+    net.write_bytes(constant_tflite(shape, {"Identity": columns(size)}, files=files))
+
+    card = crosscue.draft_card(net).path
+
+    output = read_card(card).output
+    assert (output.kind, output.classes) == ("yolov8", CLASSES)
+    found = found_in(card, size)
+    np.testing.assert_allclose(found.boxes_px, [BOX], atol=1e-3)
+    assert found.labels == ("stop sign",)
+
+
+def test_boxes_in_pixels_are_exact(tmp_path: Path) -> None:
+    net = tmp_path / "net.tflite"
+    table = columns(SIZE)
+    table[0, :4] *= np.tile(SIZE, 2)[:, None]
+    net.write_bytes(constant_tflite((1, SIZE[1], SIZE[0], 3), {"Identity": table}, files=NAMES))
+
+    card = crosscue.draft_card(net, kind="yolov8").path
+
+    np.testing.assert_allclose(found_in(card, SIZE).boxes_px, [BOX], atol=1e-3)
+
+
+def test_quantised_numbers_are_read(tmp_path: Path) -> None:
+    """Input and output are int8, as in Ultralytics' exports with int8."""
+    net = tmp_path / "net.tflite"
+    values = np.clip(np.rint(columns(SIZE) * 256.0) - 128, -128, 127).astype(np.int8)
+    content = constant_tflite(
+        (1, SIZE[1], SIZE[0], 3),
+        {"Identity": values},
+        dtype="int8",
+        scales={"images": (1 / 255, -128), "Identity": (1 / 256, -128)},
+        files=NAMES,
+    )
+    net.write_bytes(content)
+
+    card = crosscue.draft_card(net).path
+
+    found = found_in(card, SIZE)
+    np.testing.assert_allclose(found.boxes_px, [BOX], atol=3.0)
+    np.testing.assert_allclose(found.scores, [0.75])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["TFLite_Detection_PostProcess", "", ":1", ":2", ":3"],
+        ["StatefulPartitionedCall", ":3", ":2", ":1", ":0"],
+    ],
+    ids=["TF 1", "TF 2"],
+)
+@SIZES
+def test_suppressed_boxes_are_exact(tmp_path: Path, names: list[str], size: Size) -> None:
+    net = tmp_path / "net.tflite"
+    x0, y0, x1, y1 = BOX / np.tile(size, 2)
+    numbers: list[Any] = [
+        [[[y0, x0, y1, x1], [0.0] * 4]], [[2.0, 0.0]], [[0.75, 0.0]], [1.0],
+    ]  # fmt: skip
+    outputs = {
+        names[0] + end: np.array(values, np.float32)
+        for end, values in zip(names[1:], numbers, strict=True)
+    }
+    content = constant_tflite(
+        (1, size[1], size[0], 3),
+        outputs,
+        dtype="uint8",
+        files={"labelmap.txt": "a\nb\nstop sign\n"},
+    )
+    net.write_bytes(content)
+
+    card = crosscue.draft_card(net).path
+
+    found = found_in(card, size)
+    np.testing.assert_allclose(found.boxes_px, [BOX], atol=1e-3)
+    assert found.labels == ("stop sign",)
+    assert read_card(card).input.dtype == "uint8"
+
+
+@pytest.mark.parametrize("is_numbers", [True, False])
+def test_road_is_read(tmp_path: Path, *, is_numbers: bool) -> None:
+    net = tmp_path / "net.tflite"
+    numbers = np.zeros((1, 32, 64), np.int64)
+    numbers[:, 16:] = 1
+    scores = np.eye(2, dtype=np.float32)[numbers]
+    outputs = {"ArgMax": numbers} if is_numbers else {"scores": scores}
+    net.write_bytes(constant_tflite((1, 64, 128, 3), outputs, dtype="uint8"))
+
+    card = crosscue.draft_card(net, classes="background,road").path
+
+    (found,) = build(card=str(card))([Frame(0, "", np.zeros((64, 128, 3), np.uint8), (128, 64))])
+    assert isinstance(found, RoadMask)
+    np.testing.assert_array_equal(found.pixels()[:, 0], np.arange(32) >= 16)
+    assert read_card(card).output.kind == "segmentation"
+
+
+def test_published_network_is_drafted(tmp_path: Path) -> None:
+    folder = shared("weights/deeplab_cityscapes_slim")
+    net = tmp_path / "net.tflite"
+    net.write_bytes(next(folder.glob("*.tflite")).read_bytes())
+
+    drafted = crosscue.draft_card(net, class_names=folder / "cityscapes_segmentation_labels.txt")
+
+    assert drafted.draft.kind == "segmentation"
+    assert read_card(drafted.path).input.dtype == "uint8"
+
+
+@pytest.mark.parametrize("content", [b"", b"TFL3" * 9, b"\x1c\x00\x00\x00TFL3" + bytes(90)])
+def test_damaged_file_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+    net = tmp_path / "net.tflite"
+    net.write_bytes(content)
+
+    with pytest.raises(crosscue.UsageError, match=r"^[^\n]*net.tflite: not a complete model file"):
+        crosscue.draft_card(net)
+
+
+@pytest.mark.parametrize(("first", "label"), [(None, "car"), (1, "car"), (0, "stop sign")])
+def test_first_class_is_as_given(tmp_path: Path, first: int | None, label: str) -> None:
+    """Networks of Open Model Zoo count their classes from 0 or from 1, and no file says it."""
+    net = tmp_path / "net.onnx"
+    sample = FAMILIES["ssd"](SIZE)
+    sample.outputs["detection_out"][0, 0, 0, 1] = 2
+    net.write_bytes(export(sample))
+
+    card = crosscue.draft_card(net, class_names=CLASSES, first_class=first).path
+
+    assert found_in(card, SIZE).labels == (label,)
+
+
+def test_first_class_is_refused_where_no_number_is_read(tmp_path: Path) -> None:
+    net = tmp_path / "net.onnx"
+    net.write_bytes(export(FAMILIES["yolov8"](SIZE)))
+
+    with pytest.raises(crosscue.UsageError, match=r"first_class: 0, .*not yolov8"):
+        crosscue.draft_card(net, class_names=CLASSES, first_class=0)
+
+
+@pytest.mark.parametrize(
+    "text", ["names: [person, car, stop sign]", "names: {0: person, 1: car, 2: stop sign}"]
+)
+def test_class_names_are_read_from_a_data_set_file(tmp_path: Path, text: str) -> None:
+    net = tmp_path / "net.onnx"
+    net.write_bytes(export(FAMILIES["yolov8"](SIZE)))
+    (tmp_path / "data.yaml").write_text(f"path: ..\n{text}\n")
+
+    card = crosscue.draft_card(net, class_names=tmp_path / "data.yaml").path
+
+    assert read_card(card).output.classes == CLASSES
+
+
+def test_data_set_file_without_names_is_refused(tmp_path: Path) -> None:
+    net = tmp_path / "net.onnx"
+    net.write_bytes(export(FAMILIES["yolov8"](SIZE)))
+    (tmp_path / "data.yaml").write_text("path: ..\n")
+
+    with pytest.raises(crosscue.UsageError, match=r"data.yaml: expected class names under names"):
+        crosscue.draft_card(net, class_names=tmp_path / "data.yaml")
