@@ -75,20 +75,6 @@ def test_every_format_yields_same_box(name: str, tmp_path: Path) -> None:
     assert car.range_m == 12.5 if name in ("coco", "kitti") else math.isnan(car.range_m)
 
 
-def test_boxes_outside_picture_are_clipped_or_counted(tmp_path: Path) -> None:
-    (tmp_path / "classes.txt").write_text("car\n")
-    (tmp_path / "7.txt").write_text("0 0.95 0.5 0.4 0.5\n0 1.5 0.5 0.4 0.5\n0 0.5 0.5 0 0.5\n")
-    left_out: Counter[str] = Counter()
-
-    (only,) = read(tmp_path).pictures[0].inside(SIZE, left_out)
-
-    assert only.box == pytest.approx((75.0, 20.0, 100.0, 60.0))
-    assert dict(left_out) == {
-        "boxes cut off at the picture's edge": 1,
-        "boxes outside the picture, or without area": 2,
-    }
-
-
 @pytest.mark.parametrize(
     ("files", "error", "message"),
     [

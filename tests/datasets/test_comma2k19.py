@@ -77,24 +77,6 @@ def test_truncated_array_yields_exactly_its_complete_rows(
     assert len(column.rows) == whole
 
 
-@pytest.mark.parametrize("damaged", [np.nan, np.inf, -1e300, 5e8, -5e8])
-def test_invalid_time_drops_only_its_row(tmp_path: Path, damaged: float) -> None:
-    times = np.arange(50) * 0.01
-    times[0] = damaged
-    folder = tmp_path / "processed_log" / "IMU" / "gyro"
-    _save(folder / "t", times)
-    _save(folder / "value", np.ones((50, 3)))
-
-    with open_log(tmp_path) as log:
-        ledger = Ledger("")
-        rows = sum(len(block) for block in log.read(ledger))
-
-    is_time = abs(damaged) < 1e9
-    assert rows == ledger.accounts["imu/gyro"].used == (50 if is_time else 49)
-    dropped = ledger.accounts["imu/gyro"].dropped
-    assert dropped == ({} if is_time else {"a row without a valid time": 1})
-
-
 # Arrays of unexpected type or shape that a file might contain.
 UNEXPECTED_ARRAYS: dict[str, NDArray[np.generic]] = {
     "no columns": np.zeros(40),

@@ -267,12 +267,3 @@ def test_intrinsics_are_read_from_rectified_calibration(tmp_path: Path) -> None:
             assert isinstance(log, KnowsItsCameras)
             assert log.intrinsics("image_02") == (721.5, 609.6, 172.9)
             assert log.intrinsics("image_03") is None
-
-
-def test_truth_pose_is_of_imu_with_known_mounting(tmp_path: Path) -> None:
-    truth = load_truth(write_kitti_truth(raw_drive(tmp_path / "drive"), tmp_path / "truth"))
-
-    assert truth.pose_point == "imu"
-    assert truth.mounting is not None
-    assert (truth.mounting.x_m, truth.mounting.y_m) == (-0.05, 0.32)
-    assert "KITTI" in truth.mounting_source

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import crosscue
-from crosscue.detectors.base import DetectorChoice, Frame, View
+from crosscue.detectors.base import Frame, View
 from crosscue.detectors.box_detector import BoxDetector, ScoredBox
 from crosscue.detectors.registry import chosen, make
 from crosscue.replay.errors import CrosscueError, UsageError, VehicleError
@@ -33,17 +32,6 @@ def test_box_detector_meets_the_detector_contract() -> None:
     check_detector(Corner.build)
 
 
-def test_boxes_are_in_camera_pixels() -> None:
-    half = Frame(7, "cam", np.ones((30, 50), np.uint8), (100, 60))
-    black = Frame(8, "cam", np.zeros((30, 50), np.uint8), (100, 60))
-
-    first, second = Corner.build(side_px=10)([half, black])
-
-    assert first.boxes_px.tolist() == [[0.0, 0.0, 20.0, 20.0]]
-    assert (first.t_ns, first.labels, first.scores.tolist()) == (7, ("corner",), [0.5])
-    assert (second.t_ns, len(second)) == (8, 0)
-
-
 def test_settings_are_checked_and_decide_the_identity() -> None:
     with pytest.raises(VehicleError, match="detector corner: side: no such setting"):
         Corner.build(side=4)
@@ -52,13 +40,6 @@ def test_settings_are_checked_and_decide_the_identity() -> None:
 
     assert Corner.build().identity == Corner.build(side_px=4).identity
     assert len({one.identity for one in (Corner(), Corner(side_px=5), changed())}) == 3
-
-
-def test_detector_is_selected_by_class_and_factory() -> None:
-    found = make(DetectorChoice("mine", f"{__name__}:Corner.build", {"side_px": 3}))
-
-    assert isinstance(found, Corner)
-    assert found.side_px == 3
 
 
 def bright(frame: Frame) -> Iterator[ScoredBox]:

@@ -6,13 +6,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 import crosscue
 from crosscue.detectors.networks.mask_rcnn.checkpoint import load_checkpoint
-from crosscue.detectors.training.annotations import mask_of, read_training_coco
 from crosscue.eval.training.mask_rcnn import MaskRcnnTrainingSettings
 from support.mask_rcnn import write_bars
 
@@ -33,21 +31,6 @@ def _mask_head(network: Any) -> dict[str, torch.Tensor]:
         for name, value in network.state_dict().items()
         if name.startswith(MASK_HEAD)
     }
-
-
-@pytest.mark.parametrize("absent", [None, []])
-def test_annotation_without_mask_is_read(tmp_path: Path, absent: object) -> None:
-    path = write_bars(tmp_path, 2)
-    tree = json.loads(path.read_text())
-    tree["annotations"][0]["segmentation"] = absent
-    path.write_text(json.dumps(tree))
-
-    labelled = read_training_coco(path, tmp_path / "images", ("car",))
-
-    assert (labelled.objects, labelled.masks, labelled.left_out) == (4, 3, {})
-    one = labelled.pictures[0].objects[0]
-    rows, columns = np.nonzero(mask_of(one, (128, 96)))
-    assert one.box_px == (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
 
 
 @pytest.mark.slow

@@ -49,16 +49,3 @@ def test_pooled_features_match_torchvision(
 
     assert ours.shape == (len(first) + len(second), 3, side, side)
     np.testing.assert_allclose(ours.numpy(), theirs.numpy(), atol=2e-6)
-
-
-def test_nan_box_pools_zeros_and_leaves_other_boxes_unchanged() -> None:
-    levels = _levels((8, 16, 32), pictures=1)
-    pool = MultiScaleRoIAlign(["0", "1", "2"], 7, 2)
-    good = torch.tensor([[10.0, 20.0, 60.0, 70.0]])
-    bad = torch.full((1, 4), float("nan"))
-
-    alone = Pooler(levels, HEIGHT_PX)(pool, [good])
-    together = Pooler(levels, HEIGHT_PX)(pool, [torch.cat([bad, good])])
-
-    assert torch.equal(together[1:], alone)
-    assert torch.count_nonzero(together[0]) == 0

@@ -129,15 +129,6 @@ def test_download_with_another_hash_is_not_kept(
         assert not entries.weights_path(card, card.files[0]).exists()
 
 
-def test_file_that_is_named_must_exist_also_if_the_weights_are_cached(
-    card: ModelCard, server: Served, tmp_path: Path
-) -> None:
-    fetch.fetch_weights("net")
-
-    with pytest.raises(UsageError, match=r"gone\.onnx"):
-        fetch.fetch_weights("net", tmp_path / "gone.onnx")
-
-
 @pytest.mark.parametrize(
     ("name", "label"),
     [

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from crosscue.detectors import rle
-from crosscue.detectors.base import Detections, Frame, RoadMask
-from crosscue.detectors.label_images import CLASSES, LabelledObject, label_image, objects, road
+from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.label_images import CLASSES, LabelledObject, label_image, objects
 
 SIZE_PX = (40, 30)
 
@@ -30,25 +30,3 @@ def test_drawn_object_is_recovered_with_box_mask_and_score(label: str) -> None:
     assert back.scores[0] == pytest.approx(0.8, abs=1 / 255)
     np.testing.assert_array_equal(back.boxes_px, [[10, 5, 12, 8]])
     np.testing.assert_array_equal(rle.decode_mask(back.masks[0], SIZE_PX)[5:8, 10:12], mask)
-
-
-def test_objects_are_clipped_at_the_edge_and_occluded_ones_hidden() -> None:
-    whole = np.ones((6, 6), np.bool_)
-
-    back = found(
-        LabelledObject("car", 0.9, (0, 0), whole),
-        LabelledObject("stop sign", 0.9, (-2, -2), np.ones((10, 10), np.bool_)),
-    )
-
-    assert back.labels == ("stop sign",)
-    np.testing.assert_array_equal(back.boxes_px, [[0, 0, 8, 8]])
-
-
-def test_road_mask_is_recovered() -> None:
-    is_road = np.zeros((30, 40), np.bool_)
-    is_road[20:] = True
-
-    (back,) = road()([frame(label_image(is_road, []))])
-
-    assert isinstance(back, RoadMask)
-    np.testing.assert_array_equal(rle.decode_mask(back.mask, back.mask_size_px), is_road)

@@ -42,14 +42,6 @@ def model(*inputs: bytes, weights: tuple[bytes, ...] = ()) -> bytes:
     return number(1, 8) + part(2, b"maker") + part(7, graph)
 
 
-def test_first_input_that_is_not_a_weight_is_returned() -> None:
-    content = model(value_info(b"w", [9]), value_info(b"x", [None, 3, 360, 640]), weights=(b"w",))
-
-    assert input_shape(content) == (None, 3, 360, 640)
-    assert input_shape(model()) is None
-    assert input_shape(b"") is None
-
-
 @given(st.binary(max_size=60), st.integers(0, 400))
 @settings(max_examples=100, deadline=None)
 def test_damaged_file_yields_an_error_or_a_valid_shape(noise: bytes, cut: int) -> None:

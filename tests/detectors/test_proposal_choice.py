@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.detectors.networks.mask_rcnn.network import build_network, set_limits
+from crosscue.detectors.networks.mask_rcnn.network import build_network
 from crosscue.detectors.networks.mask_rcnn.nms import likeliest_apart
 from support.mask_rcnn import plan_of
 
@@ -39,18 +39,3 @@ def test_selected_boxes_and_their_order_match_torchvision(
     theirs, _ = rpn.filter_proposals(boxes[None], logits[None], [SIZE_PX], counts)
 
     assert torch.equal(ours, theirs[0])
-
-
-def test_objectness_threshold_keeps_the_highest_ranked_proposals() -> None:
-    network = build_network(plan_of()).eval()
-    rng = np.random.default_rng(3)
-    corners = rng.uniform(0.0, 90.0, (80, 2)).astype(np.float32)
-    boxes = torch.from_numpy(np.hstack([corners, corners + 20.0]).astype(np.float32))
-    logits = torch.from_numpy(rng.normal(0.0, 2.0, 80).astype(np.float32))
-    kept = []
-    for floor in (0.0, 0.5):
-        set_limits(network, 1000, 0.5, floor)
-        kept.append(likeliest_apart(network.rpn, boxes, logits, np.zeros(80, np.int64), SIZE_PX))
-
-    assert 0 < len(kept[1]) < len(kept[0])
-    assert torch.equal(kept[1], kept[0][: len(kept[1])])

@@ -7,11 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
 
-from crosscue.detectors.weights_file import serialised
 from support.mask_rcnn import write_bars
 from support.pictures import picture
 
@@ -61,15 +58,3 @@ def test_two_trainings_write_identical_files(folders: list[Path], network: str) 
     one, other = (folder.joinpath(f"{network}.safetensors").read_bytes() for folder in folders)
 
     assert one == other
-
-
-def test_metadata_and_weights_survive_a_round_trip(tmp_path: Path) -> None:
-    from safetensors import safe_open
-
-    metadata = {"b": 'é"\\\n\u2028', "a": "x" * 101}
-    path = tmp_path / "w.safetensors"
-    path.write_bytes(serialised({"t": torch.arange(5.0)}, metadata))
-
-    with safe_open(path, "pt") as file:
-        assert file.metadata() == metadata
-        np.testing.assert_array_equal(file.get_tensor("t").numpy(), np.arange(5.0))

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from crosscue.localization.fit.front_wheels import front_wheels
 from crosscue.localization.odometry import OdometrySettings, WheelSamples, integrate
@@ -43,19 +42,3 @@ def test_distinct_scales_of_four_wheels_are_recovered() -> None:
         off = one.scale - FRONT[one.setting]
         assert abs(off) < 4.0 * one.sd
         assert one.sd < 0.5 * abs(FRONT[one.setting] - 1.0)
-
-
-def test_scaled_front_and_rear_wheels_measure_the_same_distance() -> None:
-    truth = drive(np.random.default_rng(seed=5))
-    exact = replace(FOUR_SCALES, slip_per_sqrt_m=0.0)
-    car = four_wheels(truth, np.random.default_rng(seed=6))
-    distances_m = [
-        float(
-            np.abs(
-                integrate(car, replace(exact, use_front_wheels=front)).increments.distance_m
-            ).sum()
-        )
-        for front in (False, True)
-    ]
-
-    assert distances_m[1] == pytest.approx(distances_m[0], rel=2e-3)

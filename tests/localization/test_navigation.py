@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from crosscue.localization.navigation import (
     NONE,
     Memory,
-    Strategy,
     bearing_after,
     choose_option,
     empty_memory,
@@ -19,7 +18,6 @@ from crosscue.localization.navigation import (
     penalty,
     recognise,
     remember,
-    seeks_landmarks,
 )
 
 _ANGLE = st.floats(-math.pi, math.pi)
@@ -78,9 +76,3 @@ def test_landmark_ahead_skips_landmarks_off_the_route_or_visited() -> None:
     assert ahead(landmarks, False, False, False) == 1
     assert ahead(landmarks, False, True, False) == NONE
     assert ahead(np.empty((0, 2))) == NONE
-
-
-def test_hybrid_strategy_seeks_landmarks_only_when_uncertain() -> None:
-    assert [seeks_landmarks(Strategy.HYBRID, m, 50.0) for m in (49.0, 51.0)] == [False, True]
-    assert not seeks_landmarks(Strategy.STRAIGHT, 99.0, 50.0)
-    assert seeks_landmarks(Strategy.LANDMARKS, 0.0, 50.0)

@@ -145,41 +145,6 @@ def test_variances_do_not_depend_on_the_sampling_rate(kind: str) -> None:
     np.testing.assert_allclose(sums(100.0), sums(25.0), rtol=0.01)
 
 
-def test_distance_variance_includes_rounding_of_wheel_speeds() -> None:
-    """For simulated random speeds, rounded, the distance's error matches its variance."""
-    rng = np.random.default_rng(8)
-    car = replace(CAR, wheel_step_mps=0.5, slip_per_sqrt_m=0.0)
-    misses, claims = [], []
-    for _ in range(300):
-        true = rng.uniform(5.0, 15.0, (60, 2))
-        rounded = np.round(true / 0.5) * 0.5
-        exact = integrate(WheelSamples(times(60), true), car).increments
-        made = integrate(WheelSamples(times(60), rounded), car).increments
-        misses.append((made.distance_m - exact.distance_m).sum())
-        claims.append(made.distance_var_m2.sum())
-
-    assert np.mean(np.square(misses)) == pytest.approx(np.mean(claims), rel=0.25)
-
-
-def test_turn_per_turn_adds_an_sd_proportional_to_the_turn() -> None:
-    rate = TurnSignal(times(101), np.full(101, 0.5), "yaw rate")
-    exact = replace(CAR, gyro_noise_rad_per_sqrt_s=0.0)
-    made = integrate(both_wheels(5.0), replace(exact, turn_per_turn=0.02), rate).increments
-
-    np.testing.assert_allclose(np.sqrt(made.turn_var_rad2), 0.02 * made.turn_rad)
-    assert not integrate(both_wheels(5.0), exact, rate).increments.turn_var_rad2.any()
-
-
-@pytest.mark.parametrize("rate_hz", [10, 100])
-def test_noise_per_radian_does_not_depend_on_the_sampling_rate(rate_hz: int) -> None:
-    t_ns = times(2 * rate_hz + 1, 1_000_000_000 // rate_hz)
-    turn = TurnSignal(t_ns, np.full(len(t_ns), -0.5), "yaw rate")
-    car = replace(CAR, gyro_noise_rad_per_sqrt_s=0.0, turn_rad_per_sqrt_rad=0.02)
-    speeds = WheelSamples(t_ns, np.full((len(t_ns), 2), 5.0))
-
-    assert integrate(speeds, car, turn).increments.turn_var_rad2.sum() == pytest.approx(0.02**2)
-
-
 def test_turn_delay_shifts_the_turn_signal_back() -> None:
     at_s = times(101) * 1e-9
     late = TurnSignal(times(101) + 130_000_000, np.sin(at_s), "yaw rate")

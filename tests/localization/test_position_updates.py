@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -36,16 +34,6 @@ def test_position_update_applies_the_antenna_lever() -> None:
     # The landmark's update is linear in the heading; this one rotates the lever.
     np.testing.assert_allclose(found.mean, wanted.mean, atol=2e-4)
     np.testing.assert_allclose(found.cov, wanted.cov, atol=2e-3)
-
-
-def test_delayed_position_is_moved_ahead_by_the_delay() -> None:
-    belief = start_belief(SECOND, 0.0, 0.0, math.pi / 2, 10.0, 1.0, 1e-6, 1e-6)
-    measurements = PositionUpdates(delay_s=0.2)
-    measurements.add(fixes((SECOND, 0.0, -2.0)))
-    found = measurements.update(belief, 0.0)
-
-    assert found is not None
-    np.testing.assert_allclose(found.mean[:2], 0.0, atol=1e-9)
 
 
 def test_late_rejected_and_thinned_positions_are_counted() -> None:

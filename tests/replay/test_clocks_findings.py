@@ -69,26 +69,6 @@ def test_faulty_header_stamp_is_reported() -> None:
     )
 
 
-def test_faulty_log_time_is_reported() -> None:
-    log_ns = START_NS + 50 * MS * np.arange(1200, dtype=np.int64)
-    late = log_ns.copy()
-    late[[500, 501]] = late[[501, 500]]
-    twice = STREAM.header_ns()
-    twice[700] = twice[699]
-    back = log_ns.copy()
-    back[600:] -= 3600 * SECOND_NS
-
-    assert findings_of(table_of("/a", late)) == (
-        "/a: 1 row in 1 stretch out of order on log time, by up to 50 ms",
-    )
-    assert findings_of(with_header(twice)) == (
-        "/camera: 1 row with the header stamp of the row before",
-    )
-    assert findings_of(table_of("/a", back))[0].startswith(
-        "/a: log time was set back once by -3600 s at "
-    )
-
-
 def test_topics_without_common_clock_are_reported() -> None:
     boot = STREAM.log_ns() - START_NS
 

@@ -15,24 +15,10 @@ import pytest
 from crosscue.replay.processes import in_processes
 
 
-def slow_square(number: int) -> tuple[int, int]:
-    """Return the square of a number and the process id; small numbers take longest."""
-    time.sleep(0.05 * max(0, 3 - number))
-    return number * number, os.getpid()
-
-
 def fail_at_two(number: int) -> int:
     if number == 2:
         raise ValueError("two")
     return number
-
-
-@pytest.mark.slow
-def test_results_of_other_processes_are_ordered() -> None:
-    found = list(in_processes(slow_square, range(6), 2))
-
-    assert [square for square, _ in found] == [0, 1, 4, 9, 16, 25]
-    assert os.getpid() not in {process for _, process in found}
 
 
 @pytest.mark.parametrize("workers", [1, 2])

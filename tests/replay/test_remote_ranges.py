@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from crosscue.replay.base import EVERYTHING, Selection
+from crosscue.replay.base import Selection
 from crosscue.replay.columns import Block
 from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import Ledger
@@ -104,23 +104,6 @@ def test_window_of_remote_bag_transfers_only_its_chunks(tmp_path: Path, web: Ser
     assert found == expected
     assert web.sent - opened < 1.5 * (2_000 / 20_000) * path.stat().st_size + 2 * 64_000
     assert opened < 0.1 * path.stat().st_size
-
-
-def test_complete_remote_log_is_fetched_once_and_stored(tmp_path: Path, web: Served) -> None:
-    path = mcap_log(tmp_path / "log.mcap", seconds=4)
-    web.files["log.mcap"] = path.read_bytes()
-    ledger = Ledger("there")
-
-    with open_log(f"{web.base}/log.mcap") as log:
-        found = times(log.read(ledger, EVERYTHING))
-        again = times(log.read(Ledger("again"), EVERYTHING))
-
-    assert found == again
-    assert len(found["/speed"]) == 400
-    assert web.sent < 1.5 * path.stat().st_size
-    assert any(
-        "downloaded completely: all of it was requested" in notice for notice in ledger.notices
-    )
 
 
 def test_format_without_range_reads_is_downloaded_completely(tmp_path: Path, web: Served) -> None:

@@ -41,20 +41,6 @@ def test_presigned_log_is_read_like_a_local_one(
     assert {path for path in web.requests if "log" not in path} == set()
 
 
-@pytest.mark.parametrize("command", ["info", "replay -o OUT", "replay --each -o OUT"])
-def test_command_on_unknown_suffix_sends_no_request(
-    command: str, tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
-) -> None:
-    web.files["a.xyz"] = b"content"
-    words = [word.replace("OUT", str(tmp_path / "out")) for word in command.split()]
-
-    assert crosscue([*words, f"{web.base}/a.xyz{SIGNED}"]) == 4
-
-    printed = capsys.readouterr()
-    assert "suffix '.xyz' unknown" in printed.err + printed.out
-    assert not web.requests
-
-
 @pytest.mark.parametrize("name", ["a.log", "a.mcap"])
 @pytest.mark.parametrize("stalling", ["headers", "body"])
 def test_stalled_server_is_reported_then_given_up(

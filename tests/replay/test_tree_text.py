@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from crosscue.replay.files.tree_text import (
     MAX_DEPTH,
     json_tree,
-    toml_document,
     toml_tree,
     yaml_tree,
 )
@@ -107,19 +106,6 @@ def test_toml_with_brackets_and_dots_in_texts_equals_tomllib(
 ) -> None:
     text = tomlkit.dumps(value) + "# " + comment.replace("\n", " ")
     assert toml_tree(text) == tomllib.loads(text) == value
-
-
-@pytest.mark.parametrize("quote", ['"', "'"])
-@pytest.mark.parametrize("content", ["a." * 90, "[" * 90, "#" + "{" * 90])
-@pytest.mark.parametrize("end", ["", "{q}", "{q}{q}"])
-def test_toml_text_of_several_lines_may_contain_anything(
-    quote: str, content: str, end: str
-) -> None:
-    content += f"\n{quote}{quote}{content}" + end.format(q=quote)
-    text = f"a = {quote * 3}{content}{quote * 3} # {content[:90]}\nb.c = 1.5"
-
-    assert toml_tree(text) == tomllib.loads(text) == {"a": content, "b": {"c": 1.5}}
-    assert toml_document(text).unwrap() == toml_tree(text)
 
 
 _DBC: Final = 'VERSION ""\nBU_: A\nBO_ 100 M: 8 A\n SG_ S : 0|8@1+ (1,0) [0|255] "" A\n'

@@ -94,18 +94,6 @@ class _CountingBlocks(list[Block]):
             yield block
 
 
-def test_rows_that_arrive_too_late_are_skipped_and_counted() -> None:
-    late = wheel_block([7], [9.0])
-    blocks = [wheel_block([s * SECOND], [1.0]) for s in range(10)]
-    ledger = Ledger("late")
-
-    found = _windows([MemoryLog((WHEELS,), [*blocks, late])], [ledger])
-
-    assert sum(len(w.samples[Signal.WHEEL_SPEEDS].t_ns) for w in found) == 10
-    assert ledger.topic("wheels").skipped == {"too late to be put in order": 1}
-    assert ledger.topic("wheels").used == 10
-
-
 def test_rows_without_required_column_are_skipped_and_counted() -> None:
     block = Block("gyro", np.array([1], np.int64), wheel_block([1], [1.0]).rows)
     ledger = Ledger("odd")

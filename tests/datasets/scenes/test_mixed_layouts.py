@@ -44,11 +44,3 @@ def test_curved_layout_moves_car_and_objects_with_lane() -> None:
         aside = (bent.at[1] + bent.shift(at_s)[1]) - (plain.at[1] + plain.shift(at_s)[1])
         assert aside == pytest.approx(float(curved.aside_m(np.array(moved))), abs=1e-6)
     assert one.ground.road.sum() == pytest.approx(other.ground.road.sum(), rel=0.02)
-
-
-def test_two_runs_of_layout_differ_in_light_traffic_and_speed() -> None:
-    first, second = (conditions_of(mixed_layout(3), run) for run in (1, 2))
-
-    assert first.light != second.light
-    assert first.traffic != second.traffic
-    assert first.speed_mps != second.speed_mps

@@ -18,17 +18,6 @@ def vehicle(width_px: int) -> Vehicle:
     return parse(text, "vehicle.toml")
 
 
-def test_range_from_height_scales_with_picture_size() -> None:
-    large, small = vehicle(1280).ranges, vehicle(640).ranges
-    assert large.stop_sign is not None
-    assert small.stop_sign is not None
-    height = np.array([8.0, 20.0, 60.0])
-
-    far = range_of(height, large.stop_sign)
-
-    np.testing.assert_allclose(range_of(height / 2, small.stop_sign), far, rtol=1e-3)
-
-
 @pytest.mark.parametrize("x_m", [-12.0, -22.0, -35.0])
 def test_range_from_stop_sign_equals_distance_to_start(x_m: float) -> None:
     camera = SceneCamera(width_px=1280, height_px=720)

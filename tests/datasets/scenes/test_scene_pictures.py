@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from crosscue.datasets.scenes.cars import SHAPES, Look, car
 from crosscue.datasets.scenes.rendering.camera import SceneCamera, view_at
 from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M
-from crosscue.datasets.scenes.rendering.kernels import compile_kernels
 from crosscue.datasets.scenes.rendering.render import RenderedFrame, RenderedObject
 from support.scenes import mirrored, picture_at, when_at, world
 
@@ -74,40 +71,6 @@ def test_vegetation_hides_stop_sign_only_at_distance() -> None:
     assert hidden < 0.6
     assert only(picture_at(world("D"), -55.0, camera), "stop_sign").visible > 0.9
     assert only(picture_at(world("G"), -12.0, camera), "stop_sign").visible > 0.9
-
-
-@pytest.mark.parametrize("kind", sorted(SHAPES))
-@pytest.mark.parametrize("nose_left", [False, True])
-def test_front_of_car_is_lower_than_rear(kind: str, nose_left: bool) -> None:
-    mask = _side_view(kind, nose_left=nose_left)
-    columns = np.flatnonzero(mask.any(axis=0))
-    width = len(columns)
-    ends = mask[:, columns[: width // 8]], mask[:, columns[-(width // 8) :]]
-    left, right = (float(end.any(axis=1).sum()) for end in ends)
-
-    assert (left < right) == nose_left
-    assert width / mask.any(axis=1).sum() > 2.0
-
-
-def _side_view(kind: str, *, nose_left: bool) -> NDArray[np.bool_]:
-    """Return the mask of a car 15 m ahead, seen from the side."""
-    mesh = car(Look(kind, (0.5, 0.5, 0.5)), lamps_on=False, brakes_on=False)
-    placed = mesh.placed(15.0, 0.0, np.pi / 2 if nose_left else -np.pi / 2)
-    covered = np.zeros((216, 384), np.uint8)
-    axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-    compile_kernels().cover(
-        placed.corners,
-        np.zeros(3, np.float32),
-        axes,
-        np.array([0.0, 0.0, 1.4]),
-        400.0,
-        192.0,
-        108.0,
-        covered,
-        0,
-        0,
-    )
-    return covered.astype(np.bool_)
 
 
 @pytest.mark.parametrize("layout", ["D", "F", "L12"])

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.datasets.scenes.drive import write_scene
-from crosscue.datasets.scenes.rendering.camera import SceneCamera
-from crosscue.datasets.scenes.settings import SceneSettings
-from crosscue.datasets.truth.truth import read_truth as load_truth
 from crosscue.detectors.cues.far_side import (
     MobileyeState,
     end_of,
@@ -26,13 +20,12 @@ from crosscue.replay.base import Selection
 from crosscue.replay.columns import Block, Floats, Topic
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.extractor import SampleExtractor
 from crosscue.replay.signals.kinds import MOBILEYE_SIGNALS, Samples, Signal
 from crosscue.replay.signals.plan import plan
-from crosscue.replay.signals.windows import SampleWindow, windows
+from crosscue.replay.signals.windows import windows
 from crosscue.replay.vehicle.mobileye_cues import Past
-from crosscue.replay.vehicle.vehicle import Vehicle, load, parse
+from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from support.memory_log import MemoryLog
 from support.mobileye_frames import random_drive
 from support.mobileye_ros import TOPIC_TYPES, messages_of
@@ -247,40 +240,3 @@ def test_two_devices_are_distinguished_by_their_topic_prefix() -> None:
     chosen = plan(topics, vehicle_of('[mobileye]\nbus = "/rear"\n'))
 
     assert [source.topic.name for source in chosen.sources] == ["/rear/obstacle_data"]
-
-
-def windows_of(folder: Path, vehicle: Vehicle) -> list[SampleWindow]:
-    with open_log(folder / "drive.mcap") as log:
-        planned = plan([(0, topic) for topic in log.topics], vehicle)
-        extractor = SampleExtractor(planned, vehicle, 0, Ledger("drive"))
-        return list(windows([log], [extractor], [Selection(planned.topics_of(0))], planned))
-
-
-@pytest.mark.slow
-def test_lines_and_vehicles_past_are_counted_on_a_simulated_drive(tmp_path: Path) -> None:
-    """L303 has a road ahead with cars on it; both cues are positive before the intersection."""
-    tiny = SceneSettings(layout="L303", camera=replace(SceneCamera(), width_px=192, height_px=108))
-    files = write_scene(tmp_path, tiny)
-    ranges = np.loadtxt(tmp_path / "ranges.csv", delimiter=",", skiprows=1)
-    truth = load_truth(files.truth)
-    there = [c for c in truth.cues if c.cue == "road_straight" and c.present]
-    given: dict[str, list[int]] = {"lanes_past": [], "vehicles_past": []}
-    seen = [window.samples for window in windows_of(tmp_path, load(files.vehicle))]
-    obstacles, lanes = (
-        Samples(
-            signal,
-            np.concatenate([part[signal].t_ns for part in seen if signal in part]),
-            np.concatenate([part[signal].values for part in seen if signal in part]),
-        )
-        for signal in (Signal.MOBILEYE_OBSTACLES, Signal.MOBILEYE_LANES)
-    )
-    for t_ns, _, _, end_m in ranges[ranges[:, 2] > 0].tolist():
-        state = state_at(obstacles, lanes, int(t_ns), PAST)
-        for cue, count in past_counts(state, end_m, PAST).items():
-            given[cue].append(count)
-
-    assert there
-    for counts in given.values():
-        assert len(counts) > 40
-        assert max(counts) > 0
-    assert max(given["lanes_past"]) == 1

@@ -10,34 +10,12 @@ from crosscue.detectors.ranging.standard_sizes import (
 )
 
 
-def test_aspect_distinguishes_lights_with_and_without_backplate() -> None:
-    with_plate, bare, unknown = light_size(2.1), light_size(3.0), light_size()
-
-    assert with_plate.mean_m == pytest.approx(1.27, abs=0.05)
-    assert bare.mean_m == pytest.approx(1.07, abs=0.05)
-    assert bare.mean_m < unknown.mean_m < with_plate.mean_m
-    assert with_plate.spread < unknown.spread
-
-
 @pytest.mark.parametrize("aspect", [0.3, 1.0, 2.16, 3.05, 8.0])
 def test_size_prior_covers_the_sizes_of_every_aspect(aspect: float) -> None:
     size = light_size(aspect)
 
     for height_m in (1.07, 1.32):
         assert abs(height_m - size.mean_m) < 2.0 * size.spread * size.mean_m
-
-
-def test_lights_of_the_same_make_narrow_a_size_by_their_variance() -> None:
-    size = light_size(2.1)
-    alone = shared_size(size, [])
-    uncertain = shared_size(size, [(0.2, 0.5)])
-    certain = shared_size(size, [(0.2, 1e-6)])
-
-    assert alone.mean_m == pytest.approx(size.mean_m)
-    assert alone.spread == pytest.approx(size.spread)
-    assert size.mean_m < uncertain.mean_m < certain.mean_m
-    assert uncertain.spread > certain.spread > SAME_MAKE
-    assert np.log(certain.mean_m / size.mean_m) == pytest.approx(0.2, abs=0.05)
 
 
 def test_shared_size_is_consistent_with_its_variance() -> None:

@@ -13,7 +13,6 @@ import pytest
 from crosscue.eval.batch.jobs import (
     Engine,
     Job,
-    JobOutcome,
     JobState,
     exit_status_of,
     in_turn,
@@ -23,7 +22,7 @@ from crosscue.eval.batch.jobs import (
 )
 from crosscue.eval.batch.processes import Processes
 from crosscue.replay.losses import losses_heard
-from support.drive_work import Letters, letters, write_jobs
+from support.drive_work import letters, write_jobs
 from support.trees import tree
 
 TWO = Processes(2)
@@ -123,17 +122,6 @@ def test_one_and_two_workers_write_equal_bytes(tmp_path: Path) -> None:
     workers = [done.result for done in found[1] if done.result is not None]
     assert {one.threads for one in workers} == {"1"}
     assert len({one.pid for one in workers} - {os.getpid()}) in (1, 2)
-
-
-def test_exit_status_combines_those_of_all_drives() -> None:
-    def done(status: int, error: str | None = None) -> JobOutcome[Letters]:
-        return JobOutcome(Job("a", (), Path(), ""), status, error)
-
-    assert exit_status_of([done(0), done(0)]) == 0
-    assert exit_status_of([done(0), done(3)]) == 3
-    assert exit_status_of([done(0), done(4, "cut")]) == 3
-    assert exit_status_of([done(4, "cut"), done(4, "cut")]) == 4
-    assert exit_status_of([done(4, "cut"), done(2, "wrong")]) == 1
 
 
 RUNNER = """

@@ -32,15 +32,6 @@ def _run(path: Path, **columns: "pa.Array") -> RunFolder:
     return run
 
 
-def test_merged_rows_keep_their_order_and_name_their_drive(tmp_path: Path) -> None:
-    run = _merged(tmp_path, ["abc", "damaged", "de"])
-
-    table = run.table("pose")
-    assert table.column_names == ["drive", "t_ns", "letter"]
-    assert table["drive"].to_pylist() == ["drive0"] * 3 + ["drive2"] * 2
-    assert table["letter"].to_pylist() == list("abcde")
-
-
 def test_merged_manifest_lists_failures_and_sums_accounts(tmp_path: Path) -> None:
     manifest = _merged(tmp_path, ["abc", "damaged", "de"]).manifest()
     assert isinstance(manifest, MergedManifest)

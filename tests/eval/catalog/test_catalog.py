@@ -19,20 +19,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return runs_below(tmp_path_factory.mktemp("fleet"))
 
 
-def test_each_run_is_one_row(runs: Path) -> None:
-    found = crosscue.catalog(runs)
-
-    assert found.runs == tuple(
-        runs / name for name in ("a/monday", "a/tuesday", "b/monday", "b/tuesday")
-    )
-    rows = found.query("select * from runs order by run").to_pylist()
-    assert [row["vehicle"] for row in rows] == ["car"] * 4
-    assert [row["outcome"] for row in rows] == ["whole"] * 4
-    assert rows[0]["identity"] == rows[2]["identity"] != rows[1]["identity"]
-    assert rows[0]["settings_sha256"] != rows[2]["settings_sha256"]
-    assert found.left_out == {}
-
-
 def test_query_combines_the_tables_of_all_runs(runs: Path) -> None:
     found = crosscue.catalog(runs)
 
@@ -163,13 +149,3 @@ def test_table_with_damaged_data_pages_is_left_out(tmp_path: Path) -> None:
     assert rows.to_pylist() == [{"run": "good", "n": 50, "ok": True}]
     assert found.left_out.keys() == {"torn"}
     assert "belief.parquet: damaged" in found.left_out["torn"]
-
-
-def test_notice_reports_drives_with_several_settings(runs: Path) -> None:
-    [notice] = crosscue.catalog(runs).notices
-
-    assert notice == (
-        "2 drives have runs of different settings, as a/monday and b/monday: "
-        "settings_sha256 tells them apart"
-    )
-    assert crosscue.catalog(runs / "a").notices == ()

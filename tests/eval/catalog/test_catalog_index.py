@@ -39,15 +39,6 @@ def manifests_read(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def test_second_opening_reads_no_manifest(runs: Path, manifests_read: list[str]) -> None:
-    first = crosscue.catalog(runs).query(ALL)
-    assert len(manifests_read) == 4
-    manifests_read.clear()
-
-    assert crosscue.catalog(runs).query(ALL).equals(first)
-    assert manifests_read == []
-
-
 def test_only_changed_and_new_runs_are_read_again(runs: Path, manifests_read: list[str]) -> None:
     crosscue.catalog(runs)
     manifests_read.clear()

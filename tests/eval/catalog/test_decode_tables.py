@@ -9,12 +9,12 @@ import pyarrow.parquet as pq
 from crosscue.eval.catalog.decoded_logs import decode_tables, table_file
 from crosscue.eval.runs.folder import create
 from crosscue.replay.base import EVERYTHING
-from crosscue.replay.columns import Block, Messages, Table, Topic
+from crosscue.replay.columns import Block, Table, Topic
 from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.vehicle.vehicle import Mobileye, Vehicle
-from support.memory_log import MemoryLog, wheel_block
+from support.memory_log import MemoryLog
 
 EYE = Topic("eye", "crosscue/CanFrames", "columns")
 
@@ -50,24 +50,6 @@ def test_mobileye_frames_decode_to_obstacles_relative_to_rear_axle(tmp_path: Pat
     np.testing.assert_allclose(table["x_m"], 80.0 - np.arange(30), atol=1 / 32)
     np.testing.assert_allclose(table["y_m"], 2.0, atol=1 / 32)
     assert (folder / "eye_mobileye_status.parquet").exists()
-
-
-def test_unsupported_topics_are_counted_as_skipped(tmp_path: Path) -> None:
-    odd = Topic("odd", "acme/msg/Secret", "morse")
-    rows = Messages(np.zeros(8, np.uint8), np.array([0, 4]), np.array([4, 8]))
-    block = Block("odd", np.array([1, 2], np.int64), rows)
-    wheels = Topic("wheels", "crosscue/WheelSpeeds", "columns")
-    blocks = [block, wheel_block([3], [1.0]), *_mobileye_drive()]
-    log = MemoryLog((odd, wheels, EYE), blocks, path=Path(__file__))
-
-    done = decode_tables(
-        [log], Vehicle(version=1), create(tmp_path / "out", overwrite=False), EVERYTHING
-    )
-
-    assert done.rows == {"wheels.parquet": 1}
-    topics = done.account.reading[0].topics
-    assert topics["odd"].skipped == {"type not understood": 2}
-    assert topics["eye"].used == 0
 
 
 def test_file_names_of_topics_are_unique_and_stay_in_the_folder() -> None:

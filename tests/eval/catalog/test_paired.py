@@ -195,19 +195,6 @@ def test_too_few_places_state_the_number_wanted() -> None:
     assert math.isfinite(one.low)
 
 
-@pytest.mark.parametrize("drives", [1, 3, MIN_PLACES - 1])
-def test_too_few_drives_decide_nothing(drives: int) -> None:
-    before, after = (
-        [DriveMetric(str(i), "cues.a.precision", "mean", total, 10) for i in range(drives)]
-        for total in (10.0, 0.0)
-    )
-    (one,) = compare_drives(before, after)
-
-    assert one.verdict == "too few places"
-    assert math.isinf(one.could_see)
-    assert math.isnan(one.low) == (drives < 4)
-
-
 def test_equal_runs_are_undecided_and_order_of_drives_is_irrelevant() -> None:
     parts = simulated_metrics(np.random.default_rng(2), 8)
     other = simulated_metrics(np.random.default_rng(3), 8)

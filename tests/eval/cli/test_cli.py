@@ -82,11 +82,6 @@ def test_control_characters_in_an_error_are_escaped(
     assert capsys.readouterr().err == "crosscue: \\x1b[31mred\\x07 /t\\udcff\n"
 
 
-def test_misspelt_command_gets_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["replya"]) == 2
-    assert "did you mean 'replay'" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
 def test_help_of_each_command_has_example_and_exit_status(
     name: str, capsys: pytest.CaptureFixture[str]

@@ -105,23 +105,6 @@ def example_log(**changes: Any) -> BlockLog:
     return replace(BlockLog(blocks, topics), **changes)
 
 
-def text_of(log: BlockLog, width: int = 80) -> str:
-    return "\n".join(lines_of(summarise_log(log), width))
-
-
-def test_can_identifiers_are_counted_by_frame_format_and_frequency() -> None:
-    summary = summarise_log(example_log())
-    bus = next(t for t in summary.topics if t.name == "can0")
-
-    assert bus.can_id_count == 3
-    assert [(i.arbitration_id, i.is_extended, i.count) for i in bus.can_ids] == [
-        (0x100, False, 10),
-        (0x200, False, 5),
-        (0x100, True, 5),
-    ]
-    assert "can0: 3 ids; 0x100 526 Hz, 0x200 263 Hz, 0x100x 263 Hz" in text_of(example_log())
-
-
 def test_losses_are_reported_by_topic_reason_and_place() -> None:
     summary = summarise_log(example_log(dropped=31, unknown=True))
     text = "\n".join(lines_of(summary, 100))

@@ -25,15 +25,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return runs_below(tmp_path_factory.mktemp("fleet"))
 
 
-def test_query_prints_a_table(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["query", str(runs), "select name, count(*) as n from runs group by 1"]) == 0
-
-    head, *rows, last = capsys.readouterr().out.splitlines()
-    assert head.split() == ["name", "n"]
-    assert sorted(row.split() for row in rows) == [["monday", "2"], ["tuesday", "2"]]
-    assert last == "2 rows"
-
-
 def test_all_output_formats_contain_the_same_rows(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,6 @@ import pytest
 import crosscue
 from crosscue.eval import cli
 from crosscue.eval.failures.approach_level import flips_without_truth
-from crosscue.eval.failures.order import diverse
 from crosscue.eval.failures.record import Failure, read_failures, write_failures
 from crosscue.eval.scoring.columns import BeliefRows
 from support.scene_run import scene_run
@@ -133,20 +132,6 @@ def test_flip_names_the_contradicting_cue() -> None:
 
     assert left.cause == "a cue speaks against it"
     assert "one way right in 1 frames" in left.reported
-
-
-def test_diverse_selection_alternates_between_causes_and_runs() -> None:
-    severe = [failure(9.0, run="a", t_ns=t) for t in range(5)]
-    same_cause = [failure(1.0, run="b")]
-    rare = [failure(0.1, cause="score too low")]
-    everything = [*severe, *same_cause, *rare]
-
-    first_two = diverse(everything, 2)
-    assert {one.cause for one in first_two} == {"not detected", "score too low"}
-    first_three = diverse(everything, 3)
-    assert first_three[:2] == first_two
-    assert {one.run for one in first_three if one.cause == "not detected"} == {"a", "b"}
-    assert sorted(diverse(everything, 99), key=repr) == sorted(everything, key=repr)
 
 
 @pytest.mark.parametrize("ending", ["parquet", "json"])

@@ -58,18 +58,6 @@ def test_names_are_escaped_in_pages(site_of_run: tuple[Path, Site]) -> None:
         assert "<img src=x" not in page.read_text()
 
 
-def test_site_of_failure_table_has_only_its_failures(
-    site_of_run: tuple[Path, Site], tmp_path: Path
-) -> None:
-    folder, _ = site_of_run
-    truth = folder / "truth"
-    crosscue.failures(folder / "run", truth=truth, top=2, output=tmp_path / "two.parquet")
-
-    site = crosscue.browse(tmp_path / "two.parquet", tmp_path / "two")
-    assert site.failures == 2
-    assert crosscue.browse(tmp_path / "two.parquet", tmp_path / "two", overwrite=True)
-
-
 def test_missing_log_yields_pages_without_pictures(tmp_path: Path) -> None:
     run, truth = scene_run(tmp_path / "drive").path, truth_folder(tmp_path / "truth")
     (tmp_path / "drive" / "drive.mcap").unlink()

@@ -57,18 +57,6 @@ def test_chosen_threshold_reaches_precision_with_stated_confidence() -> None:
     assert too_low / 400 <= 0.05
 
 
-def test_threshold_keeps_equal_scores_together_and_needs_enough_detections() -> None:
-    scores = np.repeat([0.9, 0.5], 200)
-    is_right = np.arange(400) < 200
-
-    chosen = bounded_threshold(scores, is_right, 0.95, 0.95)
-
-    assert chosen is not None
-    assert (chosen.of, chosen.right, chosen.score, chosen.next_score) == (200, 200, 0.5, 0.9)
-    few = fewest_detections(0.95, 0.95) - 1
-    assert bounded_threshold(scores[:few], is_right[:few], 0.95, 0.95) is None
-
-
 @pytest.mark.parametrize("fit", [fit_platt, fit_isotonic])
 def test_calibrated_scores_are_probabilities_in_the_same_order(fit) -> None:  # type: ignore[no-untyped-def]
     rng = np.random.default_rng(2)

@@ -69,16 +69,6 @@ def replayed(folder: Path, vehicle: Vehicle) -> RunFolder:
     ).run
 
 
-def test_gnss_determines_first_position_and_heading() -> None:
-    start = with_start([straight_drive()], Vehicle(version=1), EVERYTHING).start
-
-    assert start.heading_rad == pytest.approx(HEADING_RAD, abs=1e-4)
-    assert start.map_origin is not None
-    np.testing.assert_allclose(start.map_origin[:2], PLACE[:2], atol=1e-7)
-    assert (start.x_m, start.y_m) == (0.0, 0.0)
-    assert start.source == "first seconds of GNSS (/gnss)"
-
-
 def test_estimate_keeps_the_first_pose_of_a_run_unless_the_vehicle_file_has_one() -> None:
     own, bare = Vehicle(version=1, start=Start(heading_rad=0.3)), Vehicle(version=1)
     run = with_start([straight_drive()], bare, EVERYTHING)

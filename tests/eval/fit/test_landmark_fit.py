@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
@@ -56,18 +54,6 @@ def test_intervals_equal_published_values() -> None:
     assert ends(clopper_pearson(5, 5)) == pytest.approx((0.025 ** (1 / 5), 1.0), abs=1e-9)
     assert ends(wilson(10, 100)) == pytest.approx((0.0552291, 0.1743657), abs=1e-6)
     assert ends(clopper_pearson(0, 0)) == ends(wilson(0, 0)) == (0.0, 1.0)
-
-
-@given(st.integers(1, 3000), st.data())
-@settings(max_examples=60, deadline=None)
-def test_intervals_contain_the_observed_rate_and_are_symmetric(
-    of: int, data: st.DataObject
-) -> None:
-    count = data.draw(st.integers(0, of))
-    for interval in (clopper_pearson, wilson):
-        rate, mirror = interval(count, of), interval(of - count, of)
-        assert 0.0 <= rate.low <= count / of <= rate.high <= 1.0
-        assert rate.low == pytest.approx(1.0 - mirror.high, abs=1e-9)
 
 
 def test_threshold_fitted_to_a_table_of_pairs_is_written(

@@ -111,24 +111,6 @@ def test_notice_names_rules_that_use_boxes_instead_of_masks(
     assert len(notices) == (message is not None)
 
 
-def test_detector_of_installed_package_is_selected_by_entry_point_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    info = tmp_path / "packages" / "own_pack-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own-pack\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[crosscue.detectors]\nown = support.detecting:build\n")
-    monkeypatch.syspath_prepend(str(info.parent))
-    log = str(_folder(tmp_path))
-
-    args = ["-o", str(tmp_path / "run"), "--no-cache", "-q"]
-    assert run(["detect", log, "--detectors", "own", *args]) == 0
-    assert open_run(tmp_path / "run").table("detections")["detector"].to_pylist() == ["own"] * 5
-
-    assert run(["detect", log, "--detectors", "owm", "--overwrite", *args]) == 2
-    assert "detector 'owm': no such name; did you mean own?" in capsys.readouterr().err
-
-
 def test_second_run_reads_cache_and_writes_same_detections(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -144,29 +126,6 @@ def test_second_run_reads_cache_and_writes_same_detections(
     assert reported[1]["from_cache"] == {BRIGHT: 5}
     first, second = (open_run(tmp_path / name) for name in ("a", "b"))
     assert first.table("detections").equals(second.table("detections"))
-
-
-def test_empty_and_oversized_pictures_are_accounted_for(tmp_path: Path) -> None:
-    log = _folder(tmp_path)
-    ok, png = cv2.imencode(".png", np.zeros((4, 4), np.uint8))
-    assert ok
-    bomb = bytearray(png.tobytes())
-    bomb[16:24] = (60_000).to_bytes(4, "big") * 2
-    bomb[29:33] = __import__("zlib").crc32(bytes(bomb[12:29])).to_bytes(4, "big")
-    (log / "frame_1.png").write_bytes(b"")
-    (log / "frame_2.png").write_bytes(bytes(bomb))
-    out = tmp_path / "run"
-
-    status = run(["detect", str(log), "-o", str(out), "--detectors", BRIGHT, "--no-cache", "-q"])
-
-    assert status == 3
-    assert len(open_run(out).table("detections")) == 3
-    reasons = open_run(out).table("skipped")["reason"].to_pylist()
-    assert sorted(reasons) == ["empty file", "picture not decoded"]
-    account = open_run(out).drive_manifest().account.reading[0].topics["cam"]
-    assert account.used == 3
-    assert account.entered == 5
-    assert account.dropped["picture not decoded"] == 1
 
 
 def test_change_of_picture_size_is_handled_and_reported(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from crosscue.datasets.truth.truth import Truth, save
 from crosscue.detectors.ranging.height_to_range import FAMILIES, fit_range, range_of
 from crosscue.eval.cli import run
 from crosscue.eval.fit.ranges.pairs import pairs_of_run, pairs_of_truth
-from crosscue.replay.vehicle.vehicle import RangeCurve, parse
+from crosscue.replay.vehicle.vehicle import RangeCurve
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -32,22 +32,6 @@ def test_fit_recovers_curve_and_residual_of_generated_pairs(family: str) -> None
     assert np.abs(range_of(height, fitted.curve) - truth).max() < 2.0
     assert fitted.curve.residual_sd_m == pytest.approx(1.7, rel=0.2)
     assert sum(b.pairs for b in fitted.bins) == 80
-
-
-def test_fit_ranges_prints_valid_vehicle_file_section(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    table = tmp_path / "pairs.csv"
-    rows = [f"{h},{750 / h + (0.5 if h % 2 else -0.5)}" for h in range(10, 80)]
-    table.write_text("height_px,range_m\n" + "\n".join(rows) + "\n")
-
-    assert run(["fit", "ranges", str(table), "--cue", "stop_sign", "--family", "pinhole"]) == 0
-
-    section = capsys.readouterr().out.split("\n\n")[-1]
-    curve = parse("version = 1\n" + section, "v.toml").ranges.stop_sign
-    assert curve is not None
-    assert curve.parameters[0] == pytest.approx(750.0, rel=0.01)
-    assert curve.residual_sd_m == pytest.approx(0.5, rel=0.05)
 
 
 HEIGHTS = {"stop_sign": 750.0, "traffic_light": 1000.0}

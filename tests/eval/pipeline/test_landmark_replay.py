@@ -21,7 +21,6 @@ from crosscue.detectors.images import Encoded
 from crosscue.eval import cli
 from crosscue.eval.pipeline.landmarks import LandmarkStage, landmark_stage
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.localization.landmarks.images import grey_of
 from crosscue.localization.landmarks.update import best_candidate
@@ -234,25 +233,6 @@ def block(payloads: list[bytes], first_ns: int = 0, step_ns: int = 500_000_000) 
 def stage_at(path: Path, ledger: Ledger, **section: float) -> LandmarkStage:
     vehicle = Vehicle.model_validate({"version": 1, "landmarks": section})
     return landmark_stage(LandmarkDatabase(path), vehicle, ledger)
-
-
-def belief_at(t_ns: int) -> PoseBelief:
-    return PoseBelief(t_ns, np.zeros(4), np.eye(4))
-
-
-def test_undecodable_picture_is_counted_as_dropped(tmp_path: Path) -> None:
-    ledger = Ledger("cam")
-    stage = stage_at(database_of(tmp_path / "lm.sqlite", np.zeros((1, 2))), ledger)
-    ledger.find("cam", 2)
-    stage.see(block([b"no picture at all", encoded(wall(1))]))
-
-    assert list(stage.times_ns()) == [0, 500_000_000]
-    assert stage.update(belief_at(0), 0.0) is None
-    assert stage.update(belief_at(500_000_000), 5.0) is None
-    assert ledger.accounts["cam"].dropped == {"picture not decoded": 1}
-    assert ledger.accounts["cam"].used == 1
-    assert stage.counts()["undecodable"] == 1
-    assert stage.counts()["candidates"] == 1
 
 
 def test_thinned_and_late_frames_are_counted(tmp_path: Path) -> None:

@@ -14,9 +14,7 @@ from crosscue.eval.pipeline.scene.motion_ranges import (
     MotionRanges,
 )
 from crosscue.eval.pipeline.scene.sign_ranges import SignRanges
-from crosscue.fusion.approaches import Approaches
-from crosscue.fusion.evidence import FrameEvidence, RangePosterior
-from crosscue.fusion.factor_graph import graph_of
+from crosscue.fusion.evidence import RangePosterior
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.vehicle import Ranges, Vehicle, parse
 
@@ -150,21 +148,3 @@ def test_boxes_cut_by_image_edge_yield_no_range_and_are_counted() -> None:
 
     assert drive(Drive(car), [aside], 3)[0] == ()
     assert counted.by_cue["traffic_light"].skipped == {CUT: 1}
-
-
-def test_posterior_starts_range_that_is_predicted_and_updated() -> None:
-    settings = vehicle()
-    loop = Approaches(graph_of(settings.fusion), settings.fusion, settings.range_filter)
-    known = RangePosterior(Reference.END, 50.0, 9.0, 51.0)
-    steps = [
-        loop(FrameEvidence(i, 1.0, 0.01, (), {"traffic_light": 1}, posteriors=some))
-        for i, some in enumerate(((known,), (known,), ()), start=1)
-    ]
-
-    first, again, carried = (step.ranges for step in steps)
-    assert [(row.range_m, row.var_m2, row.measured_m) for row in first] == [(50.0, 9.0, 51.0)]
-    assert 49.0 < again[0].range_m < 49.2
-    assert again[0].var_m2 == pytest.approx(9.0, abs=0.02)
-    assert carried[0].range_m == pytest.approx(again[0].range_m - 1.0)
-    assert carried[0].var_m2 == pytest.approx(again[0].var_m2 + 0.01)
-    assert carried[0].measured_m is None

@@ -1,7 +1,6 @@
 """Overlays anchored to the road are drawn on the road, and arrows follow the motion of cars."""
 
 import numpy as np
-import pytest
 
 from crosscue.detectors.cues.observed import Place
 from crosscue.detectors.cues.road_ground import outlines
@@ -40,8 +39,3 @@ def test_regions_are_below_the_horizon_and_symmetric() -> None:
     mirrored = np.sort(1280.0 - right[:, 0])
     np.testing.assert_allclose(np.sort(left[:, 0]), mirrored)
     assert left[:, 0].max() < straight[:, 0].min() < straight[:, 0].max() < right[:, 0].min()
-
-
-@pytest.mark.parametrize("place", [None, Place(-30.0, -14.0, 1.0)])
-def test_regions_of_unknown_or_passed_intersection_are_not_drawn(place: Place | None) -> None:
-    assert outlines(CAMERA, Regions(kind="ground"), place, SIZE)[0] is None

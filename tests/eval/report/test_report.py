@@ -140,28 +140,6 @@ def test_run_without_a_truth_has_a_report(
     assert cli.run(["report", str(run.path), "--threshold", "1.5"]) == 2
 
 
-def test_missing_log_is_an_error_unless_images_are_left_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = _scored(tmp_path / "drive").run
-    truth = tmp_path / "drive" / "truth.json"
-    (tmp_path / "moved").mkdir()
-    (tmp_path / "drive" / "drive.mcap").rename(tmp_path / "moved" / "drive.mcap")
-    argv = ["score", str(run.path), "--truth", str(truth)]
-
-    assert cli.run(argv) == 4
-    printed = capsys.readouterr().err
-    assert printed.count("\n") == 1
-    assert "drive.mcap is gone; name its folder with --logs DIR" in printed
-    assert "--without-images" in printed
-    assert not run.file("score").exists()
-
-    assert cli.run([*argv, "--logs", str(tmp_path / "moved")]) == 3
-    assert "Its picture" not in (run.file("score") / "report.html").read_text()
-    assert cli.run([*argv, "--without-images"]) == 3
-    assert "Its picture is not available." in (run.file("score") / "report.html").read_text()
-
-
 def test_attribution_of_a_cue_is_reported(tmp_path: Path) -> None:
     nothing = {"value": 0.0, "low": None, "high": None}
     worth = {

@@ -2,14 +2,11 @@
 
 import errno
 import json
-import os
-import socket
 from pathlib import Path
 
 import pytest
 
-from crosscue.eval.runs import folder
-from crosscue.eval.runs.folder import create, locked, open_run
+from crosscue.eval.runs.folder import open_run
 from crosscue.replay.errors import OutputError, RunError
 from crosscue.replay.files.whole_file import write_text, write_whole
 
@@ -26,24 +23,6 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
 
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "old"
-
-
-def test_lock_file_names_its_holder_without_kernel_locks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = create(tmp_path / "run", overwrite=False)
-    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    parent = os.getppid()
-    ticks = Path(f"/proc/{parent}/stat").read_text().rpartition(")")[2].split()[19]
-    monkeypatch.setattr(folder, "lock", lambda _: None)
-
-    run.file(".lock").write_text(f"{parent} {socket.gethostname()} {boot} {ticks}")
-    with pytest.raises(RunError, match=f"process {parent} "), locked(run):
-        pass
-    # The same process id with another start time: the id was reused.
-    run.file(".lock").write_text(f"{parent} {socket.gethostname()} {boot} {int(ticks) + 1}")
-    with locked(run):
-        pass
 
 
 @pytest.mark.parametrize(

@@ -35,18 +35,6 @@ def test_tags_are_set_listed_and_removed(runs: Path, capsys: pytest.CaptureFixtu
     ]
 
 
-def test_tags_are_columns_of_runs_and_approaches(runs: Path) -> None:
-    crosscue.catalog(runs)
-    crosscue.tag_runs([runs / "a/monday"], {"weather": "rain"})
-
-    found = crosscue.catalog(runs)
-
-    assert found.select("tags['weather'] = 'rain'") == (runs / "a/monday",)
-    rows = found.query("select run from approaches where tags.weather = 'rain'")
-    assert rows.to_pylist() == [{"run": "a/monday"}]
-    assert len(found.select("tags['weather'] is null")) == 3
-
-
 def test_copies_of_a_run_with_different_tags_are_not_merged(runs: Path) -> None:
     add_run(runs / "copy/monday", "monday")
     gathered([runs / "a", runs / "copy"])

@@ -117,20 +117,6 @@ def test_invented_feature_names_cues_that_support_it() -> None:
     assert one.at_m == pytest.approx(90.0)
 
 
-def test_condition_cost_is_difference_from_good_runs_at_same_intersection() -> None:
-    good = [_result(drive=f"{i}", conditions=("clear",), detected_m=40.0 + i) for i in range(2)]
-    bad = [
-        _result(conditions=("glare",), detected_m=30.0),
-        _result(conditions=("glare",), detected_m=None),
-    ]
-    elsewhere = _result(intersection="Y", conditions=("glare",), detected_m=1.0)
-    (cost,) = condition_costs([*good, *bad, elsewhere])
-
-    assert (cost.condition, cost.approaches, cost.undetected) == ("glare", 2, 1)
-    assert cost.detected_m.value == pytest.approx(30.0 - 40.5)
-    assert cost.full_m.value == pytest.approx(0.0)
-
-
 def test_permanent_condition_of_intersection_does_not_exclude_good_runs() -> None:
     runs = [
         _result(conditions=("clear", "occluded"), detected_m=30.0),

@@ -134,20 +134,6 @@ def test_extra_distance_is_averaged_over_pairs_reached_goals_and_all_drives() ->
     assert all(math.isnan(one.extra.value) for one in found.by_city[1:])
 
 
-def test_comparison_over_all_drives_precedes_published_subset_with_note(
-    tmp_path: Path,
-) -> None:
-    study = SMALL.model_copy(update={"drives": 20})
-    made = finish_landmarks(study, run_drives(study, tmp_path))
-    compared = next(table for table in made.tables if table.heading == "Against straight to goal")
-
-    names = compared.head
-    assert names.index("drives farther by") < names.index("published") < names.index("paired")
-    assert any("chosen after the results were known" in note for note in made.notes)
-    cities = next(table for table in made.tables if "by size of city" in table.heading)
-    assert [row[0] for row in cities.rows] == ["landmark to landmark", "hybrid"]
-
-
 @pytest.mark.slow
 def test_distance_until_loss_decreases_with_compass_interval() -> None:
     study = RangeStudy(drives=100)
@@ -165,16 +151,6 @@ def test_distance_until_loss_decreases_with_compass_interval() -> None:
     for one in found.values():
         assert one.lost_after_m[20.0].value > one.lost_after_m[30.0].value
         assert one.lost_after_m[None].value < 1000.0
-
-
-def test_strategies_share_cities_and_conditions_do_not(tmp_path: Path) -> None:
-    table = RunFolder(run_drives(SMALL, tmp_path)).table("drives")
-    area = table["area_km2"].to_numpy().reshape(3, 2, SMALL.drives)
-
-    np.testing.assert_array_equal(area[0], area[1])
-    np.testing.assert_array_equal(area[0], area[2])
-    assert (area[0, 0] != area[0, 1]).all()
-    assert len(np.unique(table["seed"].to_numpy())) == 2 * SMALL.drives
 
 
 @pytest.mark.parametrize(

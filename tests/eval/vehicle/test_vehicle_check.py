@@ -49,12 +49,6 @@ def test_yaw_rate_of_wrong_sign_is_a_contradiction() -> None:
     )
 
 
-def test_inconsistent_speeds_are_a_contradiction() -> None:
-    found = checked_signals(wheel_scale=1.6).contradictions
-
-    assert any(text.startswith("wheel_speeds: contradicts") for text in found)
-
-
 def test_steering_is_compared_without_offset_at_a_ratio_of_15() -> None:
     odometry = Odometry(steering_ratio=30.0, steering_offset_rad=0.1)
     wheel = Series.of("steering", np.array([0, 1], np.int64), np.array([0.1, 0.5]))

@@ -19,10 +19,9 @@ from crosscue.localization.landmarks.database import (
     LandmarkDatabase,
     LandmarkPosition,
     LandmarkWriter,
-    is_positive,
 )
 from crosscue.replay.columns import Floats
-from crosscue.replay.errors import LogError, LogFormatError, OutputError, UsageError
+from crosscue.replay.errors import LogError, LogFormatError, OutputError
 from support.landmark_files import database_of, place_at, some_features
 
 GRID = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0)), axis=-1).reshape(-1, 2) * 50.0
@@ -100,13 +99,6 @@ def test_invalid_covariance_is_refused(cov: list[list[float]], message: str) -> 
         LandmarkPosition("bad", np.zeros(2), np.array(cov))
 
 
-@given(st.floats(0.01, 1e3), st.floats(0.01, 1e3), st.floats(-0.99, 0.99))
-@settings(max_examples=50, deadline=None)
-def test_valid_covariance_is_positive(sd_x: float, sd_y: float, correlation: float) -> None:
-    off = correlation * sd_x * sd_y
-    assert is_positive(np.array([[sd_x**2, off], [off, sd_y**2]]))
-
-
 @pytest.mark.parametrize("fraction", [0.5, 0.02, 0.99])
 def test_truncated_file_is_refused_and_unchanged(
     grid: Path, tmp_path: Path, fraction: float
@@ -165,19 +157,6 @@ def _add(path: Path, names: list[str], max_pages: int = 1_000_000) -> None:
         writer._sql.execute(f"PRAGMA max_page_count = {max_pages}")
         for name in names:
             writer.add(place_at(1.0, 1.0, name), some_features(9, 200))
-
-
-def test_failed_write_leaves_files_unchanged(tmp_path: Path) -> None:
-    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
-    before = path.read_bytes()
-
-    with pytest.raises(UsageError, match="'2' already exists"):
-        _add(path, ["new", "2"])
-    assert path.read_bytes() == before
-
-    with pytest.raises(UsageError, match="'twin' already exists"):
-        _add(tmp_path / "fresh.sqlite", ["twin", "twin"])
-    assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]
 
 
 def test_second_concurrent_writer_is_refused(

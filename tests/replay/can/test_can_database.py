@@ -147,25 +147,6 @@ def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
         assert not words or "bus.dbc" in words
 
 
-def test_conflicting_definitions_are_refused_without_keep_first(tmp_path: Path) -> None:
-    other = replace(YAW, name="Other", signals=(CanSignal("x", 0, 8),))
-    paths = [
-        write_file(tmp_path, dbc_text([YAW, WHEEL]), "a.dbc"),
-        write_file(tmp_path, dbc_text([other]), "b.dbc"),
-    ]
-
-    with pytest.raises(
-        SchemaError, match=r"0x123 is defined as Yaw \(a\.dbc:6\) and as Other \(b\.dbc:6\)"
-    ):
-        CanDatabase.load(paths)
-    database = CanDatabase.load(paths, keep_first=True)
-
-    assert [m.name for m in database.messages] == ["Yaw", "Wheel"]
-    (conflict,) = database.conflicts
-    assert not conflict.is_harmless
-    assert any("the first is used" in notice for notice in database.notices)
-
-
 def test_arxml_file_defines_frames(tmp_path: Path) -> None:
     database = CanDatabase.load([write_file(tmp_path, ARXML, "bus.arxml")])
 

@@ -16,7 +16,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.settings import MobileyeSettings
-from support.mobileye_frames import MS, frames, random_drive, status, triple, values
+from support.mobileye_frames import MS, frames, random_drive, status, values
 
 ORIGIN_MOUNTING = DevicePosition()
 DEVICE_FRAME = MobileyeSettings(mounting=ORIGIN_MOUNTING)
@@ -57,20 +57,6 @@ def frames_in(tables: dict[str, Table]) -> int:
 
 def skipped(ledger: Ledger) -> Counter[str]:
     return ledger.topic("can1").skipped
-
-
-def test_complete_burst_yields_one_row_per_obstacle() -> None:
-    sent = [status(2, 40), *triple(0, 7), *triple(1, 9)]
-    tables, ledger = decode(frames(sent))
-
-    obstacles = tables["obstacles"]
-    assert obstacles["obstacle_id"].tolist() == [7, 9]
-    assert obstacles["slot"].tolist() == [0, 1]
-    assert obstacles["x_m"].tolist() == [24.0, 24.0]
-    assert obstacles["replaced"].tolist() == [True, True]
-    assert tables["status"]["count"].tolist() == [2]
-    assert not skipped(ledger)
-    assert ledger.is_whole
 
 
 LEFT_LANE = [(0x766, "A13EFE0A80FF7F0A"), (0x767, "0D80801E")]

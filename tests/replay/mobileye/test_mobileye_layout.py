@@ -55,26 +55,6 @@ def test_published_frames_decode_to_published_values(
     assert decoded_value(name, field, text, "classic") == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("name", "field", "text"),
-    [
-        ("obstacle_b", "length_m", "3F00000000000000"),
-        ("obstacle_b", "radar_x_m", "000000F0FF000000"),
-        ("obstacle_b", "radar_vx_mps", "000000F0FF008000"),
-        ("obstacle_b", "radar_vx_mps", "000000F0FFFF0F00"),  # the other no-match code
-        ("obstacle_b", "radar_id", "000000000000007F"),
-        ("obstacle_c", "accel_x_mps2", "0000000000020000"),
-        ("lane_details", "c2_per_m", "0080000000000000"),
-        ("lane_details", "c1", "0000000800000000"),
-        ("sign", "sign_type", "FF00000000000000"),
-        ("reference_points", "position_1_m", "0010000000000000"),
-        ("warnings", "headway_s", "0000320000000000"),
-    ],
-)
-def test_codes_for_missing_values_are_nan(name: str, field: str, text: str) -> None:
-    assert np.isnan(decoded_value(name, field, text, "classic" if name == "lane_details" else ""))
-
-
 def test_describe_lists_every_field_once() -> None:
     rows = list(describe())
     assert len(rows) == sum(len(m.fields) for m in layout().messages)

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import Selection
 from support.can_files import damaged, read_back
 from support.can_kinds import KINDS, Kind, judge
 
@@ -59,18 +58,3 @@ def test_damage_adds_no_frames_and_hides_no_loss(tmp_path: Path, kind: Kind) -> 
         verdict = judge(kind, frames, content, damaged(content, seed), path)
 
         assert not verdict.is_fault, f"seed {seed}: {verdict}"
-
-
-@EVERY_KIND
-def test_unselected_frames_are_counted_but_not_read(tmp_path: Path, kind: Kind) -> None:
-    frames = kind.frames(200)
-    expected = kind.expected(frames)
-    path = _file(tmp_path, kind, kind.spell(frames))
-    name = sorted(expected)[0]
-    times = [f.t_ns for f in expected[name]]
-    lo, hi = times[len(times) // 3], times[2 * len(times) // 3]
-
-    found, ledger = read_back(path, Selection(frozenset({name}), lo, hi))
-
-    assert found == {name: [f for f in expected[name] if lo <= f.t_ns < hi]}
-    assert {n: ledger.topic(n).found for n in expected} == {n: len(f) for n, f in expected.items()}

@@ -172,23 +172,6 @@ def test_damage_raises_only_crosscue_errors(tmp_path: Path, compression: int) ->
         assert "x.mf4" in message
 
 
-def test_damaged_compressed_block_drops_only_its_records(tmp_path: Path) -> None:
-    path = _signals(tmp_path / "x.mf4", count=200_000, compression=1)
-    content = bytearray(path.read_bytes())
-    hit = content.find(b"##DZ") + 200
-    content[hit] ^= 0xFF
-    path.write_bytes(content)
-
-    found, ledger = _tables(path)
-
-    used = sum(map(len, found["drive"]))
-    assert used + ledger.topic("drive").dropped.total() == 200_000
-    assert 0 < ledger.topic("drive").dropped.total() < 200_000
-    assert "compressed block" in next(ledger.drops()).detail
-    (last,) = found["drive"][-1:]
-    assert last.rows["torque"][-1] == -199_999
-
-
 @pytest.mark.parametrize(
     ("content", "match"),
     [

@@ -10,7 +10,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.time_file_names import find_time_file
 from crosscue.replay.limits import DEFAULT_LIMITS
 from crosscue.replay.readers.time_file import TimeFile, read_time_file
 
@@ -111,20 +110,3 @@ def test_any_bytes_are_read_or_refused_in_one_line(tmp_path: Path, raw: bytes) -
 
     assert count > 0
     assert "\n" not in refusal
-
-
-def test_time_file_is_found_in_folder_or_next_to_it(tmp_path: Path) -> None:
-    folder = tmp_path / "cam" / "data"
-    folder.mkdir(parents=True)
-    assert find_time_file(folder) is None
-    (tmp_path / "cam" / "timestamps.txt").touch()
-    assert find_time_file(folder) == tmp_path / "cam" / "timestamps.txt"
-    (tmp_path / "cam" / "data.csv").touch()
-    assert find_time_file(folder) == tmp_path / "cam" / "data.csv"
-    (folder / "one.csv").touch()
-    assert find_time_file(folder) == folder / "one.csv"
-    (folder / "two.csv").touch()
-    with pytest.raises(LogFormatError, match=r"several time files \(one.csv, two.csv\)"):
-        find_time_file(folder)
-    (folder / "times.txt").touch()
-    assert find_time_file(folder) == folder / "times.txt"

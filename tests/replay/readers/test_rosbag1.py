@@ -85,23 +85,6 @@ def test_real_bags_match_rosbags(parts: tuple[str, str]) -> None:
     assert not reading.ledger.notices
 
 
-@pytest.mark.parametrize("compression", COMPRESSIONS)
-def test_every_message_is_read_in_stored_order(tmp_path: Path, compression: str) -> None:
-    rows = rows_of(2000)
-    reading = read_rows(write_bag(tmp_path / "a.bag", rows, compression))
-
-    assert by_topic(reading.rows) == by_topic(rows)
-    assert reading.ledger.is_whole
-    assert not reading.ledger.notices
-    topic = next(t for t in reading.log.topics if t.name == "/imu/data")
-    assert (topic.type_name, topic.encoding, topic.schema_encoding) == (
-        "sensor_msgs/Imu",
-        "ros1",
-        "ros1msg",
-    )
-    assert b"float64[9] orientation_covariance" in topic.schema
-
-
 @pytest.mark.parametrize("suffix", [".bag", ".bag.active"])
 def test_bag_of_killed_recorder_is_read_completely(tmp_path: Path, suffix: str) -> None:
     rows = rows_of(800)
@@ -129,24 +112,6 @@ def test_wrong_chunk_count_drops_no_message(tmp_path: Path, field: bytes, wrong:
 
     assert by_topic(reading.rows) == by_topic(rows)
     assert any("chunk_count" in sentence for sentence in reading.ledger.notices)
-
-
-@pytest.mark.parametrize("damage", [b"\xff\xff\xff\xff", b"\0\0\0\0"])
-@pytest.mark.parametrize("of_body", [False, True])
-def test_damaged_length_without_index_drops_at_most_two_messages(
-    tmp_path: Path, damage: bytes, of_body: bool
-) -> None:
-    payloads = [b"%03d" % i * (3 + i % 5) for i in range(80)]
-    body = b"".join(message(0, START_NS + i, payload) for i, payload in enumerate(payloads))
-    content = bytearray(chunk(connection(0, b"/a") + body))
-    at = content.index(message(0, START_NS + 40, payloads[40])) + (42 if of_body else 0)
-    content[at : at + 4] = damage
-    reading = read_rows(bag(tmp_path / "a.bag", bytes(content)))
-
-    given = [row.payload for row in reading.rows]
-    assert not set(given) - set(payloads)
-    assert len(given) >= 78
-    assert not reading.ledger.is_whole
 
 
 def _loose(count: int, begin: int) -> list[tuple[Row, bytes]]:

@@ -12,8 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.base import Selection
-from crosscue.replay.ledger import NOT_ASKED_TIME
 from support.rosbag_files import Row, by_topic, read_rows, rows_of, write_folder
 
 Storage = Literal["sqlite3", "mcap"]
@@ -145,14 +143,3 @@ def test_truncated_compressed_file_yields_readable_part(tmp_path: Path, storage:
     assert not reading.ledger.is_whole
     dropped = sum(a.dropped.total() for n, a in reading.ledger.accounts.items())
     assert dropped == len(rows) - len(reading.rows)
-
-
-def test_time_range_spans_files(tmp_path: Path) -> None:
-    rows = rows_of(400)
-    folder = folder_of_parts(tmp_path / "bag", rows[:200], rows[200:])
-    selection = Selection(start_ns=rows[150].log_ns, end_ns=rows[250].log_ns)
-    reading = read_rows(folder, selection)
-
-    assert by_topic(reading.rows) == by_topic(rows[150:250])
-    skipped = sum(a.skipped[NOT_ASKED_TIME] for a in reading.ledger.accounts.values())
-    assert skipped == 300

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 import pytest
 
-from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.columns import Floats
-from crosscue.replay.vehicle.drafting.candidates import WHEELS, Candidate, SignalKind, candidates
+from crosscue.replay.vehicle.drafting.candidates import WHEELS, Candidate, SignalKind
 from crosscue.replay.vehicle.drafting.choice import Choices, rank_candidates
 from crosscue.replay.vehicle.drafting.observed import Bus, Observed
 from crosscue.replay.vehicle.drafting.series import GroundTrack, Series
@@ -127,38 +125,6 @@ def test_wheel_radius_is_estimated_from_angular_speeds() -> None:
 
     assert best.radius_m == pytest.approx(0.31, rel=0.01)
     assert not best.verdict.wrong
-
-
-DBC: Final = """VERSION ""
-BU_: A
-BO_ 100 Wheels: 8 A
- SG_ WhlSpdRL : 0|16@1+ (0.01,0) [0|0] "km/h" A
- SG_ WhlSpdRR : 16|16@1+ (0.01,0) [0|0] "km/h" A
- SG_ WhlSpdRL_Cmd : 32|16@1+ (0.01,0) [0|0] "km/h" A
-BO_ 101 ESP: 8 A
- SG_ YawRate : 0|16@1- (0.01,0) [0|0] "deg/s" A
- SG_ YawRateTarget : 16|16@1- (0.01,0) [0|0] "deg/s" A
- SG_ YawAngle : 32|16@1- (0.01,0) [0|0] "deg" A
-BO_ 102 SteerReq: 8 A
- SG_ SteerAngle : 0|16@1- (0.1,0) [0|0] "deg" A
-BO_ 103 EPS: 8 A
- SG_ SteerAngle : 0|16@1- (0.1,0) [0|0] "deg" A
- SG_ SteerRate : 16|16@1- (0.1,0) [0|0] "deg/s" A
-"""
-
-
-def test_candidates_exclude_requested_and_target_signals(tmp_path: Path) -> None:
-    file = tmp_path / "car.dbc"
-    file.write_text(DBC)
-
-    found = {one.name: one.kind for one in candidates(CanDatabase.load([file]).messages)}
-
-    assert found == {
-        "Wheels.WhlSpdRL": SignalKind.WHEEL,
-        "Wheels.WhlSpdRR": SignalKind.WHEEL,
-        "ESP.YawRate": SignalKind.YAW_RATE,
-        "EPS.SteerAngle": SignalKind.STEERING,
-    }
 
 
 def test_mobileye_is_recognised_by_message_lengths() -> None:

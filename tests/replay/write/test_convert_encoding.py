@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from crosscue.replay.columns import (
@@ -205,44 +203,6 @@ def test_images_round_trip_byte_for_byte(pictures: Images, type_name: str) -> No
         assert decoded.rows.bytes_.payload(i) == pictures.bytes_.payload(i)
     if type_name == "sensor_msgs/msg/Image":
         assert decoded.rows.pixel_format == pictures.pixel_format
-
-
-def random_columns(n: int, *names: str) -> dict[str, NDArray[np.generic]]:
-    rng = np.random.default_rng(2)
-    return {name: rng.normal(size=n) for name in names}
-
-
-QUAT = ("quat_x", "quat_y", "quat_z", "quat_w")
-TABLES: Mapping[str, dict[str, NDArray[np.generic]]] = {
-    "sensor_msgs/msg/Imu": random_columns(
-        4, *(f"accel_{a}_mps2" for a in "xyz"), *(f"gyro_{a}_radps" for a in "xyz"), *QUAT
-    ),
-    "sensor_msgs/msg/MagneticField": random_columns(4, "mag_x_t", "mag_y_t", "mag_z_t"),
-    "sensor_msgs/msg/NavSatFix": random_columns(4, "latitude_deg", "longitude_deg", "altitude_m")
-    | {
-        "status": np.array([0, -1, 2, 0], np.int8),
-        "covariance_m2": np.arange(36.0).reshape(4, 9),
-        "covariance_type": np.array([2, 0, 1, 3], np.uint8),
-    },
-    "nav_msgs/msg/Odometry": random_columns(
-        4, "x_m", "y_m", "z_m", *QUAT, "speed_x_mps", "speed_y_mps", "yaw_rate_radps"
-    ),
-    "geometry_msgs/msg/PoseStamped": random_columns(4, "x_m", "y_m", "z_m", *QUAT),
-}
-
-
-@pytest.mark.parametrize("type_name", sorted(TABLES))
-def test_standard_columns_round_trip_in_standard_type(type_name: str) -> None:
-    table = Table(TABLES[type_name])
-    (out,) = encoded(Topic("/t", "crosscue/Table", "columns"), columns_block("/t", table))
-
-    (decoded,) = round_trip("/t", table)
-
-    assert out.type.name == type_name
-    assert isinstance(decoded.rows, Table)
-    assert decoded.rows.columns.keys() == table.columns.keys()
-    for name, values in table.columns.items():
-        np.testing.assert_array_equal(decoded.rows[name], values)
 
 
 def test_other_tables_round_trip_in_generated_type() -> None:
