@@ -92,6 +92,13 @@ COMMANDS: Final = {
     "completion": "eval.completion:completion",
 }
 
+# The commands that ``crosscue --help`` lists, by what they are for; ``--help all`` lists the rest.
+FRONT: Final = {
+    "start": ("demo", "info", "check"),
+    "run": ("replay", "score", "compare"),
+    "look": ("view", "query"),
+}
+
 # Former commands, and what replaces them.
 MOVED: Final = {
     "vehicle check": "check V.toml LOG",
@@ -216,7 +223,7 @@ def run(argv: Sequence[str]) -> int:
         The exit status, as ``EXIT_STATUS`` lists them.
     """
     if not argv or argv[0] in ("-h", "--help"):
-        print(_overview())
+        print(_overview(has_all=list(argv[1:2]) == ["all"]))
         return 0 if argv else 2
     if argv[0] == "--version":
         print(f"crosscue {installed('crosscue')}")
@@ -331,7 +338,9 @@ def _command_of(argv: Sequence[str]) -> str | None:
 def _unknown(argv: Sequence[str]) -> int:
     members = [name for name in COMMANDS if name.startswith(argv[0] + " ")]
     if members and len(argv) > 1 and argv[1] in ("-h", "--help"):
-        print("\n".join(_lines(members)))
+        examples = [f"  {_docstring_of(name)[1]}" for name in members]
+        lines = [*_lines(members, max(map(len, members))), "", "examples:", *examples]
+        print("\n".join([*lines, "", f"crosscue {members[0]} --help describes a command."]))
         return 0
     if members and len(argv) == 1:
         print(f"crosscue: {argv[0]}: needs one of: {', '.join(members)}", file=sys.stderr)
@@ -349,13 +358,17 @@ def _unknown(argv: Sequence[str]) -> int:
     return 2
 
 
-def _lines(names: Iterable[str]) -> list[str]:
-    width = max(map(len, COMMANDS))
-    return [f"  {name:{width}}  {summary_of(name)}" for name in names]
+def _lines(names: Iterable[str], width: int) -> list[str]:
+    return [f"  {_coloured(f'{name:{width}}', '36')}  {summary_of(name)}" for name in names]
 
 
 def summary_of(name: str) -> str:
-    """Return one line on a command: the first of its function's docstring.
+    """Return one line on a command: the first of its function's docstring."""
+    return _docstring_of(name)[0]
+
+
+def _docstring_of(name: str) -> tuple[str, str]:
+    """Return the first line and the first example of a command's docstring.
 
     It is read from the source, because the list of commands is printed without any import.
     """
@@ -363,23 +376,33 @@ def summary_of(name: str) -> str:
     module, _, function = where.partition(":")
     path = Path(__file__).parents[1].joinpath(*module.split(".")).with_suffix(".py")
     text = path.read_text(encoding="utf-8")
-    found = re.search(rf'^def {function}\(.*?"""(.*?)\.?(?:"""|$)', text, re.DOTALL | re.MULTILINE)
+    found = re.search(rf'^def {function}\(.*?"""(.*?)"""', text, re.DOTALL | re.MULTILINE)
     assert found is not None, where
-    return found[1][:1].lower() + found[1][1:]
+    summary = found[1].partition("\n")[0].removesuffix(".")
+    examples = re.sub(r"\\+\n +", "", found[1].rpartition("Examples:")[2])
+    example = re.search(rf"^ +(crosscue {name}.*?)(?: {{3,}}.*)?$", examples, re.MULTILINE)
+    return summary[:1].lower() + summary[1:], "" if example is None else example[1]
 
 
-def _overview() -> str:
-    return "\n".join(
-        [
-            "crosscue COMMAND ...      replay drive logs, score them, show them",
-            "",
-            *_lines(COMMANDS),
-            "",
-            "crosscue COMMAND --help describes a command; crosscue --version prints the version.",
-            "",
-            EXIT_STATUS,
-        ]
-    )
+def _overview(*, has_all: bool) -> str:
+    """Return the list of commands: those of ``FRONT`` in groups, and all others if requested."""
+    front = {name for names in FRONT.values() for name in names}
+    groups = dict(FRONT)
+    if has_all:
+        groups["all other commands"] = tuple(name for name in COMMANDS if name not in front)
+    width = max(len(name) for names in groups.values() for name in names)
+    lines = ["crosscue COMMAND ...      replay drive logs, score them, show them"]
+    for title, names in groups.items():
+        lines += ["", _coloured(f"{title}:", "1"), *_lines(names, width)]
+    rest = "" if has_all else f"; crosscue --help all lists {len(COMMANDS) - len(front)} more"
+    lines += ["", f"crosscue COMMAND --help describes a command{rest}."]
+    return "\n".join([*lines, "crosscue --version prints the version.", "", EXIT_STATUS])
+
+
+def _coloured(text: str, code: str) -> str:
+    """Return a text with a terminal's escape sequence, if a terminal shows it."""
+    is_plain = "NO_COLOR" in os.environ or os.environ.get("TERM") == "dumb"
+    return text if is_plain or not sys.stdout.isatty() else f"\033[{code}m{text}\033[0m"
 
 
 if __name__ == "__main__":

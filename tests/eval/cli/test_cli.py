@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import re
+import resource
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -99,3 +103,61 @@ def test_help_imports_no_heavy_packages() -> None:
         "sys.exit(f'imported: {heavy}' if heavy else 0)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_help_lists_eight_commands_and_help_all_the_rest(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.run(["--help"]) == 0
+    short = capsys.readouterr().out
+    assert cli.run(["--help", "all"]) == 0
+    whole = capsys.readouterr().out
+
+    names = re.compile(r"^  ([a-z][a-z -]*?)  +[a-z]", re.MULTILINE)
+    front = {"demo", "info", "check", "replay", "score", "compare", "view", "query"}
+    assert {*names.findall(short)} == front == {name for one in cli.FRONT.values() for name in one}
+    assert {*names.findall(whole)} == cli.COMMANDS.keys()
+    assert f"crosscue --help all lists {len(cli.COMMANDS) - 8} more" in short
+    assert max(map(len, whole.splitlines())) <= 100
+
+
+@pytest.mark.parametrize("group", ["fit", "landmarks", "model", "run", "study", "train", "vehicle"])
+def test_help_of_a_group_has_an_example_of_each_command(
+    group: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run([group, "--help"]) == 0
+    examples = capsys.readouterr().out.partition("examples:")[2]
+
+    for name in (name for name in cli.COMMANDS if name.startswith(f"{group} ")):
+        assert re.search(rf"^  crosscue {name}\b", examples, re.MULTILINE), name
+    assert "\\" not in examples
+
+
+def test_help_is_coloured_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    def printed(is_terminal: bool) -> str:
+        out = io.StringIO()
+        monkeypatch.setattr(out, "isatty", lambda: is_terminal)
+        with contextlib.redirect_stdout(out):
+            assert cli.run(["--help"]) == 0
+        return out.getvalue()
+
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    assert "\x1b[" not in printed(False)
+    assert re.sub(r"\x1b\[\d*m", "", printed(True)) == printed(False) != printed(True)
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert "\x1b[" not in printed(True)
+
+
+@pytest.mark.parametrize("argument", ["--help", "--version"])
+def test_bare_help_and_version_take_under_a_fifth_of_a_cpu_second(argument: str) -> None:
+    subprocess.run([sys.executable, "-m", "crosscue.eval.cli", argument], check=True)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(
+        [sys.executable, "-m", "crosscue.eval.cli", argument],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 0.2
