@@ -31,6 +31,9 @@ from .standard_sizes import BOX_SPREAD, SizePrior, size_prior
 NEAR_HEIGHTS: Final = 1.0
 # Maximum ratio of the heights of a box and a track's predicted box.
 GROWTH: Final = 1.5
+# Time between two frames up to which these limits also hold where the car's motion is unknown; they
+# widen in proportion beyond.
+UNSEEN_S: Final = 0.2
 # Intersection over union above which a box is the same object as an assigned box.
 SAME_IOU: Final = 0.3
 # Distance travelled within which observations are merged to one, with their mean height.
@@ -49,8 +52,8 @@ MIN_LIT: Final = 2
 # the rule for one frame misses four in ten small or blurred lenses.
 MIN_LIT_FRACTION: Final = 0.15
 MIN_DARK: Final = 10
-# A light does not face the car if it was dark in ``MIN_DARK`` frames and lit in at most this
-# fraction.
+# A light does not face the car if it was dark in ``MIN_DARK`` frames, and lit or yellow in at most
+# this fraction.
 MAX_LIT_FRACTION: Final = 0.05
 # Relative spread of the heights of lights at one intersection, which are mostly of one make. It
 # includes the errors of the boxes and is much less than the spread of standard sizes.
@@ -128,7 +131,8 @@ class ObjectTrack:
         since_m: Distance travelled since the last observation.
         unseen_m: Absolute distance travelled since the last observation.
         unseen_s: Time since the last observation.
-        lit: Number of frames in which a lens was lit.
+        lit: Number of frames in which a red or green lens was lit.
+        yellow: Number of frames in which a spot of the box was yellow: a lens, or the housing.
         dark: Number of frames in which no lens was lit although the box was large enough.
         way_scale_sd: Relative standard deviation of the odometer's scale.
         evidence: Log likelihood ratio of an object against none, from all frames so far.
@@ -149,6 +153,7 @@ class ObjectTrack:
     unseen_m: float = 0.0
     unseen_s: float = 0.0
     lit: int = 0
+    yellow: int = 0
     dark: int = 0
     way_scale_sd: float = 0.0
     evidence: float = 0.0
@@ -192,15 +197,14 @@ class ObjectTrack:
         examined = self.lit + self.dark
         if self.lit >= MIN_LIT and self.lit >= MIN_LIT_FRACTION * examined:
             return Facing.EGO
-        is_away = self.dark >= MIN_DARK and self.lit <= MAX_LIT_FRACTION * examined
+        coloured = self.lit + self.yellow
+        is_away = self.dark >= MIN_DARK and coloured <= MAX_LIT_FRACTION * (self.dark + coloured)
         return Facing.AWAY if is_away else Facing.UNKNOWN
 
     def add_lens(self, lens: str) -> None:
-        """Count the lens of the newest box (by ``lens_of``; empty if it was not examined).
-
-        Yellow is evidence for neither.
-        """
+        """Count the lens of the newest box (by ``lens_of``; empty if it was not examined)."""
         self.lit += lens in SIGNALS
+        self.yellow += lens == "yellow"
         self.dark += lens == "dark"
 
     @property
@@ -367,7 +371,8 @@ class ObjectTracks:
         for track in self.tracks:
             track.predict(motion)
         worth = math.tanh(0.5 * motion.seconds / RESEMBLE_S) if is_new else 0.0
-        self.of_boxes = self._assign(boxes_px, heights_px)
+        slack = 1.0 if motion.way_m is not None else max(motion.seconds / UNSEEN_S, 1.0)
+        self.of_boxes = self._assign(boxes_px, heights_px, slack)
         order = range(len(boxes_px)) if evidence is None else np.argsort(-evidence, kind="stable")
         for i in map(int, order):
             if self.of_boxes[i] is None and not self._is_found(boxes_px, i) and heights_px[i] > 0.0:
@@ -389,15 +394,22 @@ class ObjectTracks:
         return self.tracks
 
     def _assign(
-        self, boxes_px: NDArray[np.float64], heights_px: NDArray[np.float64]
+        self, boxes_px: NDArray[np.float64], heights_px: NDArray[np.float64], slack: float
     ) -> list[ObjectTrack | None]:
-        """Assign boxes to tracks, nearest pairs first; return the track of each box."""
+        """Assign boxes to tracks, nearest pairs first; return the track of each box.
+
+        Args:
+            boxes_px: Shape (N, 4).
+            heights_px: Shape (N,).
+            slack: Factor on the permitted distances and logarithms of growth.
+        """
         spans_px = np.where(heights_px > 0.0, heights_px, boxes_px[:, 3] - boxes_px[:, 1])
         pairs = [
             (away, i, j)
             for j, track in enumerate(self.tracks)
             for i in range(len(boxes_px))
-            if (away := _cost_of(track, boxes_px[i], float(spans_px[i]))) < NEAR_HEIGHTS
+            if (away := _cost_of(track, boxes_px[i], float(spans_px[i]), slack))
+            < NEAR_HEIGHTS * slack
         ]
         found: list[ObjectTrack | None] = [None] * len(boxes_px)
         for _, i, j in sorted(pairs):
@@ -499,9 +511,11 @@ def iou(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return float(inside / (both - inside)) if both > inside else 0.0
 
 
-def _cost_of(track: ObjectTrack, box_px: NDArray[np.float64], height_px: float) -> float:
+def _cost_of(
+    track: ObjectTrack, box_px: NDArray[np.float64], height_px: float, slack: float
+) -> float:
     """Distance of a box from the predicted box, in heights; infinite if the heights differ."""
-    if abs(math.log(height_px / track.height_px)) > math.log(GROWTH):
+    if abs(math.log(height_px / track.height_px)) > slack * math.log(GROWTH):
         return math.inf
     apart = 0.5 * (box_px[:2] + box_px[2:] - track.box_px[:2] - track.box_px[2:])
     return float(np.hypot(*apart)) / max(height_px, track.height_px)

@@ -150,6 +150,18 @@ def test_light_that_is_missed_in_every_other_frame_is_still_found() -> None:
     assert found[-1] == (ACCEPTED,)
 
 
+def test_light_is_followed_through_rare_pictures_without_odometry() -> None:
+    """At 1 Hz a light grows by a fifth and moves by two of its heights between two pictures."""
+    one, said = ControlTracks(car()), []
+    for i in range(6):
+        (found,) = [frame([(600.0 + 60.0 * i, 300.0 - 20.0 * i, 0.8, "unknown")])]
+        grown = found.boxes_px + 15.0 * 0.2 * i * np.array([-0.4, -1.0, 0.4, 1.0])
+        (now,) = one([replace(found, boxes_px=grown)], STEP._replace(seconds=1.0))
+        said += now.decisions
+
+    assert said == [TOO_LITTLE_EVIDENCE] * 2 + [ACCEPTED] * 4
+
+
 def test_dark_housing_needs_more_frames_than_a_lit_one() -> None:
     first = {}
     for lens in ("red", "unknown", "dark"):

@@ -78,6 +78,32 @@ def test_two_boxes_of_one_object_make_one_track() -> None:
     assert followed.counts["boxes of an object already found"] == 1
 
 
+@pytest.mark.parametrize(
+    ("lenses", "facing"),
+    [
+        (["red"], Facing.UNKNOWN),
+        (["red", "dark", "green"], Facing.EGO),
+        (["dark"] * 9, Facing.UNKNOWN),
+        (["dark"] * 10, Facing.AWAY),
+        (["unknown"] * 30, Facing.UNKNOWN),
+        ([""] * 30, Facing.UNKNOWN),
+        (["dark"] * 28 + ["red"], Facing.AWAY),
+        (["dark"] * 18 + ["red"] * 2, Facing.UNKNOWN),
+        (["dark"] * 8 + ["green"] * 2, Facing.EGO),
+        (["yellow"] * 30, Facing.UNKNOWN),
+        (["dark"] * 10 + ["yellow"] * 5, Facing.UNKNOWN),
+        (["dark"] * 19 + ["yellow"], Facing.AWAY),
+    ],
+)
+def test_facing_requires_enough_consistent_frames(lenses: list[str], facing: Facing) -> None:
+    followed = tracks()
+    for gone_m, lens in enumerate(lenses):
+        box = box_of(FAR, float(gone_m))[None, :]
+        (track,) = followed(AHEAD, box, box[:, 3] - box[:, 1], [lens])
+
+    assert track.facing is facing
+
+
 def test_range_without_odometry_relies_on_the_size_prior() -> None:
     followed = tracks()
     for gone_m in range(20):
