@@ -71,8 +71,9 @@ STRAIGHT_RAD: Final = 0.15
 # Correlation time of a detector's errors on one object. Evidence of a second is the same at any
 # frame rate above 10 Hz, and about 5 independent frames.
 RESEMBLE_S: Final = 0.1
-# Evidence of an accepted track, and of one that is given up.
+# Evidence of an accepted track, of one whose acceptance is taken back, and of one that is given up.
 ACCEPTED: Final = math.log(0.95 / 0.05)
+TAKEN_BACK: Final = 0.0
 GIVEN_UP: Final = -2.0
 # Minimum number of frames of an accepted track.
 MIN_HITS: Final = 3
@@ -137,7 +138,7 @@ class ObjectTrack:
         way_scale_sd: Relative standard deviation of the odometer's scale.
         evidence: Log likelihood ratio of an object against none, from all frames so far.
         hits: Number of frames with an observation and a new picture.
-        is_accepted: True once the evidence was sufficient; a track remains accepted.
+        is_accepted: True once the evidence was sufficient, until it is against an object.
         is_way_unknown: True if the distance travelled to the newest frame is unknown.
         looks: Number of boxes by the result of the second look at them.
     """
@@ -265,6 +266,8 @@ class ObjectTrack:
         self.hits += self.is_seen and worth > 0.0
         if self.evidence >= ACCEPTED and self.hits >= MIN_HITS:
             self.accept()
+        elif self.evidence < TAKEN_BACK:
+            self.is_accepted = False
 
     def accept(self) -> None:
         """Accept the track; its range is then by all observations."""
@@ -387,7 +390,7 @@ class ObjectTracks:
                     one.weigh_evidence(float(evidence[i]), 1.0 if one.seen == 1 else worth)
         self.counts["objects followed"] += sum(one.is_accepted for one in self.tracks) - followed
         for one in self.tracks:
-            if not one.is_seen:
+            if not one.is_seen and evidence is not None:
                 one.weigh_evidence(MISSED, worth)
         self.tracks = [one for one in self.tracks if not _is_over(one)]
         self._share_sizes()

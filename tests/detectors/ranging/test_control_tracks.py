@@ -150,6 +150,15 @@ def test_light_that_is_missed_in_every_other_frame_is_still_found() -> None:
     assert found[-1] == (ACCEPTED,)
 
 
+def test_acceptance_is_taken_back_when_the_evidence_turns() -> None:
+    strong: list[Seen] = [(600.0, 140.0, 0.8, "unknown")]
+    weak: list[Seen] = [(600.0, 140.0, 0.12, "dark")]
+    found = decided([strong] * 5 + [weak] * 30 + [strong] * 10)
+
+    assert found[4] == found[8] == found[-1] == (ACCEPTED,)
+    assert found[30] == (TOO_LITTLE_EVIDENCE,)
+
+
 def test_light_is_followed_through_rare_pictures_without_odometry() -> None:
     """At 1 Hz a light grows by a fifth and moves by two of its heights between two pictures."""
     one, said = ControlTracks(car()), []
