@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from crosscue.detectors.ranging.object_tracks import CarStep, ObjectTrack, ObjectTracks
+from crosscue.detectors.ranging.object_tracks import CarStep, Facing, ObjectTrack, ObjectTracks
 from crosscue.detectors.ranging.standard_sizes import light_size
 from crosscue.replay.columns import Floats
 
