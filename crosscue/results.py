@@ -9,7 +9,17 @@ from dataclasses import fields, is_dataclass
 from enum import Enum
 from operator import attrgetter
 from pathlib import PurePath
-from typing import Any, ClassVar, Final, Protocol, Self, TypeVar, overload, runtime_checkable
+from typing import (
+    Any,
+    ClassVar,
+    Final,
+    Literal,
+    Protocol,
+    Self,
+    TypeVar,
+    overload,
+    runtime_checkable,
+)
 
 from crosscue.replay.safe_text import table, terminal_width, visible
 
@@ -32,6 +42,15 @@ class HasJson(Protocol):
         ...
 
 
+@runtime_checkable
+class HasDump(Protocol):
+    """A record of pydantic."""
+
+    def model_dump(self, *, mode: Literal["json"]) -> Any:
+        """Return dictionaries, lists and scalars."""
+        ...
+
+
 class Result:
     """Base of what verbs return. Subclasses are frozen dataclasses with ``repr=False``.
 
@@ -42,6 +61,7 @@ class Result:
     Attributes:
         also: Paths of attributes that are in JSON besides the fields, by key.
         formats: Methods that return another text, by name of the option, with its help.
+        json_is: Path of the attribute that is the JSON; empty for the fields.
         is_printed_in_parts: True if the command prints only the parts, unless as JSON.
         max_lines: Number of lines that the command prints without ``--verbose``; 0 for all.
     """
@@ -49,6 +69,7 @@ class Result:
     __slots__ = ()
     also: ClassVar[Mapping[str, str]] = {}
     formats: ClassVar[Mapping[str, str]] = {}
+    json_is: ClassVar[str] = ""
     is_printed_in_parts: ClassVar[bool] = False
     max_lines: ClassVar[int] = 0
 
@@ -64,7 +85,7 @@ class Result:
 
     def as_dict(self) -> Any:
         """Return the JSON output of the command, as dictionaries, lists and scalars."""
-        return plain(_entries(self))
+        return plain(attrgetter(self.json_is)(self) if self.json_is else _entries(self))
 
     def lines(self) -> Iterator[str]:
         """Yield the text output of the command; a piece of text may have several lines."""
@@ -152,6 +173,8 @@ def plain(value: object) -> Any:
         return value.as_dict()
     if isinstance(value, HasJson):
         return value.as_json()
+    if isinstance(value, HasDump):
+        return plain(value.model_dump(mode="json"))
     if is_dataclass(value) and not isinstance(value, type):
         return plain(_entries(value))
     if isinstance(value, Enum):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -106,10 +106,6 @@ class PositionUpdates:
         """Return time, x, y, xx, xy and yy of the positions used since the last call."""
         taken, self._used = self._used, []
         return taken
-
-    def as_dict(self) -> dict[str, int]:
-        """The counts, for the manifest."""
-        return asdict(self.counts)
 
     def _is_due(self, t_ns: int) -> bool:
         # A tolerance for jitter of the clock.

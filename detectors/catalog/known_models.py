@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from crosscue.detectors.catalog.card import Evidence, ModelCard, read_card
 from crosscue.detectors.catalog.class_names import CUE_LABELS
@@ -30,6 +30,8 @@ class Model(Result):
     name: str
     card: ModelCard
 
+    json_is: ClassVar = "card"
+
     @property
     def size_mb(self) -> float:
         """Size of the published weights, in 10^6 bytes."""
@@ -46,10 +48,6 @@ class Model(Result):
         card = self.card
         meant = {card.meaning(i) for i in range(len(card.output.classes))}
         return sorted(meant & {*CUE_LABELS})
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the card."""
-        return self.card.model_dump(mode="json")
 
     def lines(self) -> Iterator[str]:
         """Yield the origin of the network, its input and output, and what was measured."""
@@ -125,9 +123,12 @@ class FetchedModel(Result):
     name: str
     files: tuple[FetchedFile, ...]
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the paths of the files, by the model's name."""
-        return {self.name: [str(file.path) for file in self.files]}
+    json_is: ClassVar = "paths"
+
+    @property
+    def paths(self) -> dict[str, list[Path]]:
+        """Paths of the files, by the model's name."""
+        return {self.name: [file.path for file in self.files]}
 
     def lines(self) -> Iterator[str]:
         """Yield one line for each file."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.safe_text import visible
-from crosscue.results import Result
+from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
 
 if TYPE_CHECKING:
@@ -49,12 +49,47 @@ class DetectorScore(Result):
         report: Page with the scores.
     """
 
-    labelled: LabelledRun
-    labels: BoxLabels
-    scores: tuple[PartScore, ...]
+    labelled: LabelledRun = field(metadata=HIDDEN)
+    labels: BoxLabels = field(metadata=HIDDEN)
+    scores: tuple[PartScore, ...] = field(metadata=HIDDEN)
     calibration: tuple[Reliability, ...]
-    block_s: float
+    block_s: float = field(metadata=HIDDEN)
     report: Path
+
+    also: ClassVar = {
+        "run": "labelled.run.path",
+        "detector": "labelled.detector.name",
+        "labels": "labels.where",
+        "format": "labels.format",
+        "images": "images",
+        "images_labelled": "images_labelled",
+        "frames": "labelled.frames",
+        "placed": "labelled.rule",
+        "left_out": "labelled.left_out",
+        "not_judged": "labelled.not_judged",
+        "classes": "classes",
+        "parts": "part_rows",
+    }
+
+    @property
+    def images(self) -> int:
+        """Number of pictures of the run that are labelled."""
+        return len(self.labelled.names)
+
+    @property
+    def classes(self) -> dict[str, tuple[str, ...]]:
+        """Labels of the detector, by class that they count as."""
+        return {name: self.labelled.members[name] for name in self.labelled.classes}
+
+    @property
+    def images_labelled(self) -> int:
+        """Number of labelled pictures."""
+        return len(self.labels.pictures)
+
+    @property
+    def part_rows(self) -> list[dict[str, object]]:
+        """One row per class and part, with 95 % intervals."""
+        return [_row(one) for one in self.scores]
 
     @property
     def exit_status(self) -> int:
@@ -71,7 +106,7 @@ class DetectorScore(Result):
         """Table with one row per class and part, with 95 % intervals."""
         import pyarrow as pa
 
-        return pa.Table.from_pylist([_row(one) for one in self.scores])
+        return pa.Table.from_pylist(self.part_rows)
 
     @property
     def bins(self) -> pa.Table:
@@ -93,26 +128,6 @@ class DetectorScore(Result):
                 for each in one.bins
             ]
         )
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the JSON output of ``crosscue score detector``."""
-        of = self.labelled
-        return {
-            "run": str(of.run.path),
-            "detector": of.detector.name,
-            "labels": self.labels.where,
-            "format": self.labels.format,
-            "images": len(of.names),
-            "images_labelled": len(self.labels.pictures),
-            "frames": of.frames,
-            "placed": of.rule,
-            "left_out": dict(of.left_out),
-            "not_judged": dict(of.not_judged),
-            "classes": {name: list(of.members[name]) for name in of.classes},
-            "parts": [_row(one) for one in self.scores],
-            "calibration": [asdict(one) for one in self.calibration],
-            "report": str(self.report),
-        }
 
     def lines(self) -> Iterator[str]:
         """Yield what was compared, the scores of each class and part, and the calibration."""

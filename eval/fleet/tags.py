@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.runs import tags as stored
@@ -25,9 +25,7 @@ class TaggedRuns(Result):
 
     tags: Mapping[Path, Mapping[str, str]]
 
-    def as_dict(self) -> dict[str, dict[str, str]]:
-        """Return tags by run folder."""
-        return {str(path): dict(tags) for path, tags in self.tags.items()}
+    json_is: ClassVar = "tags"
 
     def lines(self) -> Iterator[str]:
         """Yield one line for each run."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, insort
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -140,7 +140,7 @@ class LandmarkStage:
 
     def counts(self) -> dict[str, int]:
         """Return the numbers of frames by outcome, for the manifest."""
-        return self.search.counts.as_dict()
+        return asdict(self.search.counts)
 
     def _describe(self, frame: _Frame) -> Keypoints | None:
         try:

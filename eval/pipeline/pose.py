@@ -285,7 +285,7 @@ class PoseStage:
             "odometry": asdict(self.odometry_counts),
             "track": asdict(self.track_counts),
             "landmarks": self.landmarks.counts(),
-            "gnss": {} if self.positions is None else self.positions.as_dict(),
+            "gnss": {} if self.positions is None else asdict(self.positions.counts),
         }
 
     @property

@@ -10,6 +10,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from crosscue.replay.time.dates import is_date
+
 Colour: TypeAlias = tuple[int, int, int]
 
 
@@ -121,7 +123,6 @@ def pack_colours(colours: Sequence[Colour]) -> NDArray[np.uint32]:
 
 # Name of the timeline; the viewer reserves ``log_time`` for the wall clock of logging.
 TIMELINE: Final = "drive"
-YEAR_2000_NS: Final = 946_684_800_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,4 +145,4 @@ class DriveTime:
 
 def time_of(first_ns: int) -> DriveTime:
     """Return the display of times for a drive that starts at ``first_ns``."""
-    return DriveTime(first_ns > YEAR_2000_NS)
+    return DriveTime(is_date(first_ns))

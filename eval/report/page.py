@@ -22,6 +22,7 @@ from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import spelled, strict_json
+from crosscue.replay.time.dates import is_date
 from crosscue.replay.vehicle.cue_table import CUES
 
 from . import scene_figures
@@ -45,8 +46,6 @@ POSE_FIGURES: Final = {
 }
 # Max number of approaches with their own chart.
 BELIEFS: Final = 12
-# Cues whose published precision is the target to which the dissertation tuned them.
-YEAR_2000_NS: Final = 946_684_800_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,7 +283,7 @@ def _frame(one: WorstFrame) -> dict[str, Any]:
 
 def reported_time(t_ns: int) -> str:
     """Return a time as the viewer shows it: a date, or seconds for a clock that starts at boot."""
-    if t_ns <= YEAR_2000_NS:
+    if not is_date(t_ns):
         return f"{t_ns * 1e-9:.3f} s"
     at = datetime.fromtimestamp(t_ns // 1_000_000_000, UTC)
     return f"{at:%Y-%m-%d %H:%M:%S}.{t_ns // 1_000_000 % 1000:03d} UTC"

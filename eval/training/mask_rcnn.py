@@ -106,9 +106,7 @@ class TrainedMaskRcnn(Result):
     path: Path
     facts: Facts
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the JSON output of ``crosscue train mask-rcnn``: the facts."""
-        return self.facts.model_dump(mode="json")
+    json_is: ClassVar = "facts"
 
     def lines(self) -> Iterator[str]:
         """Yield size and accuracy of the checkpoint."""

@@ -19,7 +19,7 @@ from __future__ import annotations
 import cmath
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -101,10 +101,6 @@ class LandmarkCounts:
     repeated: int = 0
     accepted: int = 0
     gated: int = 0
-
-    def as_dict(self) -> dict[str, int]:
-        """Return the counts by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
 class Best(NamedTuple):

@@ -37,11 +37,11 @@ from crosscue.replay.errors import UsageError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.safe_text import visible
+from crosscue.replay.time.dates import is_date
 from crosscue.results import HIDDEN, Result, json_key
 from crosscue.verb import Option, keywords
 
 CONFIDENCE: Final = 0.95
-YEAR_2000_NS: Final = 946_684_800_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -402,6 +402,6 @@ def _log_names(parts: Sequence[LabelledRun]) -> str:
 def _date_of(parts: Sequence[LabelledRun]) -> str:
     """Return the date of the first picture in parentheses, or "" if the log has no real time."""
     first = min(int(part.t_ns[0]) for part in parts)
-    if first < YEAR_2000_NS:
+    if not is_date(first):
         return ""
     return f" ({datetime.fromtimestamp(first // 1_000_000_000, UTC):%Y-%m-%d})"

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Final, Protocol
+from typing import Annotated, ClassVar, Final, Protocol
 
 import numpy as np
 
@@ -152,6 +152,8 @@ class FieldResult(Result):
     runs: tuple[FieldRun, ...]
     tables: tuple[PageTable, ...]
 
+    json_is: ClassVar = "runs"
+
     @property
     def page(self) -> Path:
         """The page with tables and picture."""
@@ -161,10 +163,6 @@ class FieldResult(Result):
     def exit_status(self) -> int:
         """0, or 3 when something of a run's log was dropped."""
         return 0 if all(one.is_whole for one in self.runs) else 3
-
-    def as_dict(self) -> list[dict[str, object]]:
-        """Return the JSON output of ``crosscue study field``: a record for each run."""
-        return [asdict(one) for one in self.runs]
 
     def lines(self) -> Iterator[str]:
         """Yield the tables, notes on them, and the path of the page."""
