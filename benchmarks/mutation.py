@@ -108,8 +108,6 @@ PARTS: Final = {
             )
         ),
         (
-            "tests/detectors/cues/test_past.py::"
-            "test_lines_and_vehicles_past_are_counted_on_a_simulated_drive",
             "tests/detectors/cues/test_past.py::test_bus_samples_do_not_depend_on_block_boundaries",
             "tests/detectors/cues/test_looked_for.py::test_built_in_detectors_list_their_labels",
             "tests/detectors/cues/test_road_ground.py::test_wide_ego_road_has_no_side_fraction",

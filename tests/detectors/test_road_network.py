@@ -115,25 +115,10 @@ def test_train_road_accepts_a_folder_of_pictures_and_masks(
 ) -> None:
     data = folder(tmp_path / "own", 11)
     out = tmp_path / "own.safetensors"
-    argv = [
-        "train",
-        "road",
-        "--data",
-        str(data),
-        "-o",
-        str(out),
-        "--steps",
-        "4",
-        "--stop-at",
-        "2",
-        "--batch",
-        "2",
-        "--width",
-        "128",
-        "--device",
-        "cpu",
-        "--json",
-    ]
+    argv = (
+        f"train road --data {data} -o {out} --steps 4 --stop-at 2 --batch 2 --width 128 "
+        "--device cpu --json"
+    ).split()
 
     assert run(argv) == 0
 

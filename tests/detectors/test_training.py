@@ -239,29 +239,11 @@ def test_train_commands_produce_a_checkpoint_from_simulated_pictures(
         run(["train", "frames", "L3", "--per-layout", "4", "--width", "320", "-o", str(frames)])
         == 0
     )
-    learn = [
-        "train",
-        "mask-rcnn",
-        "--data",
-        str(frames / "coco.json"),
-        "--images",
-        str(frames / "images"),
-        "-o",
-        str(out),
-        "--width",
-        "320",
-        "--steps",
-        "2",
-        "--batch",
-        "1",
-        "--window",
-        "128",
-        "64",
-        "--check-every",
-        "1",
-        "--check-images",
-        "1",
-    ]
+    learn = (
+        f"train mask-rcnn --data {frames / 'coco.json'} --images {frames / 'images'} -o "
+        f"{out} --width 320 --steps 2 --batch 1 --window 128 64 --check-every 1 "
+        "--check-images 1"
+    ).split()
 
     assert run(learn) == 0
 
@@ -297,16 +279,10 @@ def test_invalid_flags_are_reported_before_training(
     tmp_path: Path, flags: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_bars(tmp_path / "set", 11)
-    base = [
-        "train",
-        "mask-rcnn",
-        "--data",
-        str(path),
-        "--images",
-        str(path.parent / "images"),
-        "-o",
-        str(tmp_path / "out.safetensors"),
-    ]
+    base = (
+        f"train mask-rcnn --data {path} --images {path.parent / 'images'} -o "
+        f"{tmp_path / 'out.safetensors'}"
+    ).split()
 
     assert run([*base, *flags]) == 2
     assert message in capsys.readouterr().err
@@ -348,16 +324,10 @@ def test_train_mask_rcnn_measures_a_network_without_training(
 ) -> None:
     frames = tmp_path / "frames"
     run(["train", "frames", "L901", "--per-layout", "3", "-o", str(frames), "-q"])
-    base = [
-        "train",
-        "mask-rcnn",
-        "--measure",
-        "embedded",
-        "--data",
-        str(frames / "coco.json"),
-        "--images",
-        str(frames / "images"),
-    ]
+    base = (
+        f"train mask-rcnn --measure embedded --data {frames / 'coco.json'} --images "
+        f"{frames / 'images'}"
+    ).split()
 
     assert run([*base, "--subset", "1:", "--proposals", "100", "200", "--json"]) == 0
     tree = json.loads(capsys.readouterr().out)

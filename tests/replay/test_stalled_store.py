@@ -41,8 +41,7 @@ def test_presigned_log_is_read_like_a_local_one(
     assert {path for path in web.requests if "log" not in path} == set()
 
 
-@pytest.mark.parametrize("name", ["a.log", "a.mcap"])
-@pytest.mark.parametrize("stalling", ["headers", "body"])
+@pytest.mark.parametrize(("name", "stalling"), [("a.log", "body"), ("a.mcap", "headers")])
 def test_stalled_server_is_reported_then_given_up(
     name: str, stalling: str, tmp_path: Path, web: Served
 ) -> None:

@@ -1,15 +1,10 @@
 """Tests that lit lenses and housings seen from behind are distinguished."""
 
-from dataclasses import replace
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
-from crosscue.detectors.base import Detections, Frame
-from crosscue.detectors.ranging.lens import Lens, lens_of, with_lenses
-from crosscue.detectors.result_cache import ResultCache
+from crosscue.detectors.ranging.lens import Lens, lens_of
 from crosscue.replay.columns import Bytes
 from support.data import shared
 
@@ -31,27 +26,6 @@ def housing(lit: str | None, at: int = 0) -> Bytes:
 @pytest.mark.parametrize(("colour", "at"), [("red", 0), ("yellow", 1), ("green", 2)])
 def test_lit_lens_is_found_at_each_position(colour: str, at: int) -> None:
     assert lens_of(housing(colour, at), BOX) == colour
-
-
-def test_lenses_are_set_only_for_lights_and_survive_the_cache(
-    tmp_path: Path,
-) -> None:
-    boxes = np.array([2.0 * BOX, 2.0 * BOX])
-    found = Detections(7, (128, 160), boxes, np.ones(2), ("traffic light", "car"), (b"", b""))
-    frame = Frame(7, "front", housing("green", 2), (128, 160))
-
-    seen = with_lenses(found, frame, ("traffic light",))
-
-    assert seen.lenses == ("green", "")
-    assert with_lenses(found, frame, ("ampel",)).lenses == ()
-    assert seen.above(1.0).lenses == seen.lenses
-    with ResultCache(tmp_path / "kept.sqlite") as cache:
-        cache.put([(b"picture", "detector", seen)])
-        kept = cache.get(b"picture", "detector", 9)
-    assert isinstance(kept, Detections)
-    assert kept.lenses == seen.lenses
-    with pytest.raises(ValueError, match="lenses: expected 2 or none, got 1"):
-        replace(found, lenses=("red",))
 
 
 @pytest.mark.parametrize(

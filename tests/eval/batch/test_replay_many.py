@@ -8,13 +8,9 @@ from pathlib import Path
 
 import pytest
 
-import crosscue
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.cli import run
-from crosscue.eval.drives.many import find_drives
-from crosscue.replay.logs.log_part import LogPart
-from crosscue.replay.progress import Progress, watching
 
 pytestmark = pytest.mark.slow
 
@@ -67,25 +63,3 @@ def test_workers_for_a_single_drive_are_refused(
     assert run(["replay", log, "-o", str(tmp_path / "run"), "--workers", "2"]) == 2
 
     assert "add --each" in capsys.readouterr().err
-
-
-def test_replay_drives_function_matches_the_command(
-    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "runs"
-    reported: list[object] = []
-
-    with watching(reported.append):
-        done = crosscue.replay_drives(
-            [drives / "monday", drives / "broken"], out, part=LogPart(end="2.0")
-        )
-
-    assert [one.error is None for one in done.drives] == [True, False]
-    assert done.exit_status == 3
-    assert reported[-1] == Progress("replaying, 1 failed", 2, 2, "drives")
-    assert "drives   1 of 2, 1 failed" in repr(done)
-    assert done.merged == out / "merged"
-    assert find_drives(drives).is_many
-    pattern = str(drives / "monday" / "*.mcap")
-    assert run(["replay", pattern, "-o", str(out), "--to", "2.0", "--json"]) == 0
-    assert [one["earlier"] for one in json.loads(capsys.readouterr().out)["drives"]] == [True]

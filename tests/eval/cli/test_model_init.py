@@ -21,7 +21,6 @@ from crosscue.detectors.networks.backends import load_network
 from crosscue.detectors.networks.openvino import import_openvino
 from crosscue.detectors.networks.weights import Weights
 from crosscue.eval.cli import run
-from support.data import shared
 from support.onnx_models import Array, bright_box_model, constant_model
 from support.pictures import picture
 
@@ -236,23 +235,6 @@ def test_assumptions_are_reported_and_written_to_the_card(
     assert "assumed    logits become scores by the logistic function" in message
     text = (tmp_path / "my.toml").read_text(encoding="utf-8")
     assert "# Assumed, please check: logits become scores" in text
-
-
-def test_published_yolox_is_recognised_by_running_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "yolox.onnx"
-    path.write_bytes(shared("weights", "yolox_nano", "yolox_nano.onnx").read_bytes())
-    picture = tmp_path / "street.jpg"
-    picture.write_bytes(
-        shared("sequences", "pandaset_002", "camera", "front_camera", "00.jpg").read_bytes()
-    )
-
-    args = ["--size", "1280x736", "--picture", str(picture)]
-    assert run(["model", "init", str(path), *args]) == 0
-
-    assert "yolox; the network runs with it" in capsys.readouterr().out
-    assert (tmp_path / "yolox.street.found.jpg").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

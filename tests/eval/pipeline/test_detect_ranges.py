@@ -89,20 +89,10 @@ def test_fitted_curve_is_evaluated_on_other_drives(
 ) -> None:
     fitted, other = drive(tmp_path / "a"), drive(tmp_path / "b", noise_m=1.0)
     figure = tmp_path / "f.png"
-    argv = [
-        "fit",
-        "ranges",
-        "--cue",
-        "stop_sign",
-        "--truth",
-        str(fitted),
-        "--test",
-        str(other),
-        "--figure",
-        str(figure),
-        "--family",
-        "pinhole",
-    ]
+    argv = (
+        f"fit ranges --cue stop_sign --truth {fitted} --test {other} --figure {figure} "
+        "--family pinhole"
+    ).split()
 
     assert run([*argv, "--json"]) == 0
 

@@ -132,17 +132,10 @@ def test_only_detector_with_changed_settings_runs_again(
     (tmp_path / "v.toml").write_text(text.replace('kind = "signs"', slower))
     shutil.copy(drive / "simulated_car.dbc", tmp_path)
 
-    arguments = [
-        "replay",
-        str(drive / "drive.mcap"),
-        "--vehicle",
-        str(tmp_path / "v.toml"),
-        "-o",
-        str(tmp_path / "run"),
-        "--cache",
-        str(drive / "cache.sqlite"),
-        "--json",
-    ]
+    arguments = (
+        f"replay {drive / 'drive.mcap'} --vehicle {tmp_path / 'v.toml'} -o "
+        f"{tmp_path / 'run'} --cache {drive / 'cache.sqlite'} --json"
+    ).split()
     assert run(arguments) == 0
 
     reported = json.loads(capsys.readouterr().out)["detected"]
@@ -157,16 +150,10 @@ def test_resumed_run_writes_same_bytes_as_uninterrupted_run(
 
     with monkeypatch.context() as patch:
         patch.setattr("crosscue.eval.pipeline.replay.estimate_into", killed)
-        arguments = [
-            "replay",
-            str(drive / "drive.mcap"),
-            "-o",
-            str(tmp_path / "run"),
-            "-q",
-            "--vehicle",
-            str(drive / "vehicle.toml"),
-            "--no-cache",
-        ]
+        arguments = (
+            f"replay {drive / 'drive.mcap'} -o {tmp_path / 'run'} -q --vehicle "
+            f"{drive / 'vehicle.toml'} --no-cache"
+        ).split()
         assert run(arguments) == 130
     monkeypatch.setattr("crosscue.eval.pipeline.replay.detect_into", killed)
 

@@ -61,41 +61,6 @@ def _replay(path: Path, blocks: Sequence[Block], vehicle: Vehicle | None = None)
     return replay_drive([log], vehicle, create(path, overwrite=True), EVERYTHING)
 
 
-def _distance(outcome: Outcome, segment: int = 0) -> float:
-    """Return the distance travelled in one segment, from its odometry."""
-    table = outcome.run.table("measurements")
-    rows = zip(*(table[n].to_pylist() for n in ("kind", "segment", "distance_m")), strict=True)
-    return sum(abs(float(d)) for kind, n, d in rows if kind == "odometry" and n == segment)
-
-
-@pytest.mark.parametrize("by_s", [1200, 3600, -10, -3600, -1])
-def test_clock_jump_neither_adds_nor_removes_distance(tmp_path: Path, by_s: int) -> None:
-    blocks = _drive()
-    cut_ns = BEGIN + 8 * SECOND
-    first, second = (
-        _replay(tmp_path / "first", _part(blocks, last=cut_ns)),
-        _replay(tmp_path / "second", _part(blocks, first=cut_ns)),
-    )
-
-    jumped = _replay(tmp_path / "whole", _moved(blocks, cut_ns, by_s * SECOND))
-
-    assert jumped.exit_status == 3
-    assert len(jumped.segments) == 2
-    assert jumped.travelled_m == pytest.approx(first.travelled_m + second.travelled_m, abs=1e-9)
-    assert _distance(jumped, 0) == _distance(first)
-    assert _distance(jumped, 1) == _distance(second)
-    pose = jumped.run.table("pose")
-    assert np.all(np.diff(pose["t_ns"].to_numpy()) > 0)
-    original = pose["log_t_ns"].to_numpy()
-    expected = np.concatenate(
-        [
-            first.run.table("pose")["t_ns"].to_numpy(),
-            second.run.table("pose")["t_ns"].to_numpy() + by_s * SECOND,
-        ]
-    )
-    np.testing.assert_array_equal(original, expected)
-
-
 @pytest.mark.slow
 @settings(
     max_examples=10,

@@ -140,39 +140,6 @@ def test_run_without_a_truth_has_a_report(
     assert cli.run(["report", str(run.path), "--threshold", "1.5"]) == 2
 
 
-def test_attribution_of_a_cue_is_reported(tmp_path: Path) -> None:
-    nothing = {"value": 0.0, "low": None, "high": None}
-    worth = {
-        "stop_sign": {
-            "detected_m": nothing | {"value": 12.34},
-            "full_m": nothing | {"value": None},
-            "detected_only_with": 3,
-            "full_only_with": 2,
-            "full_only_without": 1,
-            "belief": {"left": {"log_score": nothing | {"value": -0.5}}},
-        }
-    }
-    one = _scored(tmp_path / "drive")
-
-    page = _report_text(tmp_path, one, attribution=worth)
-
-    row = re.findall(r"<tr><td>stop sign</td><td>([+].*?)</tr>", page)[0]
-    cells = re.split(r"</?td>+", row)
-    assert [cell for cell in cells if cell] == [
-        "+12.3",
-        "3",
-        "-",
-        "2",
-        "1",
-        "-",
-        "-0.500",
-        "-",
-        "-",
-    ]
-    assert "crosscue score --attribution" not in page
-    assert "crosscue score --attribution" in _report_text(tmp_path, one)
-
-
 def test_belief_without_true_distances_is_drawn_over_time(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
     assert one.judged.approaches is not None

@@ -84,20 +84,7 @@ def test_account_of_truncated_log_balances_for_replay_and_estimate(
     run = tmp_path / "run"
     for argv in (
         ["replay", str(log), "--vehicle", str(vehicle), "-o", str(run), "--json"],
-        [
-            "replay",
-            str(log),
-            "--vehicle",
-            str(vehicle),
-            "-o",
-            str(run),
-            "--json",
-            "--overwrite",
-            "--from",
-            "1",
-            "--to",
-            "8",
-        ],
+        f"replay {log} --vehicle {vehicle} -o {run} --json --overwrite --from 1 --to 8".split(),
         ["estimate", str(run), "--json"],
     ):
         assert cli.run(argv) == 3

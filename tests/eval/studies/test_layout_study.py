@@ -22,18 +22,6 @@ STUDY = LayoutStudy()
 TRUTH = {"intersection": True, "left": True, "right": False, "straight": True}
 
 
-@pytest.mark.parametrize("feature", FEATURES)
-@pytest.mark.parametrize("fold", range(STUDY.folds))
-def test_every_fold_has_layouts_with_and_without_each_feature(fold: int, feature: str) -> None:
-    known = [
-        layout_named(name).features.get(feature)
-        for name in STUDY.layouts
-        if STUDY.fold_of(name) == fold
-    ]
-
-    assert {True, False} <= set(known)
-
-
 def test_layouts_from_draws_layouts_never_seen_before_in_whole_folds() -> None:
     fresh = LayoutStudy(layouts_from=2600)
 

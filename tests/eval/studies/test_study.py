@@ -1,6 +1,5 @@
 """Studies: reproducible with any number of workers, resumed after a stop, with checked input."""
 
-import json
 import math
 import os
 import signal
@@ -272,24 +271,6 @@ def test_study_options_out_of_range_are_refused(
 ) -> None:
     assert cli.run(["study", "range", "-o", str(tmp_path), *flags]) == 2
     assert flags[0] in capsys.readouterr().err
-
-
-def test_study_prints_strict_json_without_progress(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    settings = tmp_path / "s.toml"
-    settings.write_text(
-        'version = 1\nkind = "range"\ncompass_2sigma_deg = [60.0]\n'
-        "[drive.city]\nlargest_km2 = 2.0\n"
-    )
-    command = ["study", "range", "--settings", str(settings), "--drives", "4"]
-
-    assert cli.run([*command, "-o", str(tmp_path / "out"), "--json"]) == 0
-    captured = capsys.readouterr()
-    assert captured.err == ""
-    found = json.loads(captured.out)
-    assert [r["drives"] for r in found["results"]] == [4, 4]
-    assert found["study"]["drive"]["city"]["largest_km2"] == 2.0
 
 
 @pytest.mark.slow

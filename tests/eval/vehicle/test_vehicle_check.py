@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -84,27 +83,6 @@ def test_intrinsics_of_other_pictures_are_contradictions(
     # The generated pictures are tiny, with the published intrinsics of 1920 x 1080.
     assert any(message in text for text in found.contradictions)
     assert f"WRONG    {found.contradictions[0]}" in repr(found)
-
-
-def test_check_page_and_json_have_equal_content(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    drive = pandaset_drive(tmp_path / "002")
-    vehicle = write_vehicle(tmp_path / "car.toml", "focal_px = 1500.0")
-    page = tmp_path / "check.html"
-    line = ["check", str(drive), str(vehicle), "-o", str(page)]
-
-    assert run([*line, "--json"]) == 1
-
-    (checked,) = json.loads(capsys.readouterr().out)["files"]
-    printed = checked["result"]
-    assert printed["page"] == str(page)
-    html = page.read_text(encoding="utf-8")
-    assert all(row["signal"] in html for row in printed["signals"])
-    assert printed["contradictions"][0] in html
-    assert "data:image/jpeg;base64," in html
-    assert run(line) == 1
-    assert "exists; give another name" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,14 +15,10 @@ from hypothesis import strategies as st
 from crosscue.replay.can import database
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.dbc_text import read_dbc
-from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.can.layout import CanMessage
 from crosscue.replay.can.layout_cache import VARIABLE, layout_cache_folder
 from crosscue.replay.can.sources import DatabaseText
-from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.errors import SchemaError
-from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.ledger import Ledger
 from support.can_layouts import dbc_text, messages
 from support.data import shared
 
@@ -151,38 +145,6 @@ def _record_parses(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def _are_same(a: CanDatabase, b: CanDatabase) -> bool:
     return _reprs(list(a.messages)) == _reprs(list(b.messages)) and a.notices == b.notices
-
-
-def test_second_load_reads_only_signals_of_met_messages(
-    tmp_path: Path, cache_dir: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = _dbc_file(tmp_path)
-    CanDatabase.load([path])
-    lines: list[bytes] = []
-    loads = json_tree
-
-    def counted(text: bytes) -> Any:
-        lines.append(text)
-        return loads(text)
-
-    monkeypatch.setattr("crosscue.replay.can.layout_cache.json_tree", counted)
-    decoder = BusDecoder(CanDatabase.load([path]), "can/1", Ledger("x"))
-    assert len(lines) == 1
-    one = CanFrames(
-        np.array([100], np.uint32),
-        np.zeros(1, np.bool_),
-        np.zeros(1, np.uint8),
-        np.array([64], np.uint8),
-        np.zeros((1, 64), np.uint8),
-        np.ones(1, np.bool_),
-    )
-
-    (rows,) = decoder(Block("can/1", np.zeros(1, np.int64), one))
-
-    assert isinstance(rows.rows, Table)
-    assert list(rows.rows.columns) == ["real"]
-    assert len(lines) == 2
-    assert b"real" in lines[1]
 
 
 def test_cache_entry_depends_on_text_name_and_code(
