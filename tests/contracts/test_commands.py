@@ -14,71 +14,6 @@ import pytest
 from crosscue.eval import cli
 from crosscue.replay.errors import one_line
 
-# Exit status for an unreadable recording, run, database, picture or annotation file.
-INPUT: Final = 4
-# Exit status for an unreadable file of settings.
-SETTINGS: Final = 2
-
-MISSING: Final[dict[str, tuple[str, int]]] = {
-    "info": ("gone.mcap", INPUT),
-    "convert": ("gone.mcap -o out.mcap", INPUT),
-    "vehicle init": ("gone.mcap", INPUT),
-    "check": ("gone.mcap", INPUT),
-    "decode": ("gone.mcap -o out", INPUT),
-    "detect": ("gone.mcap -o out --detectors signs", INPUT),
-    "estimate": ("gone", INPUT),
-    "replay": ("gone.mcap -o out", INPUT),
-    "score": ("gone", INPUT),
-    "score detector": ("gone --labels gone.json", INPUT),
-    "compare": ("gone gone2", INPUT),
-    "merge": ("gone -o out", INPUT),
-    "query": ("gone --schema", INPUT),
-    "tag": ("gone", INPUT),
-    "status": ("gone", INPUT),
-    "history": ("gone -o out.html", INPUT),
-    "view": ("gone -o x.rrd", INPUT),
-    "failures": ("gone", INPUT),
-    "browse": ("gone -o site", INPUT),
-    "export": ("gone.parquet -o out", INPUT),
-    "fit compass": ("gone.mcap --vehicle gone.toml", SETTINGS),
-    "truth from-gnss": ("gone.mcap -o out", INPUT),
-    "fit odometry": ("gone.mcap --vehicle gone.toml", SETTINGS),
-    "fit signs": ("gone.json --label a", INPUT),
-    "fit ranges": ("--cue stop_sign --truth gone.json", INPUT),
-    "fit detector": ("gone --labels gone.json", INPUT),
-    "fit temporal": ("gone --truth gone.json", INPUT),
-    "fit messages": ("gone --truth gone.json", INPUT),
-    "fit landmarks": ("--pairs gone.csv", INPUT),
-    "landmarks add": ("gone.db --images gone --coordinates gone.csv", INPUT),
-    "landmarks list": ("gone.db", INPUT),
-    "landmarks match": ("gone.db gone.png", INPUT),
-    "truth": ("gone -o out", INPUT),
-    "truth import": ("gone.json --log gone.mcap -o t.json", INPUT),
-    "train road": ("--data gone -o x.safetensors", INPUT),
-    "train mask-rcnn": ("--data gone.json --images gone -o x.safetensors", INPUT),
-    "seal": ("gone.mcap", INPUT),
-    "model show": ("gone", SETTINGS),
-    "model init": ("gone.onnx", SETTINGS),
-    "model fetch": ("gone", SETTINGS),
-    "study intersections": ("-o out --vehicle gone.toml", SETTINGS),
-    "study range": ("-o out --settings gone.toml", SETTINGS),
-    "study landmarks": ("-o out --settings gone.toml", SETTINGS),
-    "study field": ("-o out --settings gone.toml", SETTINGS),
-}
-READS_NOTHING: Final = {
-    "run schema",
-    "truth schema",
-    "model list",
-    "simulate",
-    "train frames",
-    "study drive",
-    "study layouts",
-    "demo",
-    "plugins",
-    "completion",
-}
-
-
 STREAMS: Final = {
     "reader gone": "| true",
     "reader stops": "| head -c 1 > /dev/null",
@@ -107,10 +42,6 @@ OPTIONS: Final = sorted(
 )
 
 
-def test_every_command_has_missing_input_case_or_reads_nothing() -> None:
-    assert MISSING.keys() | READS_NOTHING == cli.COMMANDS.keys()
-
-
 @pytest.mark.parametrize("name", sorted(cli.COMMANDS))
 def test_examples_in_help_can_be_parsed(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     cli.run([*name.split(), "--help"])
@@ -131,21 +62,6 @@ def test_unknown_option_is_refused_in_one_line(
 ) -> None:
     assert cli.run([*name.split(), "--surely-unknown"]) == 2
     _assert_one_line(capsys.readouterr().err)
-
-
-@pytest.mark.parametrize("name", sorted(MISSING))
-def test_missing_input_is_reported_in_one_line_and_writes_nothing(
-    name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    text, status = MISSING[name]
-
-    assert cli.run([*name.split(), *text.split()]) == status
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    _assert_one_line(captured.err)
-    assert "gone" in captured.err
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("streams", STREAMS)

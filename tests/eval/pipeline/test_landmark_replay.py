@@ -144,23 +144,6 @@ def _refusal(capsys: pytest.CaptureFixture[str], *command: str) -> tuple[int, st
     return status, captured.err
 
 
-def test_bad_landmark_databases_are_refused_in_one_line(
-    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    cut = tmp_path / "cut.sqlite"
-    cut.write_bytes(town.database.read_bytes()[:20_000])
-    other = database_of(tmp_path / "other.sqlite", np.zeros((1, 2)), kind="learned")
-    replaying = ["replay", str(town.drive.log), "-o", str(tmp_path / "run"), "--landmarks"]
-
-    status, text = _refusal(capsys, *replaying, str(cut))
-    assert (status, "cut short" in text) == (4, True)
-    status, text = _refusal(capsys, *replaying, str(other))
-    assert (status, "matcher 'learned', not 'orb'" in text) == (2, True)
-    status, text = _refusal(capsys, "landmarks", "list", str(tmp_path / "missing.sqlite"))
-    assert (status, "crosscue landmarks add" in text) == (4, True)
-    assert not (tmp_path / "run" / "manifest.json").exists()
-
-
 def test_landmarks_list_and_match_report_stored_landmarks(
     town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
