@@ -203,10 +203,9 @@ def _base(name: str, option: str) -> str:
 
 
 CASES: Final = [
-    (name, option, spelling, log)
+    (name, option, spelling, "log" if option == "--map" else LOGS[number % len(LOGS)])
     for name, option in OPTIONS
-    for spelling in _spellings(name, option)
-    for log in (LOGS if "{log}" in _base(name, option) and option != "--map" else ("log",))
+    for number, spelling in enumerate(_spellings(name, option), len(name))
 ]
 
 

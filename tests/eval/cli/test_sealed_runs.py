@@ -32,37 +32,28 @@ def _damage_middle(log: Path) -> None:
     log.write_bytes(raw)
 
 
-def _command_line(command: str, runs: list[Path], out: Path) -> list[str]:
-    named = [str(run) for run in runs]
-    return {
-        "view": ["view", named[0], "-o", str(out / "out.rrd")],
-        "score": ["score", named[0]],
-        "score --workers": ["score", *named, "-o", str(out / "all"), "--workers", "2"],
-    }[command]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["view", "score", "score --workers"])
 def test_damage_to_sealed_log_after_the_run_is_reported(
-    command: str,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pictured, "SIZE", (400, 225))
     made = [_run_with_sealed_log(tmp_path / name) for name in ("one", "two")]
-    argv = _command_line(command, [run for run, _ in made], tmp_path)
-    cli.run(argv)
-    assert "differ from the seal" not in capfd.readouterr().err
-
-    log = made[0][1]
-    _damage_middle(log)
-    again = [*argv, "--overwrite"] if command == "view" else argv
-
-    assert cli.run(again) == 3
-    reported = [
-        line for line in capfd.readouterr().err.splitlines() if "differ from the seal" in line
+    one, two = (run for run, _ in made)
+    commands = [
+        ["view", str(one), "-o", str(tmp_path / "out.rrd"), "--overwrite"],
+        ["score", str(one)],
+        ["score", str(one), str(two), "-o", str(tmp_path / "all"), "--workers", "2"],
     ]
-    assert reported
-    assert all(line.startswith("crosscue: dropped: ") for line in reported)
-    assert all("one" in line and "drive.mcap: bytes " in line for line in reported)
+    for argv in commands:
+        cli.run(argv)
+        assert "differ from the seal" not in capfd.readouterr().err
+
+    _damage_middle(made[0][1])
+
+    for argv in commands:
+        assert cli.run(argv) == 3
+        printed = capfd.readouterr().err.splitlines()
+        reported = [line for line in printed if "differ from the seal" in line]
+        assert reported
+        assert all(line.startswith("crosscue: dropped: ") for line in reported)
+        assert all("one" in line and "drive.mcap: bytes " in line for line in reported)
