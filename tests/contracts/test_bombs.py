@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -76,19 +77,20 @@ OPENS_NO_LOG: dict[str, str] = {
 }  # fmt: skip
 
 
-@pytest.fixture
-def names(tmp_path: Path) -> dict[str, Path]:
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A drive whose last chunk is a decompression bomb, its run, and other inputs of commands."""
-    drive = tmp_path / "drive"
+    folder = tmp_path_factory.mktemp("inputs")
+    drive = folder / "drive"
     log = write_drive(drive, Clock(), seconds=4)
     with_bomb(log)
     run = replayed(drive, log, "../run")
-    with LandmarkWriter(tmp_path / "known.db", "orb"):
+    with LandmarkWriter(folder / "known.db", "orb"):
         pass
-    compass = simulated(tmp_path / "compass", DriveSettings(seed=3, blocks=1, block_m=60.0))
+    compass = simulated(folder / "compass", DriveSettings(seed=3, blocks=1, block_m=60.0))
     with_bomb(compass.log)
     (drive / "vehicle.toml").write_bytes((drive / "car.toml").read_bytes())
-    gnss_car = tmp_path / "gnss.toml"
+    gnss_car = folder / "gnss.toml"
     gnss_car.write_text('version = 1\n[topics]\ngnss = "/imu"\n')
     objects = drive / "objects.json"
     objects.write_text(_coco([("0.png", BEGIN)], SIZE))
@@ -99,14 +101,24 @@ def names(tmp_path: Path) -> dict[str, Path]:
         "car": drive / "car.toml",
         "truth": drive / "truth.json",
         "coco": objects,
-        "db": tmp_path / "known.db",
-        "out": tmp_path / "out",
+        "db": folder / "known.db",
         "compass": compass.log,
         "its_car": compass.vehicle,
         "gnss_car": gnss_car,
         "its_truth": compass.truth,
-        "failures": table_of_failures(run.path, tmp_path / "failures.parquet", BEGIN + 10**9),
+        "failures": table_of_failures(run.path, folder / "failures.parquet", BEGIN + 10**9),
     }
+
+
+@pytest.fixture
+def names(inputs: dict[str, Path], tmp_path: Path) -> dict[str, Path]:
+    """A copy of the inputs."""
+    home = inputs["drive"].parent.resolve()
+    shutil.copytree(home, tmp_path / "all")
+    copied = {
+        name: tmp_path / "all" / path.resolve().relative_to(home) for name, path in inputs.items()
+    }
+    return {**copied, "out": tmp_path / "out"}
 
 
 def _words(flags: str, names: dict[str, Path]) -> list[str]:
