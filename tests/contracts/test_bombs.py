@@ -45,6 +45,7 @@ OPENS_LOGS: dict[str, tuple[str, int]] = {
     "score detector": ("{run} --labels {coco}", 3),
     "fit detector": ("{run} --labels {coco}", 1),
     "view": ("{run} -o {out}.rrd", 3),
+    "report": ("{run} -o {out}.html", 3),
     "vehicle init": ("{log} -o {out}.toml", 3),
     "check": ("{log} {car} {truth} -o {out}.html", 3),
     "fit compass": ("{compass} --vehicle {its_car}", 4),
@@ -58,7 +59,7 @@ OPENS_LOGS: dict[str, tuple[str, int]] = {
     "export": ("{failures} -o {out}", 3),
 }
 # Commands that read few pictures or none, and report only the messages that the run dropped.
-REPORTS_THE_RUN = {"score", "score detector", "fit detector", "browse", "export"}
+REPORTS_THE_RUN = {"score", "score detector", "fit detector", "browse", "export", "report"}
 OPENS_NO_LOG: dict[str, str] = {
     "compare": "tables", "query": "tables", "tag": "texts", "merge": "tables",
     "status": "the journal", "failures": "tables",

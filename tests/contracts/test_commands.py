@@ -113,7 +113,7 @@ def test_misspelt_command_is_refused_with_suggestion(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, _, second = name.partition(" ")
-    misspelt = [first[1] + first[0] + first[2:], *second.split()]
+    misspelt = [first[:-2] + first[-1] + first[-2], *second.split()]
 
     assert cli.run(misspelt) == 2
     message = capsys.readouterr().err
@@ -137,7 +137,7 @@ def test_completion_scripts_are_printed(shell: str, capsys: pytest.CaptureFixtur
 @pytest.mark.parametrize(
     ("line", "offered"),
     [
-        ("crosscue re", {"replay"}),
+        ("crosscue re", {"replay", "report"}),
         ("crosscue ", {name.split()[0] for name in cli.COMMANDS}),
         (
             "crosscue fit ",

@@ -40,6 +40,7 @@ BASE: Final[dict[str, str]] = {
     "history": "{runs} -o {out}.html",
     "tag": "{run}",
     "view": "{run} -o {out}.rrd",
+    "report": "{run} -o {out}.html",
     "failures": "{run}",
     "browse": "{run} -o {out}",
     "export": "{failures} -o {out}",

@@ -57,8 +57,8 @@ class Check:
             homes = crosscue._former_names()
             # A record or a helper that the reference describes under its module.
             if all(homes.get(alias.name) == node.module for alias in node.names):
-                module = import_module(node.module or "")
-                self.known |= {one.name: getattr(module, one.name) for one in node.names}
+                home = import_module(node.module or "")
+                self.known |= {one.name: getattr(home, one.name) for one in node.names}
                 return
             self._import(node, node.module or "")
             module = PUBLIC.get(node.module or "")
