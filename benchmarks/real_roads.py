@@ -4,8 +4,9 @@ Run it as ``python benchmarks/real_roads.py OUT [DRIVE ...]``; without names it 
 of ``$CROSSCUE_DATA`` (or ``../shared/data``), pictures alone unless the name says otherwise.
 Detections are cached in OUT. Drives marked ``*`` were used in development and prove nothing.
 
-A leg counts by the highest belief within the annotated frames: above 0.9 it is believed, at its
-prior it is not seen, and anything else is undecided. Times, frames and distances are those of the
+A leg counts by the highest belief within the annotated frames: above 0.9 it is believed, and wrong
+where there is none. At its prior it is not seen; below, a missing leg is right. Anything else is
+undecided. Times, frames and distances are those of the
 annotations; ranges are scored only where a track gives the true distance.
 """
 
@@ -270,10 +271,10 @@ def _legs(score: Score, approach: Approach, rows: Sequence[Mapping[str, float]])
             score.legs[name] = "right" if truth else "WRONG"
         elif not is_seen:
             score.legs[name] = "not seen"
+        elif not truth and rows[-1][name] < 0.5:
+            score.legs[name] = "right"
         else:
-            lowest = min(row[name] for row in rows)
-            is_denied = not truth and lowest < 1.0 - BELIEVED
-            score.legs[name] = "right" if is_denied else f"undecided {rows[-1][name]:.2f}"
+            score.legs[name] = f"undecided {rows[-1][name]:.2f}"
 
 
 def _ranges(

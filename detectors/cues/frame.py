@@ -20,7 +20,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
 from .labelled import count_labels
-from .observed import FrameCues, FrameDetections, Place
+from .observed import NOT_SEEN, FrameCues, FrameDetections, Place
 from .road import road_fractions
 from .road_ground import ground_fractions
 from .rules import counts_of
@@ -92,11 +92,13 @@ class CuePass:
         road = frame.road
         if isinstance(road, RoadMask):
             regions = self.vehicle.regions
-            road = (
-                ground_fractions(road, self.vehicle.camera, regions, place)
-                if regions.kind == "ground"
-                else road_fractions(road, regions)
-            )
+            if regions.kind == "area":
+                # Known only from many frames together; the stage that has them passes fractions.
+                road = NOT_SEEN
+            elif regions.kind == "ground":
+                road = ground_fractions(road, self.vehicle.camera, regions, place)
+            else:
+                road = road_fractions(road, regions)
         if road is not None:
             counts |= counts_of("road", road, self.vehicle)
         found = FrameCues(counts, road, frame.objects)

@@ -545,8 +545,8 @@ class _Tables:
         road = sorted_by_role.road
         if isinstance(road, RoadMask):
             fractions = cues.road
-            if fractions is None or self.vehicle.regions.kind == "ground":
-                # The mask is stored, because the intersection's position is estimated later.
+            if fractions is None or self.vehicle.regions.kind != "picture":
+                # The mask is stored, because the ground that it shows is examined later.
                 fractions = road_fractions(road, self.vehicle.regions)
             self._held["road"].append(
                 {

@@ -18,6 +18,8 @@ from crosscue.detectors.cues.observed import Place
 from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.cues.tracked.judge import along, crossing, is_past, parked
 from crosscue.detectors.cues.tracked.motion import CarMotion
+from crosscue.eval.pipeline.scene.road_picture import opening_lines, plan_lines
+from crosscue.eval.pipeline.scene.roads import Roads, pitches_of
 from crosscue.eval.pipeline.scene.stage import EgoMotion, Restarts, intersection_place
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DriveManifest
@@ -28,7 +30,7 @@ from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.vehicle import Camera
 
 from .columns import Colour
-from .marks import CROSSING, PARKED, REGION, REGION_WITH_ROAD, SIDES, Overlays
+from .marks import CROSSING, PARKED, REGION, REGION_WITH_ROAD, ROAD, SIDES, Overlays
 
 ALONG: Final = (235, 235, 235)
 PAST: Final = (60, 190, 70)
@@ -55,10 +57,13 @@ class Anchored:
     _ego: EgoMotion = field(init=False)
     _restarts: Restarts = field(init=False)
     _ranges: dict[int, list[RangeRow]] = field(init=False)
+    _roads: Roads | None = None
     _before: list[RangeRow] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         vehicle = self.manifest.settings
+        if vehicle.regions.kind == "area":
+            self._roads = Roads(vehicle, pitches_of(self.run))
         self._cues = CuePass(vehicle)
         self._ego = EgoMotion(odometer_of(self.run))
         self._restarts = Restarts(vehicle, self.manifest.timeline)
@@ -72,7 +77,12 @@ class Anchored:
             self._ego.restart(fresh_ns)
             self._cues.restart()
             self._before = []
-        _, ego = self._ego(seen.t_ns)
+            if self._roads is not None:
+                self._roads.restart()
+        evidence, ego = self._ego(seen.t_ns)
+        if self._roads is not None:
+            self._roads(seen, evidence)
+            self._draw_roads(self._roads)
         place = None
         if ego.way_m is not None:
             place = intersection_place(self._before, ego.way_m, vehicle.fusion.length_m)
@@ -89,6 +99,13 @@ class Anchored:
         if vehicle.cars.kind == "tracks":
             for car in self._cues.followed():
                 self._car(car, frame.size_px, place)
+
+    def _draw_roads(self, roads: Roads) -> None:
+        plan = roads.plan()
+        for line in () if plan is None else plan_lines(plan):
+            self.marks.area.add(line, ROAD)
+        for line, text in () if roads.seen is None else opening_lines(roads.seen):
+            self.marks.openings.add(line, REGION_WITH_ROAD, text)
 
     def _region(self, side: str, corners: NDArray[np.float64], fraction: float) -> None:
         is_road = fraction > self.manifest.settings.cues.road_fraction

@@ -67,6 +67,8 @@ class Overlays:
     road: Shapes = field(default_factory=lambda: Shapes("camera/road", strips))
     regions: Shapes = field(default_factory=lambda: Shapes("camera/regions", labelled_strips))
     cars: Shapes = field(default_factory=lambda: Shapes("camera/cars", arrows))
+    area: Shapes = field(default_factory=lambda: Shapes("ahead/road", strips))
+    openings: Shapes = field(default_factory=lambda: Shapes("ahead/openings", labelled_strips))
     _before: CarShapes | None = None
 
     def add(self, frame: StoredFrame, objects: Sequence[Detections]) -> None:
@@ -88,7 +90,7 @@ class Overlays:
             for line in road_lines(seen.road):
                 self.road.add(line, ROAD)
         # Overlays anchored to the road or tracked over frames are drawn by ``anchored``.
-        if self.vehicle.regions.kind != "ground":
+        if self.vehicle.regions.kind == "picture":
             self._regions(seen.road, frame.size_px)
         if seen.objects and self.vehicle.cars.kind != "tracks":
             self._cars(seen.objects)
@@ -96,7 +98,7 @@ class Overlays:
     def all(self) -> Iterator[Shapes]:
         """Yield all shapes."""
         yield from (self.objects, self.far, self.outlines, self.signs)
-        yield from (self.road, self.regions, self.cars)
+        yield from (self.road, self.regions, self.cars, self.area, self.openings)
 
     def send(self, recording: rr.RecordingStream, time: DriveTime) -> None:
         """Send the frames collected so far."""

@@ -14,9 +14,11 @@ from crosscue.detectors.cues.observed import Place
 from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.images import Encoded
 from crosscue.detectors.overlay import draw_frame
+from crosscue.eval.pipeline.scene.road_picture import plans_of
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.stored_images import pictures_at, run_camera
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
+from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import CrosscueError
 
 WIDTH_PX: Final = 800
@@ -46,12 +48,15 @@ def draw_pictures(run: RunFolder, times: Iterable[int], keep: Keep) -> str:
             return "the run has no camera, or several"
         found = _found(run, wanted)
         places, cues = _places(run, wanted), _cues(run, wanted)
+        plans = plans_of(run, wanted)
 
         def on_picture(t_ns: int, picture: Encoded) -> None:
             regions = partial(_regions, run, places.get(t_ns))
             frame = found.get(t_ns)
             results = () if frame is None else frame.found
             canvas = draw_frame(picture, results, cues.get(t_ns, {}), regions, WIDTH_PX)
+            if t_ns in plans:
+                canvas = _with_plan(canvas, plans[t_ns])
             keep(t_ns, _jpeg(canvas, WIDTH_PX), _jpeg(canvas, SMALL_PX))
 
         pictures_at(camera, wanted, on_picture)
@@ -104,7 +109,19 @@ def _regions(
     if vehicle.regions.kind == "ground":
         polygons = outlines(vehicle.camera, vehicle.regions, place, size_px)
         return [one for one in polygons if one is not None]
+    if vehicle.regions.kind == "area":
+        return []
     return [np.array(getattr(vehicle.regions, side)) * size_px for side in SIDES]
+
+
+def _with_plan(canvas: Bytes, plan: Bytes) -> Bytes:
+    """Put the plan view beside the picture, at the same height."""
+    import cv2
+
+    height = canvas.shape[0]
+    size = (round(plan.shape[1] * height / plan.shape[0]), height)
+    beside = cv2.resize(plan, size, interpolation=cv2.INTER_AREA)
+    return np.hstack([canvas, np.asarray(beside, np.uint8)])
 
 
 def _jpeg(pixels: NDArray[np.uint8], width_px: int) -> bytes:

@@ -98,6 +98,8 @@ def _in_words(vehicle: Vehicle) -> str:
     )
     if vehicle.regions.kind == "picture":
         return f"{grid} Green: the regions in which road is detected."
+    if vehicle.regions.kind == "area":
+        return grid
     return (
         f"{grid} Green: the regions in which road would be detected if an intersection began "
         f"{ASSUMED.start_m:g} m ahead and ended at {ASSUMED.end_m:g} m."

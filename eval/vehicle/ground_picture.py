@@ -80,7 +80,7 @@ def _regions(
         for name in names:
             yield name, np.array(getattr(regions, name), np.float64) * np.array(size_px)
         return
-    if camera.focal_px is None or camera.z_m <= 0.0:
+    if camera.focal_px is None or camera.z_m <= 0.0 or regions.kind == "area":
         return
     for name, (one, _) in zip(names, rectangles(regions, ASSUMED), strict=True):
         first, last, rightmost, leftmost = one

@@ -25,6 +25,9 @@ from .temporal import Temporal
 Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
+# Precision of roads that the road area shows: a round number below what it is in the frames of the
+# drives used in development (``benchmarks/real_roads.py``), which are too few for a measurement.
+OPENING_PRECISION: Final = 0.9
 # Columns of ``belief.parquet``, which cannot be names of features.
 NOT_FEATURES: Final = ("t_ns", "approach", "established", "not_believed")
 
@@ -213,6 +216,28 @@ class Fusion(Section):
 
     calibrated: Calibrated | None = None
     temporal: Temporal | None = None
+
+    def with_openings(self) -> Self:
+        """Return the settings in which a road to a side, as the road area shows it, says more.
+
+        It leaves the carriageway at a place that stays where it is, so it is an intersection, too,
+        and its precision is another. Entries that differ from the defaults are kept.
+        """
+        usual, cues = usual_cues(), dict(self.cues)
+        for name, more in (
+            ("road_left", ("intersection",)),
+            ("road_right", ("intersection",)),
+            ("road_straight", ()),
+        ):
+            if cues.get(name) == usual[name]:
+                # An opening is confirmed by several frames before it is a cue.
+                changed = {
+                    "supports": (*usual[name].supports, *more),
+                    "precision": OPENING_PRECISION,
+                    "seen_frames": 1,
+                }
+                cues[name] = usual[name].model_copy(update=changed)
+        return self.model_copy(update={"cues": cues})
 
     @field_validator("features", mode="before")
     @classmethod

@@ -143,10 +143,12 @@ class Compass(Section):
 class Regions(Section):
     """Regions in which road is searched (eq. 13): in the image, as published, or on the ground."""
 
-    kind: Literal["picture", "ground"] | None = None
+    kind: Literal["picture", "ground", "area"] | None = None
     """``picture``: the polygons below. ``ground``: rectangles on the road, anchored to the
-    estimated intersection; needs ``camera.focal_px``, ``z_m`` and a range. Default: ``ground``, but
-    ``picture`` in a simulated vehicle's file and where a polygon is specified."""
+    estimated intersection; needs a range. ``area``: road accumulated on the ground along the path,
+    whose openings are roads and give ranges themselves. The last two need ``camera.focal_px`` and
+    ``z_m``. Default: ``area``, but ``picture`` in a simulated vehicle's file and where a polygon is
+    specified."""
     left: Polygon = ((0.0, 0.55), (0.2, 0.55), (0.2, 0.7), (0.0, 0.7))
     """Polygon of (x, y) in fractions of the image's width and height; likewise the other two."""
     straight: Polygon = ((0.44, 0.52), (0.56, 0.52), (0.6, 0.62), (0.4, 0.62))
@@ -350,7 +352,7 @@ class Vehicle(Section):
         if regions.kind is not None:
             return regions
         is_drawn = not regions.model_fields_set.isdisjoint(("left", "straight", "right"))
-        kind = "picture" if is_drawn or _is_simulated(info) else "ground"
+        kind = "picture" if is_drawn or _is_simulated(info) else "area"
         return regions.model_copy(update={"kind": kind})
 
     @field_validator("cues")
@@ -372,9 +374,13 @@ class Vehicle(Section):
     @field_validator("fusion")
     @classmethod
     def _kind_of_belief(cls, fusion: Fusion, info: ValidationInfo) -> Fusion:
-        if fusion.kind is not None:
-            return fusion
-        return fusion.model_copy(update={"kind": "source" if _is_simulated(info) else "persistent"})
+        if fusion.kind is None:
+            kind = "source" if _is_simulated(info) else "persistent"
+            fusion = fusion.model_copy(update={"kind": kind})
+        regions = info.data.get("regions")
+        if fusion.kind == "persistent" and regions is not None and regions.kind == "area":
+            return fusion.with_openings()
+        return fusion
 
     @field_validator("ranges")
     @classmethod

@@ -34,6 +34,7 @@ from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .outcome import ApproachSummary, SceneOutcome
+from .roads import Roads, pitches_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 ROWS_HELD: Final = 8192
 # Min fraction of the time between two frames that odometry must cover to measure the distance.
 COVERED: Final = 0.9
+# Cues of roads, whose openings also give ranges.
+ROADS: Final = frozenset(("road_left", "road_straight", "road_right"))
 # Feature columns of ``belief.parquet``, unless the vehicle file's graph has others.
 FEATURES: Final = ("intersection", "left", "right", "straight")
 
@@ -85,11 +88,12 @@ def estimate_scene(
         Approaches(graph, vehicle.fusion, vehicle.range_filter),
         EgoMotion(odometer_of(run)),
         _Rows(sink, features_of(vehicle), gives_reasons(vehicle)),
+        Roads(vehicle, pitches_of(run)) if vehicle.regions.kind == "area" else None,
     )
     boxes_only = needing_masks(detected.detectors, vehicle.cars.labels)
     restarts = Restarts(vehicle, timeline)
     regions = vehicle.regions
-    fresh_regions = regions.kind == "ground" or detected.settings.regions != regions
+    fresh_regions = regions.kind != "picture" or detected.settings.regions != regions
     for frame in stored_frames(run, detected.detectors, with_road_masks=fresh_regions):
         vehicle.camera.check_size(frame.size_px)
         fresh_ns = restarts.before(frame.seen.t_ns)
@@ -150,10 +154,12 @@ class EgoMotion:
     Attributes:
         odometer: Odometry of the run.
         without_odometry: Number of frames whose distance from the previous frame was not measured.
+        is_known: True once a distance was measured.
     """
 
     odometer: Odometer
     without_odometry: int = 0
+    is_known: bool = False
     _last_ns: int | None = None
 
     def __call__(self, t_ns: int) -> tuple[FrameEvidence, CarStep]:
@@ -162,6 +168,7 @@ class EgoMotion:
         gap_ns = 0 if self._last_ns is None else t_ns - self._last_ns
         is_covered = way.covered_ns >= COVERED * gap_ns
         self.without_odometry += way.covered_ns - way.assumed_ns < COVERED * gap_ns
+        self.is_known |= is_covered and gap_ns > 0
         self._last_ns = t_ns if self._last_ns is None else max(t_ns, self._last_ns)
         travelled_m = way.distance_m if is_covered else None
         turned_rad = way.turn_rad if is_covered else None
@@ -188,6 +195,7 @@ class _Scene:
     approaches: Approaches
     ego: EgoMotion
     rows: _Rows
+    roads: Roads | None = None
     cues: CuePass = field(init=False)
     tally: CueTally = field(init=False)
     signs: SignRanges = field(init=False)
@@ -211,6 +219,8 @@ class _Scene:
     def step(self, frame: StoredFrame, past: PastCues | None, without: frozenset[str]) -> None:
         seen = frame.seen
         evidence, ego = self.ego(seen.t_ns)
+        if self.roads is not None:
+            seen = replace(seen, road=self.roads(seen, evidence))
         found = self.cues(seen, ego, self._place(ego), frame.heights_px)
         counts = {cue: count for cue, count in found.counts.items() if cue not in without}
         signs = tuple(
@@ -220,6 +230,16 @@ class _Scene:
         )
         evidence = replace(evidence, counts=counts, signs=signs)
         posteriors = self.motion(self.cues.controls.tracks, ego, without)
+        if not self.ego.is_known:
+            # From an assumed size alone, without any motion, a range would be a guess.
+            posteriors = ()
+        if self.roads is not None and not without >= ROADS:
+            if not posteriors:
+                posteriors = self.roads.ranges()
+            elif not self.roads.fits(posteriors):
+                # A side street before the intersection that is ranged.
+                counts = {cue: count for cue, count in counts.items() if cue not in ROADS}
+                evidence = replace(evidence, counts=counts)
         evidence = replace(evidence, posteriors=posteriors, is_new_picture=self._is_new(seen))
         self.rows.add_objects(seen.t_ns, self.motion.objects)
         step = (
@@ -256,6 +276,8 @@ class _Scene:
         self.ego.restart(t_ns)
         self.cues.restart()
         self.motion.restart()
+        if self.roads is not None:
+            self.roads.restart()
         self._before = None
         self._ranges = ()
 

@@ -165,7 +165,7 @@ def test_coarse_mask_does_not_resolve_a_distant_region() -> None:
 
 
 def test_unseen_region_yields_no_count_and_is_tallied() -> None:
-    vehicle = Vehicle(version=1, camera=CAMERA)
+    vehicle = Vehicle(version=1, camera=CAMERA, regions=Regions(kind="ground"))
     tally = CueTally(vehicle)
     cues = CuePass(vehicle, tally=tally)
 
@@ -182,10 +182,10 @@ def test_unseen_region_yields_no_count_and_is_tallied() -> None:
     assert isinstance(seen.road, RoadFractions)
 
 
-def test_regions_default_to_ground_unless_drawn_or_simulated() -> None:
+def test_regions_default_to_the_road_area_unless_drawn_or_simulated() -> None:
     drawn = "[regions]\nleft = [[0.0, 0.5], [0.2, 0.5], [0.2, 0.6]]\n"
 
-    assert parse("version = 1", "a.toml").regions.kind == "ground"
+    assert parse("version = 1", "a.toml").regions.kind == "area"
     assert parse("version = 1\n" + drawn, "a.toml").regions.kind == "picture"
     assert Vehicle(version=1, name=SIMULATED_CAR).regions.kind == "picture"
 

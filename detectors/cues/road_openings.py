@@ -1,0 +1,325 @@
+"""Openings of the carriageway: roads that leave it sideways, found in the accumulated plan view.
+
+The carriageway's own edges are followed row by row from the car. An opening is a stretch of rows in
+which one edge lies further out than the carriageway's by more than a lane, and behind which it
+comes back or the road ends: the far kerb. It is relative to the carriageway and not to the path, so
+opposite lanes are no opening. In a bend both edges go to the same side, which is no opening either.
+An edge that is hidden, out of view or out of reach is not seen, which says nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats
+
+from .road_area import CELL_M, RoadPlan
+
+# Fraction of the views above which a cell is road.
+ROAD: Final = 0.5
+# Distance by which an edge lies further out at an opening.
+LANE_M: Final = 3.0
+# Distance from the expected edge within which it is the carriageway's own.
+NEAR_EDGE_M: Final = 1.5
+# Least and greatest length of an opening along the carriageway, and longest hidden part of it.
+LENGTH_M: Final = (3.0, 40.0)
+HIDDEN_M: Final = 4.0
+# Rows ahead of the car from which the carriageway's edges are known, and min length of known edge.
+KNOWN_BY_M: Final = 12.0
+KNOWN_M: Final = 3.0
+# Half the width around the expected middle in which the carriageway is found.
+STARTS_M: Final = 3.0
+# Road ahead of an intersection: its beginning and end beyond the far kerb, and half its width.
+BEYOND_M: Final = (2.0, 12.0)
+HALF_WIDTH_M: Final = 1.5
+# Ahead of the car, rows whose edge must be known before a missing opening is one, and their share.
+EXAMINED_M: Final = (2.0, 25.0)
+EXAMINED: Final = 0.6
+# Turn by which the car has left the road it was on, and distance without new openings after it.
+TURNED_RAD: Final = 0.7
+RESTS_M: Final = 25.0
+# Distance within which openings of successive frames are one, frames that confirm it, and frames
+# without it after which it is forgotten.
+SAME_M: Final = 4.0
+CONFIRMED: Final = 3
+FORGOTTEN: Final = 5
+# S.d. of an opening's corners, which are round, and of the pitch of a frame.
+CORNER_SD_M: Final = 2.5
+PITCH_SD_RAD: Final = 0.004
+
+
+class Opening(NamedTuple):
+    """A road that leaves the carriageway.
+
+    Attributes:
+        side: 1 for the left, -1 for the right.
+        start_m: Distance of its near kerb ahead of the rear axle.
+        end_m: Distance of its far kerb.
+        depth_m: How far beyond the carriageway's edge it is seen.
+    """
+
+    side: int
+    start_m: float
+    end_m: float
+    depth_m: float
+
+
+class Legs(NamedTuple):
+    """What one frame's plan view says, 1 for seen, 0 for seen to be missing, NaN for not seen."""
+
+    left: float
+    straight: float
+    right: float
+
+
+class Seen(NamedTuple):
+    """Result of one frame.
+
+    Attributes:
+        openings: Confirmed openings whose end is ahead.
+        legs: Roads to the left, straight and to the right.
+        start_m: Start of the intersection: the nearest near kerb; NaN without an opening.
+        end_m: End of the intersection: the furthest far kerb.
+        sd_m: Standard deviation of either.
+    """
+
+    openings: tuple[Opening, ...]
+    legs: Legs
+    start_m: float = math.nan
+    end_m: float = math.nan
+    sd_m: float = math.nan
+
+
+class _Edge(NamedTuple):
+    """One edge of the carriageway, by row.
+
+    Attributes:
+        out_m: Distance from the car's axis to the edge, outwards; NaN if no road was found.
+        is_kerb: True where the cell behind it was seen and is no road.
+        is_closed: True where the road ahead of the car has ended.
+    """
+
+    out_m: Floats
+    is_kerb: NDArray[np.bool_]
+    is_closed: NDArray[np.bool_]
+
+
+@dataclass(slots=True)
+class _Candidate:
+    opening: Opening
+    hits: int = 1
+    missed: int = 0
+    turned_rad: float = 0.0
+
+
+@dataclass(slots=True)
+class RoadOpenings:
+    """Openings over the frames of a drive.
+
+    Attributes:
+        height_m: Height of the camera above the ground.
+    """
+
+    height_m: float
+    _candidates: list[_Candidate] = field(default_factory=list)
+    _rests_m: float = 0.0
+
+    def __call__(self, plan: RoadPlan, moved_m: float, turned_rad: float = 0.0) -> Seen:
+        """Process the next frame's plan view, after ``moved_m`` of travel and a turn."""
+        edges = {side: _edge(plan, side) for side in (1, -1)}
+        own = {side: _own_edge(plan, edges[side]) for side in (1, -1)}
+        found: list[Opening] = []
+        known: dict[int, bool] = {}
+        for side in (1, -1):
+            line, other = own[side], own[-side]
+            known[side] = line is not None and _is_examined(plan, edges[side])
+            if line is None:
+                continue
+            bend = None if other is None else edges[-side].out_m - _at(other, plan.ahead_m)
+            found += _openings(plan, side, edges[side], _at(line, plan.ahead_m), bend)
+        confirmed = self._followed(found, moved_m, turned_rad)
+        return self._seen(plan, confirmed, known)
+
+    def restart(self) -> None:
+        """Forget all openings."""
+        self._candidates.clear()
+        self._rests_m = 0.0
+
+    def _followed(
+        self, found: list[Opening], moved_m: float, turned_rad: float
+    ) -> tuple[Opening, ...]:
+        """Associate openings with earlier ones at the same place; return the confirmed ones."""
+        self._rests_m -= abs(moved_m)
+        for one in self._candidates:
+            one.turned_rad += turned_rad
+        if any(abs(one.turned_rad) > TURNED_RAD for one in self._candidates):
+            self._candidates.clear()
+            self._rests_m = RESTS_M
+        for one in self._candidates:
+            old = one.opening
+            one.opening = old._replace(start_m=old.start_m - moved_m, end_m=old.end_m - moved_m)
+            one.missed += 1
+        for opening in found if self._rests_m <= 0.0 else ():
+            same = [
+                one
+                for one in self._candidates
+                if one.opening.side == opening.side
+                and opening.start_m < one.opening.end_m + SAME_M
+                and one.opening.start_m < opening.end_m + SAME_M
+            ]
+            if same:
+                nearest = min(same, key=lambda one: abs(one.opening.start_m - opening.start_m))
+                gain = 1.0 / min(nearest.hits + 1, 5)
+                old = nearest.opening
+                nearest.opening = Opening(
+                    old.side,
+                    old.start_m + gain * (opening.start_m - old.start_m),
+                    old.end_m + gain * (opening.end_m - old.end_m),
+                    max(old.depth_m, opening.depth_m),
+                )
+                nearest.hits += nearest.missed > 0
+                nearest.missed = 0
+            else:
+                self._candidates.append(_Candidate(opening))
+        self._candidates = [
+            one
+            for one in self._candidates
+            if one.opening.end_m > 0.0 and (one.missed <= FORGOTTEN or one.hits >= 2 * CONFIRMED)
+        ]
+        return tuple(one.opening for one in self._candidates if one.hits >= CONFIRMED)
+
+    def _seen(self, plan: RoadPlan, openings: tuple[Opening, ...], known: dict[int, bool]) -> Seen:
+        if not openings:
+            sides = [0.0 if known[side] else math.nan for side in (1, -1)]
+            return Seen((), Legs(sides[0], math.nan, sides[1]))
+        first = min(openings, key=lambda one: one.start_m)
+        here = [one for one in openings if one.start_m < first.end_m + SAME_M]
+        end_m = max(one.end_m for one in here)
+        legs = [
+            1.0 if any(one.side == side for one in here) else 0.0 if known[side] else math.nan
+            for side in (1, -1)
+        ]
+        by_pitch = max(end_m, 0.0) ** 2 * PITCH_SD_RAD / self.height_m
+        return Seen(
+            openings,
+            Legs(legs[0], _straight(plan, end_m), legs[1]),
+            first.start_m,
+            end_m,
+            math.hypot(CORNER_SD_M, by_pitch),
+        )
+
+
+def _edge(plan: RoadPlan, side: int) -> _Edge:
+    """Follow the road outwards from the car's axis in each row."""
+    road = plan.road if side == 1 else plan.road[:, ::-1]
+    left_m = plan.left_m if side == 1 else -plan.left_m[::-1]
+    rows = len(road)
+    out_m = np.full(rows, np.nan)
+    is_kerb, is_closed = np.zeros(rows, np.bool_), np.zeros(rows, np.bool_)
+    is_road, is_seen = road > ROAD, np.isfinite(road)
+    middle = int(np.argmin(np.abs(left_m)))
+    around = round(STARTS_M / CELL_M)
+    for row in range(rows):
+        at = middle
+        if not is_road[row, at]:
+            near = np.flatnonzero(is_road[row, middle - around : middle + around + 1])
+            if not len(near):
+                span = is_seen[row, middle - around // 2 : middle + around // 2 + 1]
+                is_closed[row] = span.mean() > 0.8
+                continue
+            at = middle - around + int(near[np.argmin(np.abs(near - around))])
+        while at > 0 and is_road[row, at - 1]:
+            at -= 1
+        # A gap of one cell is noise.
+        while at > 2 and not is_road[row, at - 1] and is_road[row, at - 2]:
+            at -= 2
+            while at > 0 and is_road[row, at - 1]:
+                at -= 1
+        out_m[row] = left_m[at] + 0.5 * CELL_M
+        is_kerb[row] = at > 0 and bool(is_seen[row, at - 1])
+    return _Edge(out_m, is_kerb, is_closed)
+
+
+def _is_examined(plan: RoadPlan, edge: _Edge) -> bool:
+    """Return whether enough of an edge is seen ahead for its openings to be missed by none."""
+    rows = (plan.ahead_m > EXAMINED_M[0]) & (plan.ahead_m < EXAMINED_M[1])
+    return bool(edge.is_kerb[rows].mean() >= EXAMINED)
+
+
+def _own_edge(plan: RoadPlan, edge: _Edge) -> tuple[float, float] | None:
+    """Offset and slope of the carriageway's own edge near the car; None if it is not seen."""
+    near = edge.is_kerb & (plan.ahead_m < KNOWN_BY_M)
+    if near.sum() * CELL_M < KNOWN_M:
+        return None
+    x, y = plan.ahead_m[near], edge.out_m[near]
+    best, offset, slope = -1.0, 0.0, 0.0
+    for tried in np.linspace(-0.2, 0.2, 17):
+        away = y - tried * x
+        # The innermost of the offsets that enough rows share.
+        counts = np.array([(np.abs(away - one) < 0.5).sum() for one in away])
+        score = counts.max() - 20.0 * abs(tried)
+        if score > best:
+            best, slope = score, float(tried)
+            offset = float(np.median(away[np.abs(away - away[counts.argmax()]) < 0.5]))
+    return offset, slope
+
+
+def _at(line: tuple[float, float], ahead_m: Floats) -> Floats:
+    return line[0] + line[1] * ahead_m
+
+
+def _openings(
+    plan: RoadPlan, side: int, edge: _Edge, own_m: Floats, bend_m: Floats | None
+) -> list[Opening]:
+    """Stretches in which an edge leaves the carriageway's own and comes back."""
+    beyond_m = edge.out_m - own_m
+    with np.errstate(invalid="ignore"):
+        is_out = beyond_m > LANE_M
+        is_back = edge.is_closed | (edge.is_kerb & (beyond_m < NEAR_EDGE_M))
+        if bend_m is not None:
+            # In a bend the other edge comes inwards.
+            is_out &= ~(bend_m < -NEAR_EDGE_M)
+    found: list[Opening] = []
+    start, last_out, last_own = None, 0, 0
+    for row in range(len(beyond_m)):
+        if is_out[row]:
+            if start is None:
+                start = max(last_own, row - round(HIDDEN_M / CELL_M))
+            last_out = row
+        elif is_back[row]:
+            if start is not None:
+                rows = slice(start, row)
+                length_m = (row - start) * CELL_M
+                out_m = is_out[rows].sum() * CELL_M
+                if LENGTH_M[0] <= length_m <= LENGTH_M[1] and out_m >= LENGTH_M[0]:
+                    depth_m = float(np.nanmax(beyond_m[rows]))
+                    found.append(
+                        Opening(
+                            side,
+                            float(plan.ahead_m[start] + 0.5 * CELL_M),
+                            float(plan.ahead_m[row] - 0.5 * CELL_M),
+                            depth_m,
+                        )
+                    )
+                start = None
+            last_own = row
+        elif start is not None and (row - last_out) * CELL_M > HIDDEN_M:
+            # Hidden for too long: where it ends is not seen.
+            start = None
+    return found
+
+
+def _straight(plan: RoadPlan, end_m: float) -> float:
+    """Whether the road goes on beyond the far kerb; NaN if that is not seen."""
+    rows = (plan.ahead_m > end_m + BEYOND_M[0]) & (plan.ahead_m < end_m + BEYOND_M[1])
+    columns = np.abs(plan.left_m) < HALF_WIDTH_M
+    part = plan.road[np.ix_(rows, columns)]
+    if part.size == 0 or np.isfinite(part).mean() < 0.5 or rows.sum() * CELL_M < LENGTH_M[0]:
+        return math.nan
+    share = float(np.nanmean(part > ROAD))
+    return 1.0 if share > 0.6 else 0.0 if share < 0.2 else math.nan

@@ -1,0 +1,103 @@
+"""Roads of the scene: the accumulated road area, its openings, and the ranges that they give."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from crosscue.detectors.base import RoadMask
+from crosscue.detectors.cues.observed import NOT_SEEN, FrameDetections, RoadFractions
+from crosscue.detectors.cues.road_area import RoadArea, RoadPlan, reach_of
+from crosscue.detectors.cues.road_openings import RoadOpenings, Seen
+from crosscue.eval.pipeline.visual import MOVING, TABLE, moving_boxes
+from crosscue.eval.runs.tables.parquet import TableFolder
+from crosscue.fusion.evidence import FrameEvidence, RangePosterior
+from crosscue.fusion.intersection_range import Reference
+from crosscue.replay.vehicle.vehicle import Vehicle
+
+# Distance between an opening and a range from lights or signs that can belong together.
+TOGETHER_M: Final = 15.0
+
+
+@dataclass(slots=True)
+class Roads:
+    """Roads over the frames of a drive.
+
+    Attributes:
+        vehicle: Settings.
+        pitches_rad: Pitch of the camera by the time of a frame, where the pictures tell it.
+        area: The accumulated road; None before the first mask.
+        seen: Openings in the newest frame.
+    """
+
+    vehicle: Vehicle
+    pitches_rad: Mapping[int, float]
+    area: RoadArea | None = None
+    seen: Seen | None = None
+    _openings: RoadOpenings = field(init=False)
+    _pitch_rad: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._openings = RoadOpenings(self.vehicle.camera.z_m)
+        self._pitch_rad = next(iter(self.pitches_rad.values()), self.vehicle.camera.pitch_rad)
+
+    def __call__(self, frame: FrameDetections, evidence: FrameEvidence) -> RoadFractions | None:
+        """Process the next frame; return 1 for roads seen, 0 for missing ones, NaN for unseen."""
+        self.seen = None
+        if not isinstance(frame.road, RoadMask):
+            return frame.road
+        camera = self.vehicle.camera
+        reach_m = reach_of(camera, frame.road)
+        if evidence.travelled_m is None or reach_m <= 0.0:
+            self.restart()
+            return NOT_SEEN
+        if self.area is None:
+            self.area = RoadArea(camera, reach_m)
+        turned_rad = evidence.turned_rad or 0.0
+        self.area.move(evidence.travelled_m, turned_rad)
+        self._pitch_rad = self.pitches_rad.get(frame.t_ns, self._pitch_rad)
+        labels = {*self.vehicle.cars.labels, *MOVING}
+        self.area.see(frame.road, moving_boxes(frame.objects, labels), self._pitch_rad)
+        self.seen = self._openings(self.area.plan(), evidence.travelled_m, turned_rad)
+        return RoadFractions(*self.seen.legs)
+
+    def ranges(self) -> tuple[RangePosterior, ...]:
+        """Return the ranges to the intersection that the openings make, if its end is ahead."""
+        seen = self.seen
+        if seen is None or not seen.end_m > 0.0:
+            return ()
+        var_m2 = seen.sd_m**2
+        return (
+            RangePosterior(Reference.START, seen.start_m, var_m2, seen.start_m),
+            RangePosterior(Reference.END, seen.end_m, var_m2, seen.end_m),
+        )
+
+    def fits(self, others: Sequence[RangePosterior]) -> bool:
+        """Return whether the openings can be at the intersection of ranges from lights or signs."""
+        seen = self.seen
+        if seen is None or math.isnan(seen.start_m):
+            return True
+        return any(
+            seen.start_m - away_m <= one.range_m <= seen.end_m + away_m
+            for one in others
+            for away_m in (TOGETHER_M + 2.0 * math.sqrt(one.var_m2 + seen.sd_m**2),)
+        )
+
+    def plan(self) -> RoadPlan | None:
+        """Return the plan view after the newest frame."""
+        return None if self.area is None else self.area.plan()
+
+    def restart(self) -> None:
+        """Forget the road."""
+        self.area, self.seen = None, None
+        self._openings.restart()
+
+
+def pitches_of(run: TableFolder) -> dict[int, float]:
+    """Return the pitch of the camera by the time of a frame, as visual odometry found it."""
+    if not run.file(f"{TABLE}.parquet").exists():
+        return {}
+    table = run.table(TABLE, ["t_ns", "pitch_rad"])
+    return dict(zip(table["t_ns"].to_pylist(), table["pitch_rad"].to_pylist(), strict=True))

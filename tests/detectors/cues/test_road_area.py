@@ -1,0 +1,214 @@
+"""Road area and openings from masks of known ground, projected by the pinhole formula."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import RoadMask
+from crosscue.detectors.cues.road_area import CELL_M, RoadArea, reach_of
+from crosscue.detectors.cues.road_openings import Legs, RoadOpenings, Seen
+from crosscue.replay.columns import Floats
+from crosscue.replay.vehicle.camera import Camera
+
+SIZE_PX: Final = (1240, 376)
+MASK_PX: Final = (620, 188)
+CAMERA: Final = Camera(focal_px=707.0, center_px=(620.0, 183.0), z_m=1.65, x_m=1.0)
+NO_BOXES: Final = np.empty((0, 4))
+STEP_M: Final = 1.0
+
+# Whether ground points (metres ahead of the start, and to the left) are road.
+Ground = Callable[[Floats, Floats], NDArray[np.bool_]]
+
+
+class Pose(NamedTuple):
+    """Place of the rear axle on the ground."""
+
+    x_m: float
+    y_m: float = 0.0
+    heading_rad: float = 0.0
+
+
+def mask(ground: Ground, pose: Pose, pitch_rad: float = 0.0, flipped: float = 0.0) -> RoadMask:
+    """What a perfect network sees of the ground, with a share of pixels flipped."""
+    width, height = MASK_PX
+    u, v = np.meshgrid((np.arange(width) + 0.5) * 2.0, (np.arange(height) + 0.5) * 2.0)
+    right, down = (u - 620.0) / 707.0, (v - 183.0) / 707.0
+    # The ray (1, -right, -down), pitched down.
+    ahead = math.cos(pitch_rad) - down * math.sin(pitch_rad)
+    below = down * math.cos(pitch_rad) + math.sin(pitch_rad)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away_m = np.where(below > 1e-3, 1.65 / below, np.nan)
+    x, y = away_m * ahead + 1.0, -away_m * right
+    cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+    at_x, at_y = pose.x_m + x * cos - y * sin, pose.y_m + x * sin + y * cos
+    is_road = np.isfinite(at_x) & ground(np.nan_to_num(at_x), np.nan_to_num(at_y))
+    is_road ^= np.random.default_rng(7).random(is_road.shape) < flipped
+    return RoadMask(0, SIZE_PX, rle.encode_mask(is_road, (0, 0), MASK_PX), MASK_PX)
+
+
+def driven(
+    ground: Ground,
+    n: int,
+    *,
+    pitch_rad: float = 0.0,
+    flipped: float = 0.0,
+    boxes_px: Floats = NO_BOXES,
+    turn_rad: float = 0.0,
+) -> list[Seen]:
+    """Results of a drive in steps of one metre."""
+    first = mask(ground, Pose(0.0))
+    area, openings = RoadArea(CAMERA, reach_of(CAMERA, first)), RoadOpenings(CAMERA.z_m)
+    found, pose = [], Pose(0.0)
+    for i in range(n):
+        if i:
+            middle = pose.heading_rad + 0.5 * turn_rad
+            pose = Pose(
+                pose.x_m + STEP_M * math.cos(middle),
+                pose.y_m + STEP_M * math.sin(middle),
+                pose.heading_rad + turn_rad,
+            )
+            area.move(STEP_M, turn_rad)
+        area.see(mask(ground, pose, pitch_rad, flipped), boxes_px, pitch_rad)
+        found.append(openings(area.plan(), STEP_M if i else 0.0, turn_rad if i else 0.0))
+    return found
+
+
+def straight(x: Floats, y: Floats) -> NDArray[np.bool_]:
+    """A road 7 m wide, the car 2 m right of its middle."""
+    return (y > -1.5) & (y < 5.5)
+
+
+def side_street(x: Floats, y: Floats) -> NDArray[np.bool_]:
+    """The same with a street 8 m wide to the right, from 40 m on."""
+    return straight(x, y) | ((x > 40.0) & (x < 48.0) & (y < 0.0))
+
+
+def crossing(x: Floats, y: Floats) -> NDArray[np.bool_]:
+    """The same with streets to both sides."""
+    return straight(x, y) | ((x > 40.0) & (x < 48.0))
+
+
+def stem(x: Floats, y: Floats) -> NDArray[np.bool_]:
+    """A road that ends at a road across."""
+    return (straight(x, y) & (x < 44.0)) | ((x > 40.0) & (x < 48.0))
+
+
+def bend(x: Floats, y: Floats) -> NDArray[np.bool_]:
+    """A road that bends to the right with a radius of 60 m, from 20 m on."""
+    radius_m = np.hypot(x - 20.0, y + 60.0)
+    curve = (radius_m > 58.5) & (radius_m < 65.5) & (y > -60.0)
+    return np.where(x < 20.0, straight(x, y), curve)
+
+
+def mirrored(ground: Ground) -> Ground:
+    """The same ground with left and right exchanged."""
+    return lambda x, y: ground(x, -y)
+
+
+@pytest.mark.parametrize("pitch_rad", [0.0, 0.03, -0.02])
+def test_road_in_the_plan_view_is_where_it_is_on_the_ground(pitch_rad: float) -> None:
+    first = mask(side_street, Pose(20.0), pitch_rad)
+    area = RoadArea(CAMERA, reach_of(CAMERA, first))
+    area.see(first, NO_BOXES, pitch_rad)
+    plan = area.plan(0.0)
+    near = (plan.ahead_m > 8.0) & (plan.ahead_m < 15.0)
+    seen = np.isfinite(plan.road[near])
+    x, y = np.meshgrid(plan.ahead_m[near] + 20.0, plan.left_m, indexing="ij")
+    wrong = (plan.road[near] > 0.5) != side_street(x, y)
+    at_edge = (np.abs(y + 1.5) < 2 * CELL_M) | (np.abs(y - 5.5) < 2 * CELL_M)
+    assert seen.sum() > 500
+    assert not (wrong & seen & ~at_edge).any()
+
+
+def test_the_plan_view_stays_on_the_ground_while_the_car_moves_and_turns() -> None:
+    area = RoadArea(CAMERA, 30.0)
+    area.see(mask(side_street, Pose(20.0)), NO_BOXES, 0.0)
+    for _ in range(40):
+        area.move(0.5, math.radians(1.0))
+    plan = area.plan(25.0)
+    heading = math.radians(40.0)
+    radius_m = 0.5 / math.radians(1.0)
+    x, y = np.meshgrid(plan.ahead_m, plan.left_m, indexing="ij")
+    at_x = 20.0 + radius_m * math.sin(heading) + x * math.cos(heading) - y * math.sin(heading)
+    at_y = radius_m * (1.0 - math.cos(heading)) + x * math.sin(heading) + y * math.cos(heading)
+    seen = np.isfinite(plan.road)
+    wrong = ((plan.road > 0.5) != side_street(at_x, at_y)) & seen
+    assert seen.sum() > 1000
+    assert wrong.sum() < 0.06 * seen.sum()
+
+
+def test_a_side_street_is_found_in_its_place_and_on_its_side_alone() -> None:
+    found = driven(side_street, 36)
+    first = next(i for i, one in enumerate(found) if one.openings)
+    assert 40.0 - first * STEP_M > 12.0
+    for i, one in enumerate(found[first:], first):
+        assert abs(one.start_m + i * STEP_M - 40.0) < 2.0 * one.sd_m
+        assert abs(one.end_m + i * STEP_M - 48.0) < 2.0 * one.sd_m
+    assert found[30].legs == Legs(0.0, 1.0, 1.0)
+    assert all(one.legs.left != 1.0 for one in found)
+
+
+@pytest.mark.parametrize("ground", [straight, side_street, crossing, stem])
+def test_mirrored_ground_gives_mirrored_legs(ground: Ground) -> None:
+    for one, other in zip(driven(ground, 32), driven(mirrored(ground), 32), strict=True):
+        np.testing.assert_equal(one.legs, Legs(*other.legs[::-1]))
+
+
+def test_a_crossing_has_both_sides_and_a_way_ahead() -> None:
+    assert driven(crossing, 32)[-1].legs == Legs(1.0, 1.0, 1.0)
+
+
+def test_a_road_that_ends_at_another_has_sides_and_no_way_ahead() -> None:
+    assert driven(stem, 32)[-1].legs == Legs(1.0, 0.0, 1.0)
+
+
+def test_a_road_without_streets_has_no_opening_also_if_it_bends_or_is_wide() -> None:
+    def wide(x: Floats, y: Floats) -> NDArray[np.bool_]:
+        return (y > -3.5) & (y < 14.0)
+
+    for ground in (straight, wide):
+        found = driven(ground, 30)
+        assert not any(one.openings for one in found)
+        assert found[-1].legs[2] == 0.0
+    turns = [0.0] * 20
+    assert not any(one.openings for one in driven(bend, len(turns)))
+
+
+def test_flipped_pixels_of_a_mask_neither_hide_a_street_nor_make_one() -> None:
+    assert driven(side_street, 32, flipped=0.03)[-1].legs == Legs(0.0, 1.0, 1.0)
+    assert not any(one.openings for one in driven(straight, 30, flipped=0.03))
+
+
+def test_ground_behind_a_vehicle_is_not_seen() -> None:
+    parked = np.array([[630.0, 150.0, 1240.0, 376.0]])
+    found = driven(side_street, 30, boxes_px=parked)
+    assert not any(one.openings for one in found)
+    assert all(math.isnan(one.legs.right) for one in found)
+    assert found[-1].legs.left == 0.0
+
+
+def test_after_a_turn_into_the_street_its_openings_are_forgotten() -> None:
+    area, openings = RoadArea(CAMERA, 30.0), RoadOpenings(CAMERA.z_m)
+    for i in range(34):
+        area.see(mask(side_street, Pose(i * STEP_M)), NO_BOXES, 0.0)
+        before = openings(area.plan(), STEP_M)
+        area.move(STEP_M, 0.0)
+    assert before.openings
+    for _ in range(10):
+        area.move(STEP_M, -math.radians(9.0))
+        after = openings(area.plan(), STEP_M, -math.radians(9.0))
+    assert not after.openings
+
+
+def test_reach_grows_with_height_and_focal_length_and_is_none_without_one() -> None:
+    seen = mask(straight, Pose(0.0))
+    assert reach_of(CAMERA, seen) == pytest.approx(math.sqrt(1.5 * 1.65 * 353.5))
+    assert reach_of(Camera(focal_px=5000.0, z_m=3.0), seen) == 50.0
+    assert reach_of(Camera(), seen) == 0.0

@@ -1,0 +1,128 @@
+"""Drives of pictures alone: odometry and roads from the pictures, through detect and estimate."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import crosscue
+from crosscue.detectors.base import Frame
+from crosscue.detectors.box_detector import ScoredBox
+from crosscue.detectors.catalog.fetch import fetch_weights
+from crosscue.eval.pipeline.run import Run
+from support.data import shared
+from support.plane_pictures import CAMERA, arc, picture
+
+STEP_M = 0.8
+ROADS = "road-segmentation-adas-0001"
+SETUP = f"""
+version = 1
+[camera]
+focal_px = {CAMERA.focal_px}
+center_px = [{CAMERA.center_px[0]}, {CAMERA.center_px[1]}]
+x_m = {CAMERA.x_m}
+z_m = {CAMERA.z_m}
+pitch_rad = {CAMERA.pitch_rad}
+"""
+
+
+class Nothing(crosscue.BoxDetector):
+    """A detector that finds nothing."""
+
+    name, labels = "nothing", ("nothing",)
+
+    def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
+        """Yield no boxes."""
+        yield from ()
+
+
+def replayed(folder: Path, more: str = "") -> Run:
+    """Replay a rendered drive: three pictures standing, then six steps of a gentle turn."""
+    log = folder / "log"
+    log.mkdir()
+    poses = [(0.0, 0.0, 0.0)] * 2 + arc(STEP_M, math.radians(1.0), 6)
+    for i, pose in enumerate(poses):
+        cv2.imwrite(str(log / f"{i:02}.png"), picture(*pose))
+    (log / "timestamps.txt").write_text("rate_hz: 10\n")
+    (folder / "car.toml").write_text(SETUP + more)
+    return crosscue.replay_drive(log, folder / "run", folder / "car.toml", [Nothing])
+
+
+def test_pictures_alone_give_odometry_that_is_named_in_the_account(tmp_path: Path) -> None:
+    run = replayed(tmp_path)
+    manifest = run.manifest
+    (notice,) = [one for one in manifest.notices if "visual" in one]
+    assert "8 of 8 pairs of pictures measured, 2 of them standing" in notice
+    used = manifest.account.estimating["pairs of pictures"]
+    assert (used.entered, used.used) == (8, 8)
+    rows = [row for row in run["measurements"].to_pylist() if row["kind"] == "odometry"]
+    assert [row["distance_m"] for row in rows] == pytest.approx([0.0] * 2 + [STEP_M] * 6, abs=0.05)
+    assert sum(row["turn_rad"] for row in rows) == pytest.approx(math.radians(6.0), abs=0.004)
+    assert all(row["distance_var_m2"] > 0.0 for row in rows)
+    assert run.pose["x_m"][-1].as_py() == pytest.approx(6 * STEP_M, abs=0.2)
+    assert manifest.scene.without_odometry == 0
+
+
+def test_estimating_again_needs_no_picture_and_wheels_alone_use_none(tmp_path: Path) -> None:
+    run = replayed(tmp_path)
+    before = run["measurements"]
+    again = crosscue.estimate_run(run)
+    assert again["measurements"].equals(before)
+    (tmp_path / "wheels.toml").write_text(f'{SETUP}[odometry]\nkind = "wheels"\n')
+    wheels = crosscue.estimate_run(run, tmp_path / "wheels.toml")
+    assert not wheels["measurements"].num_rows
+    assert wheels.manifest.scene.without_odometry > 0
+
+
+def test_pictures_are_not_followed_where_the_file_says_wheels(tmp_path: Path) -> None:
+    run = replayed(tmp_path, '[odometry]\nkind = "wheels"\n')
+    assert "visual_odometry" not in run.tables
+
+
+def test_odometry_of_a_log_with_speeds_is_used_unless_the_file_says_visual() -> None:
+    from crosscue.replay.columns import Topic
+    from crosscue.replay.signals.kinds import Signal
+    from crosscue.replay.signals.plan import plan
+    from crosscue.replay.vehicle.vehicle import parse
+
+    topics = [(0, Topic("odometry", "nav_msgs/msg/Odometry", "columns"))]
+    usual, visual = (
+        plan(topics, parse(f"version = 1\n[odometry]\nkind = '{kind}'\n", "here"))
+        for kind in ("auto", "visual")
+    )
+    assert usual.source_of(Signal.WHEEL_SPEEDS) is not None
+    assert visual.source_of(Signal.WHEEL_SPEEDS) is None
+    assert "visual" in visual.missing[Signal.WHEEL_SPEEDS]
+
+
+def test_a_real_side_street_is_believed_from_pictures_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """KITTI's T junction: a street to the right, nothing to the left, no light and no sign."""
+    monkeypatch.setenv("CROSSCUE_MODELS", str(tmp_path / "models"))
+    fetch_weights(ROADS, shared("weights") / ROADS)
+    pictures = shared("sequences") / "kitti_t_junction" / "image_0"
+    log = tmp_path / "log"
+    log.mkdir()
+    for path in sorted(pictures.iterdir())[22:42]:
+        (log / path.name).write_bytes(path.read_bytes())
+    (log / "timestamps.txt").write_text("rate_hz: 9.64\n")
+    (tmp_path / "car.toml").write_text(
+        "version = 1\n[camera]\nfocal_px = 707.0912\ncenter_px = [601.8873, 183.1104]\n"
+        f'x_m = 1.03\nz_m = 1.65\n[detectors.road]\nkind = "{ROADS}"\n'
+    )
+    run = crosscue.replay_drive(log, tmp_path / "run", tmp_path / "car.toml")
+    travelled = np.array(run["measurements"]["distance_m"].to_pylist()[1:], np.float64)
+    assert travelled == pytest.approx(np.full(len(travelled), 1.19), rel=0.1)
+    last = run.belief.to_pylist()[-1]
+    assert last["right"] > 0.9
+    assert last["intersection"] > 0.9
+    assert last["straight"] > 0.9
+    assert last["left"] < 0.5
+    (approach,) = run.manifest.scene.approaches
+    assert approach.reference == "start"
