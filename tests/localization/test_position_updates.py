@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
@@ -46,7 +48,7 @@ def test_late_rejected_and_thinned_positions_are_counted() -> None:
     assert measurements.update(belief, 0.0) is None
     assert measurements.update(belief, 0.0) is not None
     assert measurements.update(belief, 0.0) is None
-    assert measurements.as_dict() == {
+    assert asdict(measurements.counts) == {
         "received": 4,
         "accepted": 1,
         "thinned": 1,

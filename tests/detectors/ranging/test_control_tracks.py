@@ -161,7 +161,8 @@ def test_acceptance_is_taken_back_when_the_evidence_turns() -> None:
 
 def test_light_is_followed_through_rare_pictures_without_odometry() -> None:
     """At 1 Hz a light grows by a fifth and moves by two of its heights between two pictures."""
-    one, said = ControlTracks(car()), []
+    one = ControlTracks(car())
+    said: list[object] = []
     for i in range(6):
         (found,) = [frame([(600.0 + 60.0 * i, 300.0 - 20.0 * i, 0.8, "unknown")])]
         grown = found.boxes_px + 15.0 * 0.2 * i * np.array([-0.4, -1.0, 0.4, 1.0])
