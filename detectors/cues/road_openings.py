@@ -24,6 +24,8 @@ from .road_area import CELL_M, RoadPlan
 ROAD: Final = 0.5
 # Distance by which an edge lies further out at an opening.
 LANE_M: Final = 3.0
+# Distance from the carriageway's edge to which a road is seen at least, unlike a lay-by.
+DEPTH_M: Final = 5.0
 # Distance from the expected edge within which it is the carriageway's own.
 NEAR_EDGE_M: Final = 1.5
 # Least and greatest length of an opening along the carriageway, and longest hidden part of it.
@@ -296,8 +298,9 @@ def _openings(
                 rows = slice(start, row)
                 length_m = (row - start) * CELL_M
                 out_m = is_out[rows].sum() * CELL_M
-                if LENGTH_M[0] <= length_m <= LENGTH_M[1] and out_m >= LENGTH_M[0]:
-                    depth_m = float(np.nanmax(beyond_m[rows]))
+                depth_m = float(np.nanmax(beyond_m[rows]))
+                is_long = LENGTH_M[0] <= length_m <= LENGTH_M[1] and out_m >= LENGTH_M[0]
+                if is_long and depth_m >= DEPTH_M:
                     found.append(
                         Opening(
                             side,

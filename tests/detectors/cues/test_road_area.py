@@ -169,6 +169,13 @@ def test_a_road_that_ends_at_another_has_sides_and_no_way_ahead() -> None:
     assert driven(stem, 32)[-1].legs == Legs(1.0, 0.0, 1.0)
 
 
+def test_a_lay_by_beside_the_road_is_no_opening() -> None:
+    def lay_by(x: Floats, y: Floats) -> NDArray[np.bool_]:
+        return straight(x, y) | ((x > 25.0) & (x < 37.0) & (y < 0.0) & (y > -6.0))
+
+    assert not any(one.openings for one in driven(lay_by, 25))
+
+
 def test_a_road_without_streets_has_no_opening_also_if_it_bends_or_is_wide() -> None:
     def wide(x: Floats, y: Floats) -> NDArray[np.bool_]:
         return (y > -3.5) & (y < 14.0)
