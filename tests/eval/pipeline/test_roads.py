@@ -1,0 +1,91 @@
+"""Roads of the scene: what openings say to the belief and to the ranges."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from crosscue.detectors import rle
+from crosscue.detectors.base import RoadMask
+from crosscue.detectors.cues.observed import NOT_SEEN, FrameDetections, RoadFractions
+from crosscue.detectors.cues.road_openings import Legs, Seen
+from crosscue.eval.pipeline.scene.roads import Roads
+from crosscue.fusion.evidence import FrameEvidence, RangePosterior
+from crosscue.fusion.intersection_range import Reference
+from crosscue.replay.vehicle.camera import Camera
+from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle, parse
+
+CAMERA = Camera(focal_px=700.0, z_m=1.6)
+SIZE_PX = (640, 360)
+
+
+def evidence(travelled_m: float | None) -> FrameEvidence:
+    """Evidence of a frame with nothing but motion."""
+    return FrameEvidence(0, travelled_m, 0.01, (), {})
+
+
+def frame() -> FrameDetections:
+    """A frame whose lower half is road."""
+    rows = np.arange(SIZE_PX[1]) > SIZE_PX[1] // 2
+    pixels = np.broadcast_to(rows[:, None], SIZE_PX[::-1])
+    return FrameDetections(
+        0, road=RoadMask(0, SIZE_PX, rle.encode_mask(pixels, (0, 0), SIZE_PX), SIZE_PX)
+    )
+
+
+def roads(seen: Seen | None = None, camera: Camera = CAMERA) -> Roads:
+    """Roads after a frame with some result."""
+    made = Roads(Vehicle(version=1, camera=camera), {})
+    made.seen = seen
+    return made
+
+
+def opening(start_m: float, end_m: float) -> Seen:
+    """An intersection with a road to the right."""
+    return Seen((), Legs(0.0, 1.0, 1.0), start_m, end_m, 2.0)
+
+
+def test_openings_mark_start_and_end_while_the_end_is_ahead() -> None:
+    start, end = roads(opening(12.0, 20.0)).ranges()
+    assert (start.reference, start.range_m, start.var_m2) == (Reference.START, 12.0, 4.0)
+    assert (end.reference, end.range_m) == (Reference.END, 20.0)
+    assert not roads(opening(-9.0, -0.5)).ranges()
+    assert not roads(Seen((), Legs(0.0, math.nan, 0.0))).ranges()
+    assert not roads().ranges()
+
+
+@pytest.mark.parametrize(("range_m", "fits"), [(12.0, True), (25.0, True), (80.0, False)])
+def test_openings_fit_lights_and_signs_at_their_place_alone(range_m: float, fits: bool) -> None:
+    other = RangePosterior(Reference.END, range_m, 4.0, range_m)
+    assert roads(opening(12.0, 20.0)).fits([other]) is fits
+    assert roads(Seen((), Legs(0.0, math.nan, 0.0))).fits([other])
+
+
+def test_without_odometry_or_a_focal_length_no_road_is_seen() -> None:
+    assert roads()(frame(), evidence(None)) is NOT_SEEN
+    assert roads(camera=Camera())(frame(), evidence(1.0)) is NOT_SEEN
+    known = roads()(frame(), evidence(1.0))
+    assert isinstance(known, RoadFractions)
+    assert roads()(FrameDetections(0), evidence(1.0)) is None
+
+
+def test_an_opening_supports_the_intersection_unless_the_method_or_the_file_says_otherwise() -> (
+    None
+):
+    usual = Vehicle(version=1).fusion.cues["road_left"]
+    assert usual.supports == ("left", "intersection")
+    simulated = Vehicle(version=1, name=SIMULATED_CAR).fusion.cues["road_left"]
+    ground = parse('version = 1\n[regions]\nkind = "ground"\n', "a").fusion.cues["road_left"]
+    published = parse('version = 1\n[fusion]\nkind = "source"\n', "a").fusion.cues["road_left"]
+    assert {one.supports for one in (simulated, ground, published)} == {("left",)}
+    assert {one.precision for one in (simulated, ground, published)} == {0.77}
+    own = parse("version = 1\n[fusion.cues]\nroad_left = { precision = 0.8 }\n", "a")
+    assert own.fusion.cues["road_left"].precision == 0.8
+    assert own.fusion.cues["road_left"].supports == ("left",)
+
+
+def test_settings_of_a_run_are_the_same_when_read_again() -> None:
+    vehicle = Vehicle(version=1)
+    assert Vehicle.model_validate(vehicle.model_dump()) == vehicle
