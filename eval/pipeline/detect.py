@@ -167,7 +167,9 @@ def detect_into(
             reading.timeline,
             reading.clock,
             notices=uncounted,
-            visual=VisualPass(vehicle) if uses_pictures(logs, vehicle) else None,
+            visual=VisualPass(vehicle)
+            if uses_pictures(logs, vehicle, finds_road=_finds_road(named))
+            else None,
         )
         _run_detectors(reading, runner, tables)
         frames = runner.counts.frames
@@ -192,6 +194,11 @@ def detect_into(
         made,
         reading.timeline.has_gaps,
     )
+
+
+def _finds_road(named: Sequence[Named]) -> bool:
+    """Return whether a detector declares that it finds no objects, as those of road do."""
+    return any(reportable(one.detector) == () for one in named)
 
 
 def only_camera(logs: Sequence[Log], vehicle: Vehicle) -> tuple[int, Topic]:

@@ -1,7 +1,8 @@
 """Visual odometry in the two stages: pictures are followed by ``detect``, and ``estimate`` uses it.
 
 The table ``visual_odometry`` has one row for each pair of successive pictures. It is filled where
-the vehicle file has ``odometry.kind = "visual"``, or by default where no log has a speed.
+the vehicle file has ``odometry.kind = "visual"``, or by default where no log has a speed. It is
+also filled where road is accumulated on the ground, which needs the camera's pitch in the rows.
 """
 
 from __future__ import annotations
@@ -38,11 +39,19 @@ HELD_NS: Final = 1_000_000_000
 ACCEL_SD_MPS2: Final = 2.0
 
 
-def uses_pictures(logs: Sequence[Log], vehicle: Vehicle) -> bool:
-    """Return whether the pictures are the source of the odometry."""
+def uses_pictures(logs: Sequence[Log], vehicle: Vehicle, *, finds_road: bool) -> bool:
+    """Return whether pictures are compared: for the odometry, or for the camera's pitch alone.
+
+    Args:
+        logs: All logs of the drive.
+        vehicle: Settings.
+        finds_road: True if a detector finds road, whose projection to the ground needs the pitch.
+    """
     kind = vehicle.odometry.kind
     if kind != "auto":
         return kind == "visual"
+    if finds_road and vehicle.regions.kind == "area" and vehicle.camera.focal_px is not None:
+        return True
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
     try:
         return plan(topics, vehicle).source_of(Signal.WHEEL_SPEEDS) is None

@@ -100,6 +100,20 @@ def test_odometry_of_a_log_with_speeds_is_used_unless_the_file_says_visual() -> 
     assert "visual" in visual.missing[Signal.WHEEL_SPEEDS]
 
 
+def test_pictures_are_also_compared_for_the_pitch_where_road_is_accumulated() -> None:
+    from crosscue.eval.pipeline.visual import uses_pictures
+    from crosscue.replay.vehicle.vehicle import parse
+
+    for more, finds_road, expected in (
+        ("", True, True),
+        ('[odometry]\nkind = "wheels"\n', True, False),
+        ('[regions]\nkind = "ground"\n[odometry]\nkind = "wheels"\n', False, False),
+        ('[odometry]\nkind = "visual"\n', False, True),
+    ):
+        vehicle = parse(SETUP + more, "here")
+        assert uses_pictures([], vehicle, finds_road=finds_road) is expected
+
+
 def test_a_real_side_street_is_believed_from_pictures_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
