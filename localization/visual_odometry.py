@@ -46,10 +46,13 @@ ROWS, COLUMNS = 30, 20
 # Max shift between two pictures, and min shift, in reverse.
 AHEAD_M: Final = 5.0
 BACK_M: Final = 0.3
-# Min standard deviation of a patch in grey levels, and min height of the peak of the votes.
+# Min standard deviation of a patch in grey levels, and min height of the peak of the votes; half of
+# it where the last speed, not older than a second, leads one to expect the shift this closely.
 MIN_TEXTURE: Final = 1.5
 MIN_PEAK: Final = 0.15
+EXPECTED_M: Final = 0.2
 MIN_PATCHES: Final = 4
+KEPT_NS: Final = 1_000_000_000
 # S.d. of the pitch before any motion, of its change from pair to pair as the road's slope changes,
 # of the direction of travel in one pair, and of the pitch by the ground in one pair.
 PITCH_SD: Final = 0.03
@@ -119,6 +122,8 @@ class VisualOdometry:
     _before: _View | None = None
     _pitch: float = field(init=False)
     _pitch_var: float = PITCH_SD**2
+    _speed_mps: float = 0.0
+    _seen_ns: int = -KEPT_NS
 
     def __post_init__(self) -> None:
         self._pitch = self.camera.pitch_rad
@@ -148,7 +153,7 @@ class VisualOdometry:
 
     def restart(self) -> None:
         """Forget the previous picture."""
-        self._before = None
+        self._before, self._seen_ns = None, -KEPT_NS
 
     def _between(self, before: _View, now: _View, plane: GroundPlane, scale: int) -> VisualStep:
         focal_px = plane.focal_px / scale
@@ -192,10 +197,14 @@ class VisualOdometry:
         lever_m = (turned(turn_rad, 0.0, 0.0) - np.eye(3))[:2, :2] @ np.array(
             [self.camera.x_m, self.camera.y_m]
         )
-        shift = _ground_shift(before, now, planes, turn_rad, lever_m)
+        seconds = (now.t_ns - before.t_ns) * 1e-9
+        is_recent = now.t_ns - self._seen_ns < KEPT_NS
+        expected_m = self._speed_mps * seconds if is_recent else None
+        shift = _ground_shift(before, now, planes, turn_rad, lever_m, expected_m)
         step = nothing._replace(turn_rad=turn_rad, turn_sd_rad=TURN_SD_RAD, pitch_rad=self._pitch)
         if shift is None:
             return step
+        self._speed_mps, self._seen_ns = shift.shift_m / seconds, now.t_ns
         # A point at x seems to move by s (1 + 2 x e / h) with an error e of the pitch.
         per_pitch = 2.0 * shift.shift_m / self.camera.z_m
         if shift.shift_m > LEAST_M:
@@ -352,6 +361,7 @@ def _ground_shift(
     planes: list[GroundPlane],
     turn_rad: float,
     lever_m: Floats,
+    expected_m: float | None,
 ) -> _Shift | None:
     """Find the shift of the ground along the chord of the turn; None without enough texture."""
     height_px, width_px = before.grey.shape
@@ -374,7 +384,9 @@ def _ground_shift(
         np.isfinite(votes).sum(axis=0), 1
     )
     best = int(np.argmax(total))
-    if total[best] < MIN_PEAK or not 0 < best < len(total) - 1:
+    is_expected = expected_m is not None and abs(CELL_M * best - BACK_M - expected_m) < EXPECTED_M
+    least = 0.5 * MIN_PEAK if is_expected else MIN_PEAK
+    if total[best] < least or not 0 < best < len(total) - 1:
         return None
     peak = best + _vertex(total[best - 1], total[best], total[best + 1])
     own = [_nearest_peak(vote, best) for vote in votes]
