@@ -14,7 +14,7 @@ import numpy as np
 
 from crosscue.replay.base import EVERYTHING, Selection, name_of
 from crosscue.replay.base import Log as OneLog
-from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
+from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.decode.packets import PacketDecoder, is_stream
@@ -148,6 +148,34 @@ class Log(Closing):
         """
         with unless_damaged(self.logs):
             return replace(self, selection=select_part(self.logs, start_s, end_s, topics))
+
+    def batches(
+        self,
+        topics: Sequence[str] | None = None,
+        start_s: float | None = None,
+        end_s: float | None = None,
+    ) -> Iterator[tuple[str, pa.RecordBatch]]:
+        """Yield the rows of all topics in one pass over the log, in bounded memory.
+
+        Each batch comes with the name of its topic; batches are in the order of the log. Pictures
+        and packets of video stay encoded: views of what was read, in the columns ``coding`` and
+        ``data`` (with ``width_px``, ``height_px``, ``step_bytes`` and ``pixel_format`` where the
+        log has them).
+        Warnings report rows that are dropped, and topics and rows that cannot be decoded.
+
+        Args:
+            topics: Names of topics; None for all.
+            start_s: Start, in seconds after the drive's first row; None for the beginning.
+            end_s: End (exclusive), in seconds after the drive's first row; None for the end.
+
+        Raises:
+            UsageError: The time span is empty.
+            MissingTopicError: The drive has no such topic.
+        """
+        with unless_damaged(self.logs):
+            wanted = _narrowed(self.selection, select_part(self.logs, start_s, end_s, topics))
+        for log in self.logs:
+            yield from _batches_of(log, wanted)
 
     def signals(
         self, *databases: Path | str, bus: str | None = None, messages: Sequence[str] | None = None
@@ -360,10 +388,8 @@ class LogTopic:
                 yield CameraFrame(t_ns, self.name, content, picture.coding, picture.layout)
 
     def _selected(self, start_s: float | None, end_s: float | None) -> Selection:
-        of_log, wanted = self.log.selection, select_part(self.log.logs, start_s, end_s)
-        starts = [ns for ns in (of_log.start_ns, wanted.start_ns) if ns is not None]
-        ends = [ns for ns in (of_log.end_ns, wanted.end_ns) if ns is not None]
-        return Selection(frozenset({self.name}), max(starts, default=None), min(ends, default=None))
+        part = _narrowed(self.log.selection, select_part(self.log.logs, start_s, end_s))
+        return replace(part, topics=frozenset({self.name}))
 
     def _rows(self, selection: Selection, ledgers: list[Ledger]) -> Iterator[Block]:
         """Yield blocks of columns."""
@@ -501,6 +527,39 @@ def _bus(log: Log, name: str | None) -> LogTopic:
     return buses[0]
 
 
+def _narrowed(part: Selection, wanted: Selection) -> Selection:
+    """Return what is in both parts of a drive."""
+    starts = [ns for ns in (part.start_ns, wanted.start_ns) if ns is not None]
+    ends = [ns for ns in (part.end_ns, wanted.end_ns) if ns is not None]
+    topics = [one for one in (part.topics, wanted.topics) if one is not None]
+    return Selection(
+        frozenset.intersection(*topics) if topics else None,
+        max(starts, default=None),
+        min(ends, default=None),
+    )
+
+
+def _batches_of(log: OneLog, wanted: Selection) -> Iterator[tuple[str, pa.RecordBatch]]:
+    """Yield the batches of one log; at the end, warn about missing rows."""
+    decoders: dict[str, Decoder] = {}
+    for topic in log.topics:
+        if wanted.wants(topic.name):
+            try:
+                decoders[topic.name] = _decoder(log, topic)
+            except SchemaError as error:
+                warn_of_loss(f"{error}; no row of it is read")
+    ledger = Ledger(name_of(log))
+    part = replace(wanted, topics=frozenset(decoders))
+    for block in ledger.handing_on(log.read(ledger, part)):
+        decoded = decoders[block.topic](block, ledger)
+        if len(decoded):
+            for batch in _table_of([decoded], {}).to_batches():
+                yield block.topic, batch
+    ledger.check()
+    for name in ("", *decoders):
+        _warn(ledger, name)
+
+
 def _decoder(log: OneLog, topic: Topic) -> Decoder:
     decode = decoder_for(topic)
     if decode is None:
@@ -516,6 +575,9 @@ def _table_of(blocks: Sequence[Block], reported: Mapping[str, object]) -> pa.Tab
         return pa.table({"log_t_ns": pa.array([], pa.int64())}, metadata=_metadata(reported))
     units = blocks[0].rows.units if isinstance(blocks[0].rows, Table) else {}
     arrays = {name: pa.array(values) for name, values in topic_columns(blocks).items()}
+    if isinstance(blocks[0].rows, Images):
+        arrays["coding"] = pa.array([one for block in blocks for one in _images(block).coding])
+        arrays["data"] = pa.chunked_array([_views(_images(block).bytes_) for block in blocks])
     if isinstance(blocks[0].rows, CanFrames):
         arrays["data"] = pa.chunked_array([_payloads(block.rows) for block in blocks])
     fields = [
@@ -523,6 +585,30 @@ def _table_of(blocks: Sequence[Block], reported: Mapping[str, object]) -> pa.Tab
         for name, array in arrays.items()
     ]
     return pa.table(list(arrays.values()), pa.schema(fields, metadata=_metadata(reported)))
+
+
+def _images(block: Block) -> Images:
+    assert isinstance(block.rows, Images)
+    return block.rows
+
+
+def _views(messages: Messages) -> pa.Array:
+    """Return messages as views of their buffer, which is not copied.
+
+    A view has the length, then either up to 12 bytes, or 4 bytes, a buffer and the place in it.
+    """
+    import pyarrow as pa
+
+    views = np.zeros((len(messages), 4), np.int32)
+    views[:, 0] = messages.stop - messages.start
+    is_long = views[:, 0] > 12
+    views[is_long, 3] = messages.start[is_long]
+    inline = views.view(np.uint8)
+    for row, is_viewed in enumerate(is_long.tolist()):
+        content = messages.payload(row)[: 4 if is_viewed else 12]
+        inline[row, 4 : 4 + len(content)] = content
+    buffers = [None, pa.py_buffer(views), pa.py_buffer(messages.buffer)]
+    return pa.Array.from_buffers(pa.binary_view(), len(messages), buffers)
 
 
 def _payloads(rows: object) -> pa.Array:
@@ -533,9 +619,12 @@ def _payloads(rows: object) -> pa.Array:
     width = rows.data.shape[1]
     length = np.minimum(rows.length, width).astype(np.int32)
     stop = np.concatenate([[0], np.cumsum(length, dtype=np.int32)]).astype(np.int32)
-    content = rows.data[np.arange(width) < length[:, None]]
+    is_full = bool((length == width).all())
+    content = rows.data if is_full else rows.data[np.arange(width) < length[:, None]]
     return pa.Array.from_buffers(
-        pa.binary(), len(rows), [None, pa.py_buffer(stop), pa.py_buffer(content)]
+        pa.binary(),
+        len(rows),
+        [None, pa.py_buffer(stop), pa.py_buffer(np.ascontiguousarray(content))],
     )
 
 

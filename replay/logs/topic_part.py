@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.base import Log, Selection, name_of
-from crosscue.replay.columns import Block, CanFrames, Table, Topic
+from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.errors import UsageError
 from crosscue.replay.ledger import Ledger
@@ -69,8 +69,8 @@ def topic_columns(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:
     message that is itself named ``log_t_ns`` becomes ``log_t_ns_``.
 
     Args:
-        blocks: At least one block of ``Table`` or ``CanFrames``, all with the same columns.
-            Payloads of CAN frames are omitted.
+        blocks: At least one block of ``Table``, ``CanFrames`` or ``Images``, all with the same
+            columns. Payloads of CAN frames and pictures are omitted.
     """
     columns: dict[str, NDArray[np.generic]] = {
         "log_t_ns": np.concatenate([b.log_ns for b in blocks])
@@ -93,6 +93,11 @@ def topic_columns(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:
 def _named(rows: object) -> dict[str, NDArray[np.generic]]:
     if isinstance(rows, Table):
         return dict(rows.columns)
+    if isinstance(rows, Images):
+        sizes = ("width_px", "height_px", "step_bytes")
+        found = {name: getattr(rows, name) for name in sizes}
+        found["pixel_format"] = None if rows.pixel_format is None else np.array(rows.pixel_format)
+        return {name: values for name, values in found.items() if values is not None}
     assert isinstance(rows, CanFrames)
     return {
         name: getattr(rows, name)
