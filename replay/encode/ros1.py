@@ -24,7 +24,7 @@ from crosscue.replay.decode.ros.plan import (
     jumped,
 )
 from crosscue.replay.decode.ros.type_names import ros2_spelling
-from crosscue.replay.decode.ros.walk import Bools, Cursor, FieldPositions, Rows, Walker
+from crosscue.replay.decode.ros.walk import Bools, Cursor, FieldPositions, Place, Rows, Walker
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 
@@ -70,24 +70,19 @@ class _TwoCursors(Cursor):
 
     def pick(self, which: Bools) -> _TwoCursors:
         """Return a separate cursor over some of the messages."""
-        return _TwoCursors(
-            self.some_rows(which),
-            self.origin[which],
-            self.at[which],
-            self.stop[which],
-            self.out[which],
-        )
+        one = Cursor.pick(self, which)
+        return _TwoCursors(one.rows, one.origin, one.at, one.stop, self.out[which])
 
     def put_back(self, which: Bools, moved: Cursor) -> None:
         """Copy the positions of a cursor from ``pick``."""
         assert isinstance(moved, _TwoCursors)
-        self.at[which] = moved.at
+        Cursor.put_back(self, which, moved)
         self.out[which] = moved.out
 
     def numbers(self) -> Rows:
         """Row number of each message in the block."""
         if isinstance(self.rows, slice):
-            return np.arange(len(self.at))
+            return np.arange(len(self.stop))
         return self.rows
 
 
@@ -126,38 +121,38 @@ class _Transcriber(Walker):
             put = places[begin] if places is not None else run.cdr_place[modulo, begin]
             self.jobs.append(_Values(rows, source + run.place[0, begin], target + put, width))
 
-    def text(self, text: Text, cursor: Cursor, keep: bool) -> tuple[Int64s, Int64s]:
+    def text(self, text: Text, cursor: Cursor, keep: bool) -> tuple[Place, Place]:
         """Record a string, and add its terminator."""
         assert isinstance(cursor, _TwoCursors)
         first, length = Walker.text(self, text, cursor, keep)
         at = (cursor.out + 3) & -4
-        rows = cursor.numbers()
-        self.jobs.append(_Lengths(rows, at, length + 1))
-        self.jobs.append(_Values(rows, first, at + 4, length))
-        cursor.out = at + 5 + length
+        rows, size = cursor.numbers(), cursor.spread(length)
+        self.jobs.append(_Lengths(rows, at, size + 1))
+        self.jobs.append(_Values(rows, cursor.origin + first, at + 4, size))
+        cursor.out = at + 5 + size
         return first, length
 
-    def contents(self, items: Items, cursor: Cursor, count: Int64s) -> None:
+    def contents(self, items: Items, cursor: Cursor, count: Place) -> None:
         """Record a sequence's length and items."""
         assert isinstance(cursor, _TwoCursors)
-        rows = cursor.numbers()
+        rows, counts = cursor.numbers(), cursor.spread(count)
         if items.count is None:
             at = (cursor.out + 3) & -4
-            self.jobs.append(_Lengths(rows, at, count))
+            self.jobs.append(_Lengths(rows, at, counts))
             cursor.out = at + 4
         first, out = cursor.origin + cursor.at, cursor.out
         Walker.contents(self, items, cursor, count)
         if items.jumps is None or items.cdr_jumps is None:
             return
         fits = self.found.ok[cursor.rows]
-        count = np.where(fits, count, 0)
+        counts = np.where(fits, counts, 0)
         if items.code:
             width = int(items.code[1])
-            at = np.where(count > 0, -(-out // width) * width, out)
-            self.jobs.append(_Values(rows, first, at, count * width))
+            at = np.where(counts > 0, -(-out // width) * width, out)
+            self.jobs.append(_Values(rows, first, at, counts * width))
         else:
-            self._all_items(items, rows, first, out, count)
-        cursor.out = jumped(items.cdr_jumps, out, count)
+            self._all_items(items, rows, first, out, counts)
+        cursor.out = jumped(items.cdr_jumps, out, counts)
 
     def _all_items(
         self, items: Items, rows: Rows, first: Int64s, out: Int64s, count: Int64s
@@ -225,12 +220,12 @@ class Ros1ToCdr:
         """Transcode a block; messages that do not fit their definition are dropped."""
         assert isinstance(block.rows, Messages)
         messages = block.rows
-        found = FieldPositions(messages.buffer, True, np.ones(len(messages), np.bool_))
+        count, start = len(messages), messages.start
+        no_heads = np.empty((count, 0), np.uint8)
+        found = FieldPositions(messages.buffer, start, True, np.ones(count, np.bool_), no_heads)
         walker = _Transcriber(found, False)
-        zero = np.zeros(len(messages), np.int64)
-        cursor = _TwoCursors(
-            slice(None), messages.start, zero, messages.stop - messages.start, zero.copy()
-        )
+        zero = np.zeros(count, np.int64)
+        cursor = _TwoCursors(slice(None), start, zero, messages.stop - start, zero.copy())
         walker.whole(self.plan, cursor)
         for refused in found.refused:
             rows = refused.rows

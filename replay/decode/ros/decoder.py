@@ -3,36 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from crosscue.replay.columns import Block, Messages, Topic
+from crosscue.replay.columns import Block, Bytes, Messages, Topic
 from crosscue.replay.decode.refuse import MISFIT, WRONG_CODING, refuse
 from crosscue.replay.decode.ros.definition import Definitions, definitions_of, well_known
-from crosscue.replay.decode.ros.fields import FieldColumns, MessageBatch, WalkedFields
+from crosscue.replay.decode.ros.fields import FieldColumns, MessageBatch
 from crosscue.replay.decode.ros.plan import ParsingPlan, compile_plan
-from crosscue.replay.decode.ros.repeated import (
-    LAYOUTS_KEPT,
-    MAX_BYTES,
-    MessageLayout,
-    RepeatedFields,
-    layout_of,
-    repeats,
-    tail_counts,
-    tail_of,
-)
 from crosscue.replay.decode.ros.standard import Doubt, RosConversion, conversion_for, header_ns
 from crosscue.replay.decode.ros.type_names import ros2_spelling
-from crosscue.replay.decode.ros.walk import CDR_PADDING, Bools, Rows, gather, locate_fields
+from crosscue.replay.decode.ros.walk import Bools, Rows, gather, heads_of, locate_fields
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 
 CDR_BE: Final = 0x0000
 CDR_LE: Final = 0x0001
-# Key of the layout of messages that end in bytes.
-ANY_LENGTH: Final = -1
 # Encapsulations that DDS defines and that are not supported; any other number means damage.
 OTHER_CODINGS: Final = (0x0002, 0x0003, *range(0x0006, 0x000C))
 
@@ -44,14 +32,10 @@ class RosDecoder:
     Attributes:
         plan: Parsing plan of the type.
         kind: Conversion of the type to columns.
-        tail: Path of the bytes at the end of the type, if any.
-        layouts: Known layouts by the length of their message; None for a length without a layout.
     """
 
     plan: ParsingPlan
     kind: RosConversion
-    tail: str = ""
-    layouts: dict[int, MessageLayout | None] = field(default_factory=dict)
 
     def __call__(self, block: Block, ledger: Ledger) -> Block:
         """Decode a block; messages that do not fit are counted in ``ledger``."""
@@ -78,68 +62,34 @@ class RosDecoder:
 
         The others are dropped or skipped in ``ledger``, with reason and time.
         """
-        repeated = self._repeated(messages)
-        if repeated is not None:
-            return repeated, np.arange(len(messages))
-        fields, kept = self._walked(block, messages, ledger)
-        if len(kept):
-            self._learn(messages, int(kept[-1]))
-        return fields, kept
-
-    def _repeated(self, messages: Messages) -> RepeatedFields | None:
-        """Return the messages without parsing them, if all of them repeat a known layout."""
-        if not len(messages):
-            return None
-        layout = self.layouts.get(self._key(messages, 0))
-        rows = None if layout is None else repeats(layout, messages)
-        if layout is None or rows is None:
-            return None
-        counts = None
-        if layout.tail:
-            padding = CDR_PADDING if self.plan.is_cdr else 0
-            counts = tail_counts(layout, rows, messages, padding)
-            if counts is None:
-                return None
-        return RepeatedFields(self.plan, layout, rows, messages.buffer, messages.start, counts)
-
-    def _key(self, messages: Messages, i: int) -> int:
-        return ANY_LENGTH if self.tail else int(messages.stop[i] - messages.start[i])
-
-    def _learn(self, messages: Messages, i: int) -> None:
-        raw = messages.payload(i)[:MAX_BYTES].tobytes()
-        key = self._key(messages, i)
-        is_big = self.plan.is_cdr and raw[1] == 0
-        has_room = key in self.layouts or len(self.layouts) < LAYOUTS_KEPT
-        if key in (len(raw), ANY_LENGTH) and has_room and not is_big:
-            self.layouts[key] = layout_of(self.plan, raw)
-
-    def _walked(
-        self, block: Block, messages: Messages, ledger: Ledger
-    ) -> tuple[WalkedFields, Rows]:
         parts, rows = [], []
-        for little, index in self._by_order(block, messages, ledger):
-            whole = len(index) == len(messages)
-            found = locate_fields(
-                self.plan, messages if whole else messages.take(index), little=little
-            )
+        heads = heads_of(messages)
+        for little, index in self._by_order(block, messages, heads, ledger):
+            these = (messages, heads)
+            if len(index) != len(messages):
+                these = messages.take(index), heads[index]
+            found = locate_fields(self.plan, *these, little=little)
             for refused in found.refused:
                 _refuse(ledger, block, index[refused.rows], MISFIT, refused.why)
-            fits = np.flatnonzero(found.ok)
+            fits = np.flatnonzero(found.ok) if found.refused else np.arange(len(index))
             parts.append(MessageBatch(found, fits))
-            rows.append(index[fits])
+            rows.append(index[fits] if found.refused else index)
         kept = rows[0] if len(rows) == 1 else np.concatenate(rows)
         order = None
         if len(parts) > 1:
             order = np.argsort(kept, kind="stable")
             kept = kept[order]
-        return WalkedFields(self.plan, messages.buffer, tuple(parts), order), kept
+        return FieldColumns(self.plan, messages.buffer, tuple(parts), order), kept
 
     def _by_order(
-        self, block: Block, messages: Messages, ledger: Ledger
+        self, block: Block, messages: Messages, heads: Bytes, ledger: Ledger
     ) -> Iterator[tuple[bool, Rows]]:
         """Yield messages by byte order, and refuse those with an unsupported encapsulation."""
         everything = np.arange(len(messages))
         if not self.plan.is_cdr:
+            yield True, everything
+            return
+        if heads.shape[1] >= 4 and not np.count_nonzero(heads[:, :2].view("<u2") != CDR_LE << 8):
             yield True, everything
             return
         has_head = messages.stop - messages.start >= 4
@@ -196,4 +146,4 @@ def ros_decoder(topic: Topic) -> RosDecoder | None:
         kind.check(plan)
     except SchemaError as error:
         raise SchemaError(f"{topic.name}: {error}") from None
-    return RosDecoder(plan, kind, tail_of(plan))
+    return RosDecoder(plan, kind)

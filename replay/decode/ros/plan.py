@@ -342,7 +342,7 @@ def _jumps(sizes: list[Int64s]) -> Int64s:
 
 
 def jumped(jumps: Int64s, at: Int64s, count: Int64s) -> Int64s:
-    """Return the ends of ``count`` items that begin at ``at``, both of shape (N,)."""
+    """Return the ends of ``count`` items that begin at ``at``, both of one shape."""
     for k in range(int(count.max(initial=0)).bit_length()):
         at = at + np.where((count >> k) & 1, jumps[k][at & 7], 0)
     return at

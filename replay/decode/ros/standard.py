@@ -124,15 +124,21 @@ def _frame_kinds(fields: FieldColumns) -> NDArray[np.uint8]:
 
 
 def _can_doubts(fields: FieldColumns) -> Iterator[Doubt]:
-    # As unsigned numbers, negative numbers of a wrong definition are too large as well.
-    identifier = fields.number("id").astype(np.int64).view(np.uint64)
+    identifier = _unsigned(fields.number("id"))
     long = identifier > 0x7FF
     if np.count_nonzero(long):
         extended = fields.number("is_extended").astype(np.bool_, copy=False)
         error = fields.number("is_error").astype(np.bool_, copy=False)
         too_long = long & ~(extended | error) | (identifier > 0x1FFF_FFFF)
         yield too_long, "identifier has more bits than its frame kind"
-    yield fields.number("dlc").astype(np.int64).view(np.uint64) > 8, "data length code over 8"
+    yield _unsigned(fields.number("dlc")) > 8, "data length code over 8"
+
+
+def _unsigned(column: NDArray[np.generic]) -> NDArray[np.unsignedinteger]:
+    """Return numbers as unsigned: negative ones of a wrong definition are too large as well."""
+    if np.issubdtype(column.dtype, np.unsignedinteger):
+        return column.view(column.dtype)
+    return column.astype(np.int64).view(np.uint64)
 
 
 def _can_fd_frame(fields: FieldColumns) -> CanFrames:
@@ -167,13 +173,13 @@ def _picture_ranges(fields: FieldColumns) -> Messages:
 
 
 def _codings(fields: FieldColumns) -> Sequence[ImageCoding | None]:
-    pictures = _picture_ranges(fields)
     first, size = fields.items("data")
     if len(fields) and np.minimum.reduce(size) >= len(JPEG):
         begins = gather(fields.buffer, "<u2", 0, first)
         if not np.count_nonzero(begins != int.from_bytes(JPEG, "little")):
             jpeg: ImageCoding = "jpeg"
             return (jpeg,) * len(fields)
+    pictures = _picture_ranges(fields)
     return [
         coding_of(pictures.payload(i)[:MAGIC_BYTES].tobytes(), label)
         for i, label in enumerate(fields.texts("format"))

@@ -16,7 +16,6 @@ from rosbags.typesys.store import Typestore
 from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.ros.decoder import RosDecoder
-from crosscue.replay.decode.ros.fields import WalkedFields
 from crosscue.replay.decode.ros.standard import RosConversion, generic
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
@@ -134,40 +133,42 @@ def test_random_types_decode_like_rosbags(seed: int, is_cdr: bool) -> None:
 @pytest.mark.slow
 @given(seed=SEEDS, is_cdr=st.booleans())
 @QUICK
-def test_learned_layout_decodes_like_field_by_field_walk(seed: int, is_cdr: bool) -> None:
+def test_messages_decode_together_as_alone(seed: int, is_cdr: bool) -> None:
+    """Positions that all messages share are one number; the others are one for each message."""
     rng = np.random.default_rng(seed)
     store = get_typestore(Stores.ROS2_HUMBLE if is_cdr else Stores.ROS1_NOETIC)
     text, name = random_definition(rng, "made_msgs/Root"), "made_msgs/msg/Root"
     store.register(get_types_from_msg(text, name))
     topic = (ros2_topic if is_cdr else ros1_topic)("/t", name, text)
-    message = random_message(rng, store, name)
-    raw = bytes(
-        store.serialize_cdr(message, name) if is_cdr else store.serialize_ros1(message, name)
+    raw, other = (
+        bytes(store.serialize_cdr(one, name) if is_cdr else store.serialize_ros1(one, name))
+        for one in (random_message(rng, store, name) for _ in range(2))
     )
-    trained = generic_decoder(topic)
-    trained(block_of("/t", [raw]), Ledger("made"))
     # The first bytes contain lengths more often than the rest.
     for at in {*range(min(8, len(raw))), *rng.integers(0, max(len(raw), 1), 8).tolist()}:
         if at >= len(raw):
             continue
         changed = bytearray(raw)
         changed[at] ^= int(rng.integers(1, 256))
-        block = block_of("/t", [raw, bytes(changed), raw], gap=1)
-        ledgers = Ledger("from_layout"), Ledger("from_walk")
+        for payloads in ([raw, bytes(changed), raw], [raw, bytes(changed), other, raw]):
+            block = block_of("/t", payloads, gap=1)
+            ledgers = Ledger("together"), Ledger("alone")
 
-        from_layout, from_walk = (
-            trained(block, ledgers[0]),
-            generic_decoder(topic)(block, ledgers[1]),
-        )
+            together = generic_decoder(topic)(block, ledgers[0])
+            alone = [
+                generic_decoder(topic)(block.take(np.array([i])), ledgers[1])
+                for i in range(len(payloads))
+            ]
 
-        assert isinstance(from_layout.rows, Table)
-        assert isinstance(from_walk.rows, Table)
-        np.testing.assert_array_equal(from_layout.log_ns, from_walk.log_ns)
-        assert from_layout.rows.columns.keys() == from_walk.rows.columns.keys()
-        for column in from_layout.rows.columns:
-            assert from_layout.rows[column].dtype == from_walk.rows[column].dtype
-            assert from_layout.rows[column].tobytes() == from_walk.rows[column].tobytes()
-        assert ledgers[0].details == ledgers[1].details
+            assert isinstance(together.rows, Table)
+            np.testing.assert_array_equal(
+                together.log_ns, np.concatenate([one.log_ns for one in alone])
+            )
+            for column in together.rows.columns:
+                parts = [one.rows[column] for one in alone]  # type: ignore[index]
+                assert all(part.dtype == together.rows[column].dtype for part in parts)
+                assert together.rows[column].tobytes() == b"".join(p.tobytes() for p in parts)
+            assert ledgers[0].details == ledgers[1].details
 
 
 @given(seed=SEEDS, is_cdr=st.booleans())
@@ -228,7 +229,6 @@ def test_taking_rows_of_both_byte_orders_keeps_values() -> None:
 
     decoder = generic_decoder(ros2_topic("/i", name))
     fields, _ = decoder.walked(block_of("/i", payloads), messages_of(payloads), Ledger("made"))
-    assert isinstance(fields, WalkedFields)
 
     np.testing.assert_array_equal(fields.number("data"), np.arange(10))
     np.testing.assert_array_equal(fields.take(keep).number("data"), [0, 3, 6, 9])
