@@ -262,7 +262,7 @@ def _own_edge(plan: RoadPlan, edge: _Edge) -> tuple[float, float] | None:
     best, offset, slope = -1.0, 0.0, 0.0
     for tried in np.linspace(-0.2, 0.2, 17):
         away = y - tried * x
-        # The innermost of the offsets that enough rows share.
+        # The offset that most rows share.
         counts = np.array([(np.abs(away - one) < 0.5).sum() for one in away])
         score = counts.max() - 20.0 * abs(tried)
         if score > best:
@@ -324,5 +324,5 @@ def _straight(plan: RoadPlan, end_m: float) -> float:
     part = plan.road[np.ix_(rows, columns)]
     if part.size == 0 or np.isfinite(part).mean() < 0.5 or rows.sum() * CELL_M < LENGTH_M[0]:
         return math.nan
-    share = float(np.nanmean(part > ROAD))
+    share = float((part[np.isfinite(part)] > ROAD).mean())
     return 1.0 if share > 0.6 else 0.0 if share < 0.2 else math.nan

@@ -82,13 +82,14 @@ class Anchored:
         evidence, ego = self._ego(seen.t_ns)
         if self._roads is not None:
             self._roads(seen, evidence)
-            self._draw_roads(self._roads)
         place = None
         if ego.way_m is not None:
             place = intersection_place(self._before, ego.way_m, vehicle.fusion.length_m)
         self._before = self._ranges.get(seen.t_ns, [])
         found = self._cues(seen, ego, place, frame.heights_px)
         self.marks.add(frame, found.objects)
+        if self._roads is not None:
+            self._draw_roads(self._roads)
         if vehicle.regions.kind == "ground" and isinstance(seen.road, RoadMask):
             fractions = found.road
             polygons = outlines(vehicle.camera, vehicle.regions, place, frame.size_px)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -11,13 +11,17 @@ import numpy as np
 import pytest
 
 import crosscue
-from crosscue.detectors.base import Frame
+from crosscue.detectors import rle
+from crosscue.detectors.base import Frame, RoadMask, View
 from crosscue.detectors.box_detector import ScoredBox
 from crosscue.detectors.catalog.fetch import fetch_weights
 from crosscue.eval.pipeline.run import Run
+from crosscue.eval.pipeline.scene.road_picture import plans_of
+from crosscue.eval.report.frame_pictures import draw_pictures
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import EstimateManifest, SceneSummary
 from support.data import shared
-from support.plane_pictures import CAMERA, arc, picture
+from support.plane_pictures import CAMERA, SIZE_PX, arc, picture
 
 STEP_M = 0.8
 ROADS = "road-segmentation-adas-0001"
@@ -42,6 +46,20 @@ class Nothing(crosscue.BoxDetector):
         yield from ()
 
 
+class LowerHalf:
+    """A detector to which the ground between the walls is road."""
+
+    view, identity, labels = View(is_grey=True), "lower half", ()
+
+    def __call__(self, frames: Sequence[Frame], /) -> list[RoadMask]:
+        """Return all pixels 20 rows below the middle of each picture."""
+        width, height = SIZE_PX
+        rows = np.arange(height) > height // 2 + 20
+        pixels = np.broadcast_to(rows[:, None], (height, width))
+        mask = rle.encode_mask(pixels, (0, 0), SIZE_PX)
+        return [RoadMask(frame.t_ns, SIZE_PX, mask, SIZE_PX) for frame in frames]
+
+
 def scene_of(run: Run) -> tuple[EstimateManifest, SceneSummary]:
     """Return the manifest of a run, and its scene."""
     manifest = run.manifest
@@ -50,7 +68,7 @@ def scene_of(run: Run) -> tuple[EstimateManifest, SceneSummary]:
     return manifest, manifest.scene
 
 
-def replayed(folder: Path, more: str = "") -> Run:
+def replayed(folder: Path, more: str = "", detector: object = Nothing) -> Run:
     """Replay a rendered drive: three pictures standing, then six steps of a gentle turn."""
     log = folder / "log"
     log.mkdir()
@@ -59,7 +77,7 @@ def replayed(folder: Path, more: str = "") -> Run:
         cv2.imwrite(str(log / f"{i:02}.png"), picture(*pose))
     (log / "timestamps.txt").write_text("rate_hz: 10\n")
     (folder / "car.toml").write_text(SETUP + more)
-    return crosscue.replay_drive(log, folder / "run", folder / "car.toml", [Nothing])
+    return crosscue.replay_drive(log, folder / "run", folder / "car.toml", [detector])
 
 
 def test_pictures_alone_give_odometry_that_is_named_in_the_account(tmp_path: Path) -> None:
@@ -75,6 +93,28 @@ def test_pictures_alone_give_odometry_that_is_named_in_the_account(tmp_path: Pat
     assert all(row["distance_var_m2"] > 0.0 for row in rows)
     assert run.pose["x_m"][-1].as_py() == pytest.approx(6 * STEP_M, abs=0.2)
     assert scene.without_odometry == 0
+
+
+def test_accumulated_road_is_drawn_in_the_recording_and_beside_pictures(tmp_path: Path) -> None:
+    run = replayed(tmp_path, detector=LowerHalf())
+    _, scene = scene_of(run)
+    assert not scene.approaches
+    assert crosscue.save_recording(run, tmp_path / "drive.rrd").stat().st_size > 10_000
+    sizes: list[int] = []
+    times = run["frames"]["t_ns"].to_pylist()
+    why = draw_pictures(
+        RunFolder(run.path),
+        times[-1:],
+        lambda _, picture, __: sizes.append(
+            cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR).shape[1]
+        ),
+    )
+    assert (why, len(sizes)) == ("", 1)
+    plan = plans_of(RunFolder(run.path), times[-1:])[times[-1]]
+    # Road is green, and on either side of the axis, near the car.
+    greens = (plan == np.array([90, 160, 60], np.uint8)).all(axis=2)
+    assert greens[:, : plan.shape[1] // 2].sum() > 200
+    assert greens[:, plan.shape[1] // 2 :].sum() > 200
 
 
 def test_estimating_again_needs_no_picture_and_wheels_alone_use_none(tmp_path: Path) -> None:
