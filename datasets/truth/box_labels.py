@@ -1,4 +1,4 @@
-"""Read labelled boxes of pictures: COCO, YOLO, Pascal VOC and KITTI.
+"""Read labelled boxes of pictures: COCO, YOLO, Pascal VOC and KITTI; or what pictures show.
 
 * COCO: a ``.json`` file. ``iscrowd`` marks regions that are not scored; ``t_ns`` and ``range_m``
   (of an annotation, metres) are used if present.
@@ -9,6 +9,8 @@
   box; objects marked ``difficult`` are not scored.
 * KITTI: a folder of ``.txt`` files with 15 columns. ``DontCare`` regions are not scored; the range
   is the distance ahead of the camera.
+* Pictures: a ``.csv`` or ``.tsv`` file. The heading names the column of the pictures and the
+  classes; in each row, yes, no, 1 or 0 says whether the picture shows an object of that class.
 
 A file without boxes means that its picture shows no objects; a picture without a file is not
 labelled.
@@ -16,6 +18,7 @@ labelled.
 
 from __future__ import annotations
 
+import csv
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -34,14 +37,18 @@ from crosscue.verb import Option
 from .coco import read_coco
 from .voc import read_voc
 
-LabelFormat: TypeAlias = Literal["coco", "yolo", "voc", "kitti"]
-FORMATS: Final[tuple[LabelFormat, ...]] = ("coco", "yolo", "voc", "kitti")
+LabelFormat: TypeAlias = Literal["coco", "yolo", "voc", "kitti", "pictures"]
+FORMATS: Final[tuple[LabelFormat, ...]] = ("coco", "yolo", "voc", "kitti", "pictures")
 MAX_TEXT_BYTES: Final = 16 * MIB
 NAME_FILES: Final = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml")
 DONT_CARE: Final = "DontCare"
 OUTSIDE: Final = "boxes outside the picture, or without area"
 CUT: Final = "boxes cut off at the picture's edge"
 _KITTI_COLUMNS: Final = 15
+# Separators of the columns of a table of pictures, by suffix.
+_SEPARATORS: Final = {".csv": ",", ".tsv": "\t"}
+_YES: Final = ("yes", "true", "1")
+_NO: Final = ("no", "false", "0")
 
 
 def meanings_of(
@@ -139,6 +146,11 @@ class BoxLabels:
     pictures: tuple[LabelPicture, ...]
     left_out: Mapping[str, int] = field(default_factory=dict)
 
+    @property
+    def is_by_picture(self) -> bool:
+        """True if each box stands for a whole picture that shows such an object."""
+        return self.format == "pictures"
+
 
 def read_box_labels(
     path: Path, kind: str | None = None, class_names: Sequence[str] = ()
@@ -146,7 +158,7 @@ def read_box_labels(
     """Read labelled boxes.
 
     Args:
-        path: A COCO file, or a folder of the other formats.
+        path: A COCO file, a table of pictures, or a folder of the other formats.
         kind: One of ``FORMATS``; detected by default.
         class_names: Class names in YOLO's order; for other formats, all classes that annotators
             could use.
@@ -162,6 +174,8 @@ def read_box_labels(
     known = kind or _recognised(path, files)
     if known == "coco":
         found = _coco(path)
+    elif known == "pictures":
+        found = _pictures(path)
     elif known == "voc":
         found = _voc(path, [file for file in files if file.suffix == ".xml"], class_names)
     elif known == "kitti":
@@ -188,6 +202,8 @@ def _texts(files: Sequence[Path]) -> list[Path]:
 def _recognised(path: Path, files: Sequence[Path]) -> LabelFormat:
     if path.is_file() and path.suffix == ".json":
         return "coco"
+    if path.is_file() and path.suffix in _SEPARATORS:
+        return "pictures"
     if path.is_dir() and any(one.suffix == ".xml" for one in files):
         return "voc"
     if path.is_dir() and _texts(files):
@@ -197,8 +213,8 @@ def _recognised(path: Path, files: Sequence[Path]) -> LabelFormat:
                 return "yolo" if words[0].split()[0].replace(".", "").isdigit() else "kitti"
         return "yolo"
     raise AnnotationError(
-        f"{path}: no labels of boxes; expected a COCO .json, or a folder of YOLO .txt, Pascal VOC "
-        ".xml or KITTI .txt files"
+        f"{path}: no labels of boxes; expected a COCO .json, a .csv of pictures, or a folder of "
+        "YOLO .txt, Pascal VOC .xml or KITTI .txt files"
     )
 
 
@@ -258,6 +274,34 @@ def _kitti(path: Path, files: Sequence[Path], class_names: Sequence[str]) -> Box
             )
         pictures.append(LabelPicture(file.name, tuple(boxes)))
     return BoxLabels(str(path), "kitti", _classes(pictures, class_names), tuple(pictures))
+
+
+def _pictures(path: Path) -> BoxLabels:
+    rows = list(csv.reader(_lines(path), delimiter=_SEPARATORS.get(path.suffix, ",")))
+    heading = [word.strip() for word in rows[0]] if rows else []
+    if len(heading) < 2:
+        raise AnnotationError(f"{path}: expected a heading: the column of pictures, then classes")
+    pictures = []
+    for number, row in enumerate(rows[1:], 2):
+        if len(row) != len(heading):
+            raise AnnotationError(
+                f"{path}:{number}: {len(row)} columns, the heading has {len(heading)}; correct it"
+            )
+        shown = [_is_shown(word, f"{path}:{number}") for word in row[1:]]
+        boxes = tuple(
+            LabelBox(name, (0.0, 0.0, 1.0, 1.0))
+            for name, is_there in zip(heading[1:], shown, strict=True)
+            if is_there
+        )
+        pictures.append(LabelPicture(row[0].strip(), boxes, is_in_fractions=True))
+    return BoxLabels(str(path), "pictures", tuple(heading[1:]), tuple(pictures))
+
+
+def _is_shown(word: str, where: str) -> bool:
+    plain = word.strip().lower()
+    if plain not in (*_YES, *_NO):
+        raise AnnotationError(f"{where}: {word!r}, expected yes or no; correct it")
+    return plain in _YES
 
 
 def _classes(pictures: Sequence[LabelPicture], class_names: Sequence[str]) -> tuple[str, ...]:

@@ -291,6 +291,11 @@ def score_detector(
         path, settings.logs, without_images=settings.without_images, limits=settings.limits
     ).folder
     read = read_box_labels(Path(labels), settings.kind, class_names_given(settings.class_names))
+    if read.is_by_picture:
+        raise UsageError(
+            f"{read.where}: says what pictures show, and has no boxes to score; use crosscue fit "
+            "detector"
+        )
     of = labelled_run(folder, read, settings.detector, dict(settings.meanings))
     scores = score_parts(
         of.truth,

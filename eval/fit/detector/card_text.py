@@ -89,10 +89,12 @@ def _evidence(fit: ClassFit, pictures: str, measured: str, aim: str) -> dict[str
     assert fit.held_out is not None
     assert fit.scores is not None
     held = fit.held_out
+    what, found = fit.counted
+    where = " in a picture" if fit.unit == "pictures" else ""
     row: dict[str, object] = {
         "pictures": pictures,
         "boxes": held.labels,
-        "metric": f"precision of {fit.name} above {fit.scores.threshold:g}, held out",
+        "metric": f"precision of {fit.name}{where} above {fit.scores.threshold:g}, held out",
         "value": round(held.precision, 4) if held.of else 0.0,
     }
     if held.of:
@@ -100,7 +102,7 @@ def _evidence(fit: ClassFit, pictures: str, measured: str, aim: str) -> dict[str
     if measured:
         row["measured"] = measured
     row["note"] = (
-        f"{WRITTEN_BY}: {aim}; fitted to {fit.labels} boxes and {fit.detections} detections, "
+        f"{WRITTEN_BY}: {aim}; fitted to {fit.labels} {what} and {fit.detections} {found}, "
         f"bound {fit.bound:.4f}; held out {held.right} of {held.of} right, recall "
         f"{held.right} of {held.labels}"
     )

@@ -17,6 +17,8 @@ from crosscue.eval.scoring.intervals import Interval, wilson
 from .threshold import best_bound, bounded_threshold, fewest_detections, lower_bound, round_between
 
 CalibrationKind: TypeAlias = Literal["platt", "isotonic", "none"]
+# What is labelled: boxes, or whether a picture shows such an object.
+LabelUnit: TypeAlias = Literal["boxes", "pictures"]
 CALIBRATIONS: Final[tuple[CalibrationKind, ...]] = ("platt", "isotonic", "none")
 NOT_LABELLED: Final = "not labelled"
 # Min number of labelled boxes to fit a class.
@@ -32,12 +34,14 @@ class ClassDetections:
     Attributes:
         scores: Scores of the detections, shape (N,).
         is_right: True for detections that match a label, shape (N,).
-        labels: Number of labelled boxes.
+        labels: Number of labelled boxes, or of pictures that show such an object.
+        unit: What is labelled; of pictures, the best detection counts.
     """
 
     scores: NDArray[np.float64]
     is_right: NDArray[np.bool_]
     labels: int
+    unit: LabelUnit = "boxes"
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +93,7 @@ class ClassFit:
         bound: Lower bound of the precision above the threshold; NaN without a threshold.
         held_out: Result on held-out pictures; None without a threshold and a calibration.
         notes: Reasons why something was not fitted.
+        unit: What is labelled.
     """
 
     name: str
@@ -100,6 +105,18 @@ class ClassFit:
     bound: float
     held_out: HeldOut | None
     notes: tuple[str, ...]
+    unit: LabelUnit = "boxes"
+
+    @property
+    def counted(self) -> tuple[str, str]:
+        """What ``labels`` and ``detections`` count, in words."""
+        return _COUNTED[self.unit]
+
+
+_COUNTED: Final[dict[LabelUnit, tuple[str, str]]] = {
+    "boxes": ("boxes", "detections"),
+    "pictures": ("pictures with it", "pictures with a detection"),
+}
 
 
 def fit_class(
@@ -123,11 +140,14 @@ def fit_class(
         kind: Kind of calibration.
     """
     n, right = len(chosen_on.scores), int(chosen_on.is_right.sum())
+    unit = chosen_on.unit
     if not chosen_on.labels + held_out.labels:
-        return ClassFit(name, members, 0, n, right, None, math.nan, None, (NOT_LABELLED,))
+        return ClassFit(name, members, 0, n, right, None, math.nan, None, (NOT_LABELLED,), unit)
     if chosen_on.labels < MIN_LABELS:
-        why = f"{chosen_on.labels} labelled boxes, {MIN_LABELS} needed: not fitted"
-        return ClassFit(name, members, chosen_on.labels, n, right, None, math.nan, None, (why,))
+        why = f"{chosen_on.labels} {_COUNTED[unit][0]}, {MIN_LABELS} needed: not fitted"
+        return ClassFit(
+            name, members, chosen_on.labels, n, right, None, math.nan, None, (why,), unit
+        )
     notes = []
     calibration = _calibration(chosen_on, kind)
     if calibration is None and kind != "none":
@@ -141,7 +161,7 @@ def fit_class(
         scores = None if calibration is None else ClassScores(calibration=calibration)
         held = None if scores is None else _held_out(held_out, scores, confidence)
         return ClassFit(
-            name, members, chosen_on.labels, n, right, scores, math.nan, held, tuple(notes)
+            name, members, chosen_on.labels, n, right, scores, math.nan, held, tuple(notes), unit
         )
     low, high = _applied(calibration, np.array([found.score, found.next_score])).tolist()
     scores = ClassScores(threshold=round_between(low, high), calibration=calibration)
@@ -155,6 +175,7 @@ def fit_class(
         found.bound,
         _held_out(held_out, scores, confidence),
         tuple(notes),
+        unit,
     )
 
 

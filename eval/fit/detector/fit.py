@@ -27,6 +27,7 @@ from crosscue.eval.fit.detector.class_fit import (
     CalibrationKind,
     ClassDetections,
     ClassFit,
+    LabelUnit,
     fit_class,
 )
 from crosscue.eval.pipeline.run import Run, open_run
@@ -112,8 +113,9 @@ class FittedDetector(Result):
 def _class_lines(one: ClassFit, precision: float) -> list[str]:
     if one.notes == (NOT_LABELLED,):
         return [f"{visible(one.name):10} {NOT_LABELLED}, {one.detections:,} detections"]
+    what, found = one.counted
     lines = [
-        f"{visible(one.name):10} {one.labels:,} boxes, {one.detections:,} detections, "
+        f"{visible(one.name):10} {one.labels:,} {what}, {one.detections:,} {found}, "
         f"{one.right:,} right"
     ]
     if one.scores is not None and one.scores.threshold is not None:
@@ -249,6 +251,10 @@ def fit_detector(
     other runs. A class with too few labelled boxes is reported and keeps its values. The result is
     written into the detector's card.
 
+    LABELS may also be a .csv or .tsv file that says what each picture shows: a heading, with the
+    column of the pictures and the classes, and yes or no for each picture and class. The best
+    detection of each picture is then right if the picture shows such an object.
+
     The bounds assume that detections are independent, but those of neighbouring images are not.
     Therefore, use several drives.
 
@@ -304,6 +310,8 @@ def fit_detector(
         )
         for name in _common(whole)
     )
+    if len({part.is_by_picture for part in whole}) > 1:
+        raise UsageError("labels: some are of boxes, others of pictures; expected one kind")
     written = None
     if output is not None and source is not None and any(one.scores for one in fits):
         written = Path(output)
@@ -370,6 +378,13 @@ class _Pictures:
         """Match the detections of one class to labels."""
         scores, right, labels = [np.empty(0)], [np.empty(0, np.bool_)], 0
         for run, chosen in zip(self.runs, self.chosen, strict=True):
+            if run.is_by_picture:
+                best, has = _best_of_pictures(run, chosen, run.classes.index(name))
+                found = np.isfinite(best)
+                scores.append(best[found])
+                right.append(has[found])
+                labels += int(has.sum())
+                continue
             matched = match(
                 *run.part(chosen), run.classes.index(name), overlaps=np.array([overlap])
             )
@@ -377,7 +392,24 @@ class _Pictures:
             scores.append(matched.scores[judged])
             right.append(matched.is_right[0][judged])
             labels += len(matched.labels)
-        return ClassDetections(np.concatenate(scores), np.concatenate(right), labels)
+        unit: LabelUnit = "pictures" if self.runs[0].is_by_picture else "boxes"
+        return ClassDetections(np.concatenate(scores), np.concatenate(right), labels, unit)
+
+
+def _best_of_pictures(
+    run: LabelledRun, chosen: np.typing.NDArray[np.bool_], label: int
+) -> tuple[np.typing.NDArray[np.float64], np.typing.NDArray[np.bool_]]:
+    """Best score of a class in each chosen picture, and whether the picture shows such an object.
+
+    The score is -inf in a picture without a detection.
+    """
+    truth, found = run.truth, run.found
+    best = np.full(len(chosen), -np.inf)
+    is_of = found.label == label
+    np.maximum.at(best, found.picture[is_of], found.scores[is_of])
+    has = np.zeros(len(chosen), np.bool_)
+    has[truth.picture[(truth.label == label) & ~truth.is_ignored]] = True
+    return best[chosen], has[chosen]
 
 
 def _split(

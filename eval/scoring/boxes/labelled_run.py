@@ -59,6 +59,7 @@ class LabelledRun:
         left_out: Number of labels left out or repaired, and of detections on one object with other
             labels of their class, by reason.
         not_judged: Number of detections of classes that the labels lack, by label.
+        is_by_picture: True if the labels say what a picture shows, and not where.
     """
 
     run: RunFolder
@@ -74,6 +75,7 @@ class LabelledRun:
     frames: int
     left_out: Mapping[str, int]
     not_judged: Mapping[str, int]
+    is_by_picture: bool = False
 
     @property
     def is_whole(self) -> bool:
@@ -157,6 +159,7 @@ def labelled_run(
         len(frames),
         dict(left_out),
         not_judged,
+        labels.is_by_picture,
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import crosscue
+from crosscue.datasets.truth.box_labels import read_box_labels
 from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.training.platt import fit_isotonic, fit_platt
 from crosscue.eval.fit.detector.threshold import (
@@ -289,3 +290,76 @@ def test_left_out_labels_are_counted_by_reason(drive: Path, tmp_path: Path) -> N
     page = found.report.read_text()
     assert "1 images that are not in the run" in page
     assert found.parts.num_rows == len(found.scores)
+
+
+def picture_labels(folder: Path, path: Path, separator: str = ",") -> Path:
+    """Write which pictures of the drive show a light, and that none shows a van."""
+    rows = [
+        f"{file.stem}.png{separator}{'yes' if file.read_text() else 'no'}{separator}0"
+        for file in sorted((folder / "labels").glob("frame_*.txt"))
+    ]
+    path.write_text("\n".join([f"picture{separator}traffic light{separator}van", *rows]) + "\n")
+    return path
+
+
+@pytest.mark.slow
+def test_fit_to_labels_of_pictures_equals_that_to_their_only_boxes(
+    drive: Path, tmp_path: Path
+) -> None:
+    labels = picture_labels(drive, tmp_path / "lights.csv")
+
+    by_picture = crosscue.fit_detector(drive / "run", labels, drive / "net_by_picture.toml")
+    by_box = crosscue.fit_detector(drive / "run", drive / "labels")
+
+    (one,), (other,) = by_picture.classes, by_box.classes
+    assert (one.scores, one.bound, one.labels) == (other.scores, other.bound, other.labels)
+    assert one.held_out is not None
+    assert other.held_out is not None
+    assert (one.held_out.right, one.held_out.of) == (other.held_out.right, other.held_out.of)
+    assert f"{one.labels} pictures with it, {one.detections} pictures with" in str(by_picture)
+    assert f"{other.labels} boxes" in str(by_box)
+    (evidence,) = read_card(drive / "net_by_picture.toml").evidence
+    assert "fitted to" in evidence.note
+    assert "pictures with it" in evidence.note
+    assert "traffic light in a picture" in evidence.metric
+
+
+def test_best_detection_of_a_picture_counts(tmp_path: Path) -> None:
+    """Three pictures with two cars each, of which the second picture shows none."""
+    run = two_labels_on_one_object(tmp_path)
+    labels = tmp_path / "cars.tsv"
+    labels.write_text("picture\tcar\nframe_0.png\t1\nframe_1.png\t0\nframe_2.png\t1\n")
+
+    found = crosscue.fit_detector(run, labels, hold_out=0.01)
+
+    (one,) = found.classes
+    assert (one.labels, one.detections, one.right) == (2, 3, 2)
+
+
+def test_labels_of_pictures_are_no_boxes_to_score(drive: Path, tmp_path: Path) -> None:
+    labels = picture_labels(drive, tmp_path / "lights.tsv", "\t")
+
+    with pytest.raises(UsageError, match=r"lights.tsv: .*no boxes.*crosscue fit detector"):
+        crosscue.score_detector(drive / "run", labels)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected a heading"),
+        ("picture\na.png\n", "expected a heading"),
+        ("picture,car\na.png,maybe\n", "cars.csv:2: 'maybe', expected yes or no"),
+        ("picture,car\na.png\n", "cars.csv:2: 1 columns, the heading has 2"),
+        ("picture,car\n\xff.png,1\n", "not UTF-8 text"),
+    ],
+)
+def test_damaged_labels_of_pictures_are_refused_with_their_line(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    path = tmp_path / "cars.csv"
+    path.write_text(text, encoding="latin-1")
+
+    with pytest.raises(crosscue.CrosscueError, match=message) as caught:
+        read_box_labels(path)
+
+    assert "\n" not in str(caught.value)
