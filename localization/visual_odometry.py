@@ -52,6 +52,7 @@ MIN_TEXTURE: Final = 1.5
 MIN_PEAK: Final = 0.15
 EXPECTED_M: Final = 0.2
 MIN_PATCHES: Final = 4
+# Time after which a speed is forgotten, and longest time between pictures that are compared.
 KEPT_NS: Final = 1_000_000_000
 # S.d. of the pitch before any motion, of its change from pair to pair as the road's slope changes,
 # of the direction of travel in one pair, and of the pitch by the ground in one pair.
@@ -129,7 +130,7 @@ class VisualOdometry:
         self._pitch = self.camera.pitch_rad
 
     def __call__(self, t_ns: int, grey: Bytes, boxes_px: Floats) -> VisualStep | None:
-        """Return the motion since the previous picture; None for the first.
+        """Return the motion since the previous picture; None for the first, or after a gap.
 
         Args:
             t_ns: Time of the picture.
@@ -147,13 +148,11 @@ class VisualOdometry:
             grey = np.asarray(cv2.resize(grey, small, interpolation=cv2.INTER_AREA), np.uint8)
         now = _View(t_ns, grey, boxes_px / scale)
         before, self._before = self._before, now
-        if before is None or before.grey.shape != now.grey.shape or t_ns <= before.t_ns:
+        if before is None or before.grey.shape != now.grey.shape:
+            return None
+        if not 0 < t_ns - before.t_ns <= KEPT_NS:
             return None
         return self._between(before, now, GroundPlane.of(self.camera, size_px), scale)
-
-    def restart(self) -> None:
-        """Forget the previous picture."""
-        self._before, self._seen_ns = None, -KEPT_NS
 
     def _between(self, before: _View, now: _View, plane: GroundPlane, scale: int) -> VisualStep:
         focal_px = plane.focal_px / scale

@@ -67,7 +67,7 @@ from .empty_result import empty_result, silent_roles
 from .landmarks import landmark_stage
 from .pose import PoseStage, estimating_of, fused_positions, turn_signal_of
 from .progress import report_time
-from .visual import VisualSource, visual_source
+from .visual import VisualSource, visual_source, with_visual_scale
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -375,6 +375,8 @@ def _scene(
     run: RunFolder, vehicle: Vehicle, found: DetectManifest, reading: _Reading
 ) -> SceneOutcome:
     timeline, clock = reading.timeline, reading.timeline.clock(found.camera_log)
+    if reading.visual(run) is not None:
+        vehicle = with_visual_scale(vehicle)
     with ExitStack() as stack:
         sinks = {
             name: stack.enter_context(LabelledSink(run, name, schema, timeline, clock))

@@ -20,7 +20,7 @@ from crosscue.detectors.runner import FrameResult
 from crosscue.eval.runs.account import Line, line
 from crosscue.eval.runs.tables.parquet import TableFolder
 from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
-from crosscue.localization.visual_odometry import VisualOdometry, VisualStep
+from crosscue.localization.visual_odometry import HEIGHT_SD, VisualOdometry, VisualStep
 from crosscue.replay.base import Log
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import VehicleError
@@ -93,6 +93,16 @@ def moving_boxes(found: Sequence[Found], labels: set[str]) -> Floats:
         if label in labels
     ]
     return np.array(boxes, np.float64).reshape(-1, 4)
+
+
+def with_visual_scale(vehicle: Vehicle) -> Vehicle:
+    """Return the settings with the scale error of distances that depend on the camera's height.
+
+    It is common to all pairs of pictures, so ranges from motion cannot average it out.
+    """
+    scale_sd = max(vehicle.odometry.scale_sd, HEIGHT_SD)
+    odometry = vehicle.odometry.model_copy(update={"scale_sd": scale_sd})
+    return vehicle.model_copy(update={"odometry": odometry})
 
 
 def visual_schema() -> pa.Schema:

@@ -89,3 +89,4 @@ def test_a_picture_of_another_size_or_time_starts_over() -> None:
     assert odometry(20, picture(0.0, 0.0, 0.0)[:200], NO_BOXES) is None
     assert odometry(15, picture(0.0, 0.0, 0.0)[:200], NO_BOXES) is None
     assert odometry(30, picture(0.0, 0.0, 0.0)[:200], NO_BOXES) is not None
+    assert odometry(1_000_000_031, picture(0.0, 0.0, 0.0)[:200], NO_BOXES) is None

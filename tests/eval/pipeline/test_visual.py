@@ -149,6 +149,15 @@ def test_odometry_of_a_log_with_speeds_is_used_unless_the_file_says_visual() -> 
     assert "visual" in visual.missing[Signal.WHEEL_SPEEDS]
 
 
+def test_distances_from_pictures_have_the_scale_error_of_the_cameras_height() -> None:
+    from crosscue.eval.pipeline.visual import with_visual_scale
+    from crosscue.replay.vehicle.vehicle import parse
+
+    assert with_visual_scale(parse(SETUP, "here")).odometry.scale_sd == 0.05
+    worse = parse(f"{SETUP}[odometry]\nscale_sd = 0.2\n", "here")
+    assert with_visual_scale(worse).odometry.scale_sd == 0.2
+
+
 def test_pictures_are_also_compared_for_the_pitch_where_road_is_accumulated() -> None:
     from crosscue.eval.pipeline.visual import uses_pictures
     from crosscue.replay.vehicle.vehicle import parse
