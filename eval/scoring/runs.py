@@ -103,7 +103,7 @@ def find_truth(run: RunFolder, given: Path | None) -> Path:
         RunError: The manifest cannot be read.
     """
     if given is not None:
-        return given
+        return given / FILE if given.is_dir() else given
     known = _remembered(run)
     if known is not None:
         return known[0].path
