@@ -43,7 +43,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two short drives, each in a folder of its own with its vehicle file."""
     folder = tmp_path_factory.mktemp("place")
     for i, name in enumerate(DRIVES):
-        write_drive(folder / "drives" / name, Clock(), seconds=8 + 2 * i)
+        write_drive(folder / "drives" / name, Clock(), seconds=4 + i)
         (folder / "drives" / name / "car.toml").rename(folder / "drives" / name / "vehicle.toml")
     return folder
 
@@ -143,7 +143,7 @@ def test_manifest_has_no_times_and_timings_file_has_them(expected: Path) -> None
     assert timed is not None
     assert timed.seconds > 0.0
     assert timed.detect is not None
-    assert timed.detect.from_cache == {"grey": 80}
+    assert timed.detect.from_cache == {"grey": 40}
 
 
 def _keys(tree: object) -> set[str]:

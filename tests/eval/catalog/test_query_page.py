@@ -53,15 +53,11 @@ def catalog(tmp_path_factory: pytest.TempPathFactory) -> Catalog:
     return crosscue.catalog(runs)
 
 
-@pytest.mark.parametrize("sql", PAGE_QUERIES, ids=range(1, len(PAGE_QUERIES) + 1))
-def test_query_of_the_page_returns_rows(catalog: Catalog, sql: str) -> None:
-    assert catalog.query(sql).num_rows > 0
-
-
 def test_queries_of_the_page_return_expected_rows(catalog: Catalog) -> None:
     def rows(number: int) -> list[dict[str, Any]]:
         return list(catalog.query(PAGE_QUERIES[number - 1]).to_pylist())
 
+    assert all(map(rows, range(1, len(PAGE_QUERIES) + 1)))
     assert rows(1) == [{"vehicle": "car", "crosscue": "0", "runs": 5, "with_losses": 1}]
     assert [row["run"] for row in rows(2)] == ["c/wednesday"]
     assert rows(3)[0]["detected_m"] == 20.0
