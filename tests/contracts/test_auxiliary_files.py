@@ -1,7 +1,8 @@
 """Every argument and option that names an input file is tested with missing and unusable files.
 
 For a missing or empty file, noise, a folder or other text, the exit status is 4 for input and 2 for
-settings. One line names the file, and no file is written.
+settings. One line names the file, and no file is written. A file of an option is refused before a
+log is read.
 """
 
 from __future__ import annotations
@@ -16,8 +17,10 @@ import pytest
 from crosscue.eval import cli
 from crosscue.localization.landmarks.database import LandmarkWriter
 from support.failures import table_of_failures
-from support.gap_drive import BEGIN, Clock, replayed, write_drive
+from support.gap_drive import BEGIN, BUS, Clock, replayed, write_drive
+from support.mcap_files import McapFile
 from support.onnx_models import bright_box_model
+from support.opened_files import opened_files
 from support.pictures import picture
 from support.trees import tree
 
@@ -92,7 +95,10 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("detect", "--vehicle"): ("{log} -o {out} --vehicle {gone}", SETTINGS),
     ("detect", "--detectors"): ("{log} -o {out} --detectors {gone}.toml", SETTINGS),
     ("replay", "--vehicle"): ("{log} -o {out} --vehicle {gone}", SETTINGS),
-    ("replay", "--detectors"): ("{log} -o {out} --detectors {gone}.toml", SETTINGS),
+    ("replay", "--detectors"): (
+        "{log} -o {out} --vehicle {car} --detectors {gone}.toml",
+        SETTINGS,
+    ),
     ("replay", "--landmarks"): ("{log} -o {out} --vehicle {car} --landmarks {gone}", INPUT),
     ("estimate", "--vehicle"): ("{run} --vehicle {gone}", SETTINGS),
     ("estimate", "--logs"): ("{run} --logs {gone}", INPUT),
@@ -200,7 +206,10 @@ DAMAGE: Final[dict[str, Callable[[Path], object]]] = {
     "noise": lambda path: path.write_bytes(bytes(range(256)) * 8),
     "a folder": lambda path: path.mkdir(),
     "text": lambda path: path.write_text("nothing of the kind\n"),
+    "nested": lambda path: path.write_text(f"a = {'[' * 3000}{']' * 3000}\n"),
 }
+# A log of the car, one without pictures and one without messages.
+LOGS: Final = ("log", "bus_log", "empty_log")
 
 
 def _named_files() -> set[tuple[str, str]]:
@@ -228,6 +237,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     drive, photos = folder / "drive", folder / "photos"
     log = write_drive(drive, Clock(), seconds=4)
     run = replayed(drive, log, "../run")
+    (folder / "empty.mcap").write_bytes(McapFile([]).coded())
     with LandmarkWriter(folder / "known.db", "orb"):
         pass
     for place in ("images", "masks"):
@@ -244,6 +254,8 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     assert cli.run(["model", "init", str(photos / "net.onnx"), "-q"]) == 0
     return {
         "log": log,
+        "bus_log": write_drive(folder / "bus", Clock(), seconds=4, topics=[BUS]),
+        "empty_log": folder / "empty.mcap",
         "run": run.path,
         "car": drive / "car.toml",
         "truth": drive / "truth.json",
@@ -293,11 +305,16 @@ def test_unusable_input_file_is_refused_in_one_line(
         pytest.skip("expects a folder; an empty one is another error")
     if case in CREATED_IF_MISSING and damage in ("missing", "empty"):
         pytest.skip("created if missing")
-    if case[1] == "--class-names" and damage == "text":
+    if case[1] == "--class-names" and damage in ("text", "nested"):
         pytest.skip("expects text")
-    argv = line.format(**names, gone=tmp_path / "gone", out=tmp_path / "out").split()
+    is_option = case[1].startswith("--")
+    log = names[LOGS[[*DAMAGE].index(damage) % len(LOGS) if is_option else 0]]
+    places = {**names, "log": log, "gone": tmp_path / "gone", "out": tmp_path / "out"}
+    argv = line.format(**places).split()
 
-    _assert_refused([*command.split(), *argv], expected, "gone", names, tmp_path, capsys)
+    opened = _assert_refused([*command.split(), *argv], expected, "gone", names, tmp_path, capsys)
+
+    assert not is_option or not {str(names[one]) for one in LOGS} & {*opened}
 
 
 def _assert_refused(
@@ -307,11 +324,13 @@ def _assert_refused(
     names: dict[str, Path],
     out: Path,
     capsys: pytest.CaptureFixture[str],
-) -> None:
+) -> list[str]:
+    """Check how a command ends, and return the files that it opened."""
     inputs = names["masks"].parent
     before, here = tree(inputs), tree(out)
 
-    status = cli.run(argv)
+    with opened_files() as opened:
+        status = cli.run(argv)
 
     captured = capsys.readouterr()
     assert status == expected, captured.err
@@ -322,6 +341,7 @@ def _assert_refused(
     assert "bug" not in captured.err
     assert tree(inputs) == before
     assert {name for name in tree(out) if Path(out / name).is_file()} == here.keys()
+    return opened
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
