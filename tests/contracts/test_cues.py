@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.compute as pc
 import pytest
 from rerun.chunk import RrdReader
 
 import crosscue
 from crosscue.datasets.scenes.cues import SIMULATED
+from crosscue.detectors.base import Detections, Found, Frame
 from crosscue.detectors.cues.rules import rule_of
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.cue_table import CUES, groups
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.testing import check_cue
-from support.gap_drive import Clock, write_drive
+from support.gap_drive import Clock, GreyNumber, write_drive
 
 DUMMY = CueSpec(
     name="zebra",
@@ -33,6 +36,42 @@ DUMMY = CueSpec(
     label="zebra",
     colour=(1, 2, 3),
 )
+
+
+# The contract and the plug-in below name these functions as text, ``{__name__}:function``.
+
+
+def count_zebras(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
+    """Return twice the number of zebra crossings: the only function of the dummy cue."""
+    assert vehicle.version == 1
+    return 2 * sum(found.labels.count(cue.label or "") for found in boxes)
+
+
+def always(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
+    """Return 1 for an empty picture, which violates the contract."""
+    return 1
+
+
+def a_fraction(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> float:
+    """Return a count that is not an integer, which violates the contract."""
+    return 0.5
+
+
+class ZebraDetector(GreyNumber):
+    """A detector that adds a zebra crossing next to the drive's stop sign."""
+
+    def _one(self, frame: Frame) -> Found:
+        found = super()._one(frame)
+        assert isinstance(found, Detections)
+        if not len(found):
+            return found
+        return replace(
+            found,
+            boxes_px=np.concatenate([found.boxes_px, [[10.0, 60.0, 90.0, 80.0]]]),
+            scores=np.ones(2),
+            labels=(*found.labels, "zebra"),
+            masks=(b"", b""),
+        )
 
 
 @pytest.mark.parametrize("cue", CUES.values(), ids=lambda cue: str(cue.name))
