@@ -14,9 +14,9 @@ from crosscue.eval.fit.landmarks.database import (
     AddCounts,
     add_from_images,
     add_from_log,
-    frames_of,
     metres,
     near_of,
+    pictures_with,
     read_poses,
 )
 from crosscue.eval.logs.log import DriveIfGiven, opened
@@ -32,7 +32,7 @@ from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.safe_text import visible
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result, json_key
-from crosscue.verb import Option
+from crosscue.verb import Option, keywords
 
 if TYPE_CHECKING:
     from crosscue.localization.landmarks.features import Match, Matcher
@@ -162,18 +162,35 @@ class LandmarkMatches(Result):
             )
 
 
+@dataclass(frozen=True, slots=True)
+class LandmarkSource:
+    """Where landmarks come from: a log with poses, or pictures with coordinates.
+
+    Attributes:
+        poses: Poses of the vehicle: a run or a truth file.
+        images: Folder of images.
+        coordinates: Position of each image.
+        every_m: Distance between landmarks from a log, in metres.
+        sd_m: Standard deviation of the vehicle's position at a match, in metres, added to the error
+            of the poses.
+        source: Name of the source (default: the log's name).
+        vehicle: Vehicle file: camera and matcher.
+        matcher: ``orb``, or your own ``module:factory``.
+    """
+
+    poses: Annotated[Path | str | None, Option(metavar="RUN|T.json")] = None
+    images: Annotated[Path | str | None, Option(metavar="DIR")] = None
+    coordinates: Annotated[Path | str | None, Option(metavar="FILE.csv")] = None
+    every_m: Annotated[float, Option("--every", convert=metres)] = 10.0
+    sd_m: Annotated[float, Option("--sd", convert=metres)] = 3.0
+    source: str | None = None
+    vehicle: Vehicle | Path | str | None = None
+    matcher: str | None = None
+
+
+@keywords(LandmarkSource, 2)
 def add_landmarks(
-    database: Path | str,
-    log: DriveIfGiven = None,
-    *,
-    poses: Annotated[Path | str | None, Option(metavar="RUN|T.json")] = None,
-    images: Annotated[Path | str | None, Option(metavar="DIR")] = None,
-    coordinates: Annotated[Path | str | None, Option(metavar="FILE.csv")] = None,
-    every_m: Annotated[float, Option("--every", convert=metres)] = 10.0,
-    sd_m: Annotated[float, Option("--sd", convert=metres)] = 3.0,
-    source: str | None = None,
-    vehicle: Vehicle | Path | str | None = None,
-    matcher: str | None = None,
+    database: Path | str, log: DriveIfGiven, settings: LandmarkSource
 ) -> AddedLandmarks:
     """Add landmarks from a log with poses, or from pictures with coordinates.
 
@@ -187,16 +204,8 @@ def add_landmarks(
 
     Args:
         database: Landmark database; created if missing.
-        log: The drive.
-        poses: Poses of the vehicle: a run or a truth file.
-        images: Folder of images.
-        coordinates: Position of each image.
-        every_m: Distance between landmarks from a log, in metres.
-        sd_m: Standard deviation of the vehicle's position at a match, in metres, added to the error
-            of the poses.
-        source: Name of the source (default: the log's name).
-        vehicle: Vehicle file: camera and matcher.
-        matcher: ``orb``, or your own ``module:factory``.
+        log: The drive; None with pictures.
+        settings: Where they come from.
 
     Raises:
         UsageError: There are not exactly a log and poses, or images and coordinates.
@@ -204,23 +213,24 @@ def add_landmarks(
         SchemaError: The coordinates are not valid; the message names the line.
         VehicleError: The drive has no camera, or several.
     """
+    poses, images, coordinates = settings.poses, settings.images, settings.coordinates
+    car, source = vehicle_given(settings.vehicle), settings.source
     if log is not None and poses is not None and images is None and coordinates is None:
-        settings = vehicle_given(vehicle)
-        describing = matcher_for(settings, matcher)
-        known = read_poses(Path(poses), settings)
+        describing = matcher_for(car, settings.matcher)
+        known = read_poses(Path(poses), car)
         with opened(log) as drive:
             name = visible(source or drive.logs[0].path.resolve().stem)
 
             def add(writer: LandmarkWriter) -> tuple[AddCounts, bool]:
-                with frames_of(drive, settings) as (frames, ledgers):
+                with pictures_with(known, drive, car) as pictures:
                     counts = add_from_log(
-                        writer, describing, frames, known, every_m, sd_m, name, ledgers
+                        writer, describing, pictures, settings.every_m, settings.sd_m, name
                     )
-                return counts, all(ledger.is_whole for ledger in ledgers)
+                return counts, all(ledger.is_whole for ledger in pictures.ledgers)
 
             return _added(Path(database), describing, add)
     if log is None and poses is None and images is not None and coordinates is not None:
-        describing, folder = matcher_for(vehicle_given(vehicle), matcher), Path(images)
+        describing, folder = matcher_for(car, settings.matcher), Path(images)
         table, name = Path(coordinates), visible(source or folder.resolve().name)
         return _added(
             Path(database),

@@ -409,9 +409,7 @@ def _plants(site: _Site, fixed: Generator) -> None:
             if abs(y) > w + 3:
                 site.parts.append(
                     crown(
-                        x + float(fixed.uniform(-2, 2)),
-                        float(y),
-                        4.0,
+                        (x + float(fixed.uniform(-2, 2)), float(y), 4.0),
                         4.0,
                         4.0,
                         5,
@@ -432,7 +430,7 @@ def _overgrowth(site: _Site, fixed: Generator) -> None:
         site.parts.append(bush(float(x), y, 1.5, high, site.atlas, fixed))
         site.shadows.crowns.append((float(x), y, 1.4, 0.8))
     for x in (-11.5, -9.5, -7.5):
-        mesh = crown(x, -(w + 0.55), 2.75, 0.95, 0.7, 7, site.atlas, fixed)
+        mesh = crown((x, -(w + 0.55), 2.75), 0.95, 0.7, 7, site.atlas, fixed)
         site.parts.append(mesh)
     for x, y in ((-10.0, -(w + 2.2)), (-17.0, -(w + 2.4)), (-24.0, -(w + 2.2))):
         mesh, radius, high = tree(x, y, site.atlas, fixed)

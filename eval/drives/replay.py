@@ -124,8 +124,8 @@ def replay_with(
 ) -> Run:
     """Replay a drive, as ``replay_drive``."""
     from crosscue.eval.fit.first_pose import check_start, with_start
+    from crosscue.eval.pipeline.detect import Detecting
     from crosscue.eval.pipeline.landmarks import matcher_for, open_for
-    from crosscue.eval.pipeline.replay import Detecting
     from crosscue.eval.pipeline.replay import replay_drive as replay_into
 
     overwrite, resume = settings.overwrite, settings.resume

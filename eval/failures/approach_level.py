@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +82,7 @@ def from_finding(found: Finding, curve: Curve | None, about: About, threshold: f
     values = None if curve is None else curve.features.get(found.feature)
     if curve is None or values is None:
         # Without any belief the odds are even.
-        return _failure(about, kind, found.feature, (found.cause, found.reported), severity=1.0)
+        return _failure(about, kind, found.feature, (found.cause, found.reported), 1.0)
     if kind == "false":
         row = int(values.argmax())
         rows = np.flatnonzero(values > threshold)
@@ -98,9 +98,8 @@ def from_finding(found: Finding, curve: Curve | None, about: About, threshold: f
         kind,
         found.feature,
         (found.cause, found.reported),
-        severity=severity,
-        at=(int(curve.t_ns[row]), float(curve.distance_m[row])),
-        frames=len(rows),
+        severity,
+        _Span((int(curve.t_ns[row]), float(curve.distance_m[row])), frames=len(rows)),
     )
 
 
@@ -128,10 +127,12 @@ def flips(
                 "flipped",
                 name,
                 (AGAINST, f"{swing}; {counts} frames") if loud else (NOTHING, swing),
-                severity=bits(float(later.min())),
-                at=(int(curve.t_ns[row]), float(curve.distance_m[row])),
-                span_ns=(int(curve.t_ns[decided]), int(curve.t_ns[row])),
-                frames=row - decided + 1,
+                bits(float(later.min())),
+                _Span(
+                    (int(curve.t_ns[row]), float(curve.distance_m[row])),
+                    (int(curve.t_ns[decided]), int(curve.t_ns[row])),
+                    row - decided + 1,
+                ),
             )
 
 
@@ -165,19 +166,27 @@ def _against(
     return sorted(found, key=lambda pair: (-pair[1], pair[0]))
 
 
+class _Span(NamedTuple):
+    """Clearest moment and span of a failure; by default, the end and the whole of its approach."""
+
+    at: tuple[int, float] | None = None
+    span_ns: tuple[int, int] | None = None
+    frames: int = 0
+
+
+WHOLE: Final = _Span()
+
+
 def _failure(
     about: About,
     kind: Kind,
     what: str,
     why: tuple[str, str],
-    *,
     severity: float,
-    at: tuple[int, float] | None = None,
-    span_ns: tuple[int, int] | None = None,
-    frames: int = 0,
+    span: _Span = WHOLE,
 ) -> Failure:
-    t_ns, distance_m = (about.end_ns, math.nan) if at is None else at
-    start_ns, end_ns = (about.start_ns, about.end_ns) if span_ns is None else span_ns
+    t_ns, distance_m = span.at or (about.end_ns, math.nan)
+    start_ns, end_ns = span.span_ns or (about.start_ns, about.end_ns)
     return Failure(
         run=about.run,
         kind=kind,
@@ -189,7 +198,7 @@ def _failure(
         at_s=0.0,
         start_ns=start_ns,
         end_ns=end_ns,
-        frames=frames,
+        frames=span.frames,
         approach=about.approach,
         intersection=about.intersection,
         conditions=about.conditions,

@@ -52,12 +52,12 @@ def missed_and_false(
         # The nearest frame before the intersection, where detection should be easiest.
         ahead = rows[~(cue.distance_m[rows] < NEAR_M)]
         row = int(ahead[-1] if len(ahead) else rows[-1])
-        yield _failure("missed", cue.cue, why, cue, rows, row, about, run)
+        yield _failure("missed", why, cue, rows, row, about, run)
     for rows in _episodes(cue.t_ns, np.flatnonzero(is_wrong(cue)), cue.approach):
         sure = [_highest(detected.get(int(cue.t_ns[i]), ()), labels) for i in rows]
         row = int(rows[int(np.argmax(sure))])
         why = _why_false(cue, rows, others, max(sure))
-        yield _failure("false", cue.cue, why, cue, rows, row, about, run)
+        yield _failure("false", why, cue, rows, row, about, run)
 
 
 def failing_times(cues: Sequence[CueFrames]) -> NDArray[np.int64]:
@@ -158,7 +158,6 @@ def _highest(rows: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> float:
 
 def _failure(
     kind: Kind,
-    what: str,
     why: tuple[str, str],
     cue: CueFrames,
     rows: NDArray[np.intp],
@@ -172,7 +171,7 @@ def _failure(
         run=run,
         kind=kind,
         level="frames",
-        what=what,
+        what=cue.cue,
         cause=why[0],
         reported=why[1],
         t_ns=int(cue.t_ns[row]),

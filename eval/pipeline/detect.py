@@ -82,6 +82,25 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
+@dataclass(frozen=True, slots=True)
+class Detecting:
+    """Options of the detect stage.
+
+    Attributes:
+        choices: Detectors, in order.
+        cache: File with results of earlier runs, or None.
+        draw: Number of pictures to write with detections drawn.
+        resume: Keep detections of an earlier start that would be the same.
+        is_required: The user named the detectors, so a drive without a camera is an error.
+    """
+
+    choices: tuple[DetectorChoice, ...]
+    cache: Path | None = None
+    draw: int = 0
+    resume: bool = False
+    is_required: bool = False
+
+
 def choices_of(vehicle: Vehicle) -> dict[str, DetectorChoice]:
     """Return the detectors that the vehicle file defines, by name."""
     return {
@@ -109,7 +128,8 @@ def detect_drive(
     """
     with locked(run), staged(run) as new, nothing_left(new):
         clear(new, input_of(run, logs, vehicle, selection, choices, draw, None))
-        outcome = detect_into(logs, vehicle, new, selection, choices, cache, draw)
+        detecting = Detecting(tuple(choices), cache, draw)
+        outcome = detect_into(logs, vehicle, new, selection, detecting)
     return replace(outcome, run=run)
 
 
@@ -118,9 +138,7 @@ def detect_into(
     vehicle: Vehicle,
     run: RunFolder,
     selection: Selection,
-    choices: Sequence[DetectorChoice],
-    cache: Path | None = None,
-    draw: int = 0,
+    detecting: Detecting,
     timeline: Timeline | None = None,
 ) -> DetectOutcome:
     """Run detectors over the only camera of a drive, into a locked run folder.
@@ -130,9 +148,7 @@ def detect_into(
         vehicle: Settings of the vehicle file.
         run: The run folder.
         selection: The part of the logs to use.
-        choices: Detectors, in order.
-        cache: File with results of earlier runs, or None.
-        draw: Max number of pictures to write with detections drawn, spread over the drive.
+        detecting: Detectors, cache and pictures to write.
         timeline: The drive's time segments, if already known.
 
     Raises:
@@ -141,11 +157,12 @@ def detect_into(
         OutputError: The disk is full.
     """
     began = time.monotonic()
+    choices = detecting.choices
     camera = only_camera(logs, vehicle)
     named = [Named(choice.name, make(choice)) for choice in choices]
     uncounted = _uncounted(named, choices, vehicle)
     reading = _Reading(logs, camera, vehicle, selection, timeline)
-    with ResultCache(cache) as results:
+    with ResultCache(detecting.cache) as results:
         runner = Runner(
             named,
             results,
@@ -161,7 +178,7 @@ def detect_into(
             reading.topic.name,
             vehicle,
             named,
-            Drawer(run.file("pictures"), draw),
+            Drawer(run.file("pictures"), detecting.draw),
             CuePass(vehicle),
             [choice.kind == "signs" for choice in choices],
             reading.timeline,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -73,16 +73,30 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
+@dataclass(frozen=True, slots=True)
+class Earlier:
+    """What earlier stages found.
+
+    Attributes:
+        detected: Outcome of the detect stage, if it ran just now.
+        manifest: Manifest of the detect stage, if it ran earlier.
+        logs: ``log_rows`` of the run, if already computed.
+        timeline: The drive's time segments, if already known.
+    """
+
+    detected: DetectOutcome | None = None
+    manifest: DetectManifest | None = None
+    logs: Sequence[LogRow] | None = None
+    timeline: Timeline | None = None
+
+
 def estimate_into(
     logs: Sequence[Log],
     vehicle: Vehicle,
     run: RunFolder,
     selection: Selection,
+    before: Earlier,
     landmarks: LandmarkDatabase | None = None,
-    detected: DetectOutcome | None = None,
-    earlier: DetectManifest | None = None,
-    reported: Sequence[LogRow] | None = None,
-    timeline: Timeline | None = None,
 ) -> Outcome:
     """Write pose, cues, ranges, beliefs and the manifest into a locked run folder.
 
@@ -91,11 +105,8 @@ def estimate_into(
         vehicle: Settings of the vehicle file.
         run: The run folder, with or without tables of the detect stage.
         selection: The part of the logs to use.
+        before: What earlier stages found.
         landmarks: Database with which camera frames are compared, or None.
-        detected: Outcome of the detect stage, if it ran just now.
-        earlier: Manifest of the detect stage, if it ran earlier.
-        reported: ``log_rows(logs, run)``, if already computed.
-        timeline: The drive's time segments, if already known.
 
     Raises:
         VehicleError: The vehicle file does not fit the logs.
@@ -104,9 +115,10 @@ def estimate_into(
         OutputError: The disk is full.
     """
     began = time.monotonic()
-    found = earlier if detected is None else run.drive_manifest().detected
+    detected = before.detected
+    found = before.manifest if detected is None else run.drive_manifest().detected
     kept = None if found is None else _camera_skips(run, found.camera)
-    reading = _Reading(logs, vehicle, selection, landmarks, timeline, found)
+    reading = _Reading(logs, vehicle, selection, landmarks, before.timeline, found)
     if found is not None:
         refuse_other_segments(run, reading.timeline)
     stage = _pose_stage(reading)
@@ -121,7 +133,7 @@ def estimate_into(
     results = _Results(stage, tally, scene, made, _notices(reading, stage, silent))
     detect_s = 0.0 if detected is None else detected.seconds
     seconds = time.monotonic() - began + detect_s
-    rows = _hashed(logs, run, found) if reported is None else tuple(reported)
+    rows = _hashed(logs, run, found) if before.logs is None else tuple(before.logs)
     detecting = None if found is None else run.timings()
     detect = None if detecting is None else detecting.detect
     write_timings(run, Timings(seconds=seconds, detect=detect))

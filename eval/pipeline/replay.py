@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from crosscue.detectors.base import DetectorChoice
 from crosscue.detectors.registry import make
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, clear, locked, staged, write_input
@@ -35,32 +34,13 @@ from crosscue.replay.signals.plan import chosen_camera
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .detect import detect_into, only_camera
+from .detect import Detecting, detect_into, only_camera
 from .drive_time import drive_timeline
 from .empty_result import nothing_left
-from .estimate import begin_again, estimate_into
+from .estimate import Earlier, begin_again, estimate_into
 
 # Tables of the first stage that the second stage reads.
 TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
-
-
-@dataclass(frozen=True, slots=True)
-class Detecting:
-    """Options of the detect stage.
-
-    Attributes:
-        choices: Detectors, in order.
-        cache: File with results of earlier runs, or None.
-        draw: Number of pictures to write with detections drawn.
-        resume: Keep detections of an earlier start that would be the same.
-        is_required: The user named the detectors, so a drive without a camera is an error.
-    """
-
-    choices: tuple[DetectorChoice, ...]
-    cache: Path | None = None
-    draw: int = 0
-    resume: bool = False
-    is_required: bool = False
 
 
 NO_DETECTORS: Final = Detecting(())
@@ -116,9 +96,8 @@ def replay_drive(
                 found = _detect(logs, vehicle, new, selection, detecting, timeline)
             else:
                 found = None
-            outcome = estimate_into(
-                logs, vehicle, new, selection, landmarks, found, earlier, timeline=timeline
-            )
+            before = Earlier(found, earlier, timeline=timeline)
+            outcome = estimate_into(logs, vehicle, new, selection, before, landmarks)
         detected = None if outcome.detected is None else replace(outcome.detected, run=run)
         return replace(outcome, run=run, detected=detected)
 
@@ -154,16 +133,7 @@ def _detect(
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
     if not detecting.choices or chosen_camera(topics, vehicle) is None:
         return None
-    return detect_into(
-        logs,
-        vehicle,
-        run,
-        selection,
-        detecting.choices,
-        detecting.cache,
-        detecting.draw,
-        timeline,
-    )
+    return detect_into(logs, vehicle, run, selection, detecting, timeline)
 
 
 def _kept(
@@ -241,8 +211,7 @@ def estimate_run(
             settings,
             new,
             manifest.selection.selection,
-            earlier=manifest.detected,
-            reported=manifest.logs,
+            Earlier(manifest=manifest.detected, logs=manifest.logs),
         )
     return replace(outcome, run=run)
 

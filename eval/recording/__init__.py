@@ -66,13 +66,13 @@ def save_rrd(
 
     if not part.is_whole:
         run = run_between(run, part.start_ns, part.end_ns)
-    truth, true_ranges = _within(part, truth, true_ranges)
+    known = _within(part, truth, true_ranges)
     pose = _pose(run)
     scene = scene_rows(run)
     camera = run_camera(run) if part.shows("cameras") else None
     has_scene = any(part is not None for part in (scene.cues, scene.ranges, scene.belief))
     topic = None if camera is None else camera.topic.name
-    shown = ViewData(topic, pose, truth is not None, has_scene, longest_m(scene), part)
+    shown = ViewData(topic, pose, known[0] is not None, has_scene, longest_m(scene), part)
     layout = blueprint(shown)
     first_ns = int(scene.frames_ns[0]) if len(scene.frames_ns) else 0
     time = time_of(first_ns if pose is None else int(pose["t_ns"][0]))
@@ -82,7 +82,7 @@ def save_rrd(
         # By its number, because rerun takes no name that is not UTF-8.
         with os.fdopen(door.opened(partial, os.O_WRONLY), "wb") as file:
             recording.save(f"/dev/fd/{file.fileno()}", default_blueprint=layout)
-            _log_all(recording, time, run, pose, truth, true_ranges, camera, part)
+            _log_all(recording, time, run, pose, known, camera, part)
             recording.flush()
             recording.disconnect()
 
@@ -94,8 +94,7 @@ def _log_all(
     time: DriveTime,
     run: RunFolder,
     pose: Mapping[str, Floats] | None,
-    truth: TruthTrack | None,
-    true_ranges: TrueRanges | None,
+    known: tuple[TruthTrack | None, TrueRanges | None],
     stored: StoredCamera | None,
     part: RecordingSpan,
 ) -> None:
@@ -103,6 +102,7 @@ def _log_all(
     from .notes import notes
     from .scene_rows import scene_rows
 
+    truth, true_ranges = known
     manifest = run.drive_manifest()
     vehicle = manifest.settings
     scene = scene_rows(run)

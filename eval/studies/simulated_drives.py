@@ -24,9 +24,9 @@ from crosscue.datasets.scenes.drive import (
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.detectors.registry import EMBEDDED, chosen
 from crosscue.eval.batch.jobs import Engine, Job, JobOutcome, fingerprint_of, run_many
-from crosscue.eval.pipeline.detect import choices_of
+from crosscue.eval.pipeline.detect import Detecting, choices_of
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.pipeline.replay import Detecting, replay_drive
+from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import create
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.files import door

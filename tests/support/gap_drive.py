@@ -19,9 +19,9 @@ from crosscue.datasets.simulated.drive import dbc_path
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.detectors.base import Detections, Found, Frame, View, nothing_found
-from crosscue.eval.pipeline.detect import choices_of
+from crosscue.eval.pipeline.detect import Detecting, choices_of
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.pipeline.replay import Detecting, replay_drive
+from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.can.database import CanDatabase

@@ -113,7 +113,7 @@ def tree(x: float, y: float, atlas: Atlas, rng: Generator) -> tuple[Mesh, float,
     middle = float(rng.uniform(4.2, 5.6))
     trunk = tube((x, y, 0.0), (x + rng.normal(0, 0.15), y, middle), 0.16, WOOD)
     return (
-        merge_meshes([trunk, crown(x, y, middle, radius, radius * 0.95, 12, atlas, rng)]),
+        merge_meshes([trunk, crown((x, y, middle), radius, radius * 0.95, 12, atlas, rng)]),
         radius,
         middle,
     )
@@ -121,13 +121,11 @@ def tree(x: float, y: float, atlas: Atlas, rng: Generator) -> tuple[Mesh, float,
 
 def bush(x: float, y: float, radius: float, high: float, atlas: Atlas, rng: Generator) -> Mesh:
     """Return a bush on the ground."""
-    return crown(x, y, high / 2, radius, high / 2, 8, atlas, rng)
+    return crown((x, y, high / 2), radius, high / 2, 8, atlas, rng)
 
 
 def crown(
-    x: float,
-    y: float,
-    z: float,
+    at: tuple[float, float, float],
     radius: float,
     half_high: float,
     count: int,
@@ -139,7 +137,7 @@ def crown(
     for _ in range(count):
         spot = rng.normal(0.0, 1.0, 3)
         spot *= rng.uniform(0.15, 0.8) / np.linalg.norm(spot)
-        centre = np.array([x, y, z]) + spot * np.array([radius, radius, half_high])
+        centre = np.array(at) + spot * np.array([radius, radius, half_high])
         size = radius * float(rng.uniform(0.55, 0.85))
         turn = float(rng.uniform(0, np.pi))
         lean = float(rng.normal(0, 0.35))

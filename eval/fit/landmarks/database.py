@@ -142,13 +142,26 @@ def camera_frames(
             yield LogPicture(t_ns, topic.name, copy_picture(pictures, row))
 
 
+class PosedPictures(NamedTuple):
+    """The camera's pictures of a drive with known poses.
+
+    Attributes:
+        frames: Pictures in order of time.
+        poses: Poses of the same drive.
+        ledgers: Ledgers of all logs; pictures that do not decode are dropped in the camera's.
+    """
+
+    frames: Iterator[LogPicture]
+    poses: CameraPoses
+    ledgers: Sequence[Ledger]
+
+
 @contextmanager
-def frames_of(
-    drive: Drive, vehicle: Vehicle
-) -> Iterator[tuple[Iterator[LogPicture], list[Ledger]]]:
+def pictures_with(poses: CameraPoses, drive: Drive, vehicle: Vehicle) -> Iterator[PosedPictures]:
     """Yield the camera's pictures; warn about missing ones at the end."""
     ledgers = [Ledger(str(log.path)) for log in drive.logs]
-    yield camera_frames(drive.logs, vehicle, drive.selection, ledgers), ledgers
+    frames = camera_frames(drive.logs, vehicle, drive.selection, ledgers)
+    yield PosedPictures(frames, poses, ledgers)
     for ledger in ledgers:
         warn_of(ledger)
 
@@ -162,12 +175,10 @@ def drop_picture(ledgers: Sequence[Ledger], frame: LogPicture, error: LogError) 
 def add_from_log(
     writer: LandmarkWriter,
     matcher: Matcher,
-    frames: Iterator[LogPicture],
-    poses: CameraPoses,
+    pictures: PosedPictures,
     every_m: float,
     sd_m: float,
     source: str,
-    ledgers: Sequence[Ledger],
 ) -> AddCounts:
     """Add a landmark every ``every_m`` along the path.
 
@@ -177,19 +188,17 @@ def add_from_log(
     Args:
         writer: Writer of the database.
         matcher: Matcher that computes the features.
-        frames: Frames in order of time.
-        poses: Poses of the same drive.
+        pictures: Pictures of a drive with its poses.
         every_m: Straight distance between two landmarks.
         sd_m: S.d. of the vehicle's distance from the landmark at the best match; added to the
             covariance of the poses.
         source: Name of the drive; landmarks are named ``source/time``.
-        ledgers: Ledgers of all logs; pictures that do not decode are dropped in the camera's.
     """
     counts = AddCounts()
     last: Floats | None = None
-    for frame in frames:
+    for frame in pictures.frames:
         counts.pictures += 1
-        place = place_at(frame.t_ns, poses, sd_m, source)
+        place = place_at(frame.t_ns, pictures.poses, sd_m, source)
         if place is None:
             counts.without_pose += 1
             continue
@@ -200,7 +209,7 @@ def add_from_log(
             features = matcher.describe(grey_of(frame.picture))
         except LogError as error:
             counts.undecodable += 1
-            drop_picture(ledgers, frame, error)
+            drop_picture(pictures.ledgers, frame, error)
             continue
         if len(features) < MIN_POINTS:
             counts.blank += 1

@@ -8,7 +8,7 @@ from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from crosscue.eval.fit.landmarks.database import frames_of, metres, read_poses
+from crosscue.eval.fit.landmarks.database import metres, pictures_with, read_poses
 from crosscue.eval.fit.landmarks.pairs import landmark_pairs, pairs_of_drive, with_min_score
 from crosscue.eval.fit.vehicle_output import check_output, write_fit
 from crosscue.eval.logs.log import DriveIfGiven, opened
@@ -156,18 +156,16 @@ def fit_landmarks(log: DriveIfGiven, settings: LandmarkFitSettings) -> FittedLan
         with (
             open_for(Path(database), comparing) as marks,
             opened(log) as drive,
-            frames_of(drive, car) as (frames, ledgers),
+            pictures_with(known, drive, car) as pictures,
         ):
             scored = pairs_of_drive(
-                frames,
-                known,
+                pictures,
                 marks,
                 comparing,
                 settings.every_m,
                 settings.same_within_m,
                 settings.different_beyond_m,
                 settings.max_landmarks,
-                ledgers,
             )
     else:
         raise UsageError("pairs: expected labelled pairs, or else a log with database and poses")

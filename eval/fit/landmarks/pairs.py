@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Final
@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import tomlkit
 
-from crosscue.eval.fit.landmarks.database import CameraPoses, LogPicture, drop_picture, place_at
+from crosscue.eval.fit.landmarks.database import PosedPictures, drop_picture, place_at
 from crosscue.localization.angles import wrap
 from crosscue.localization.landmarks.database import LandmarkDatabase, Nearby
 from crosscue.localization.landmarks.features import Keypoints, Matcher
@@ -22,7 +22,6 @@ from crosscue.localization.landmarks.images import grey_of, read_encoded
 from crosscue.replay.errors import AnnotationError, LogError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import toml_document
-from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import MIB
 
 MAX_PAIRS: Final = 1_000_000
@@ -80,21 +79,18 @@ def _labelled(path: Path) -> Iterator[tuple[str, str, bool]]:
 
 
 def pairs_of_drive(
-    frames: Iterator[LogPicture],
-    poses: CameraPoses,
+    pictures: PosedPictures,
     database: LandmarkDatabase,
     matcher: Matcher,
     every_m: float,
     near_m: float,
     far_m: float,
     max_per_frame: int,
-    ledgers: Sequence[Ledger],
 ) -> ScoredPairs:
     """Score frames with known poses against landmarks; near ones are the same place, far ones not.
 
     Args:
-        frames: Frames of another drive than the landmarks' drive, else the rates are too good.
-        poses: Poses of that drive.
+        pictures: Pictures of another drive than the landmarks', else the rates are too good.
         database: The landmarks.
         matcher: Matcher that computes the scores.
         every_m: Distance between the frames used.
@@ -102,21 +98,20 @@ def pairs_of_drive(
         far_m: Min distance of different places; pairs in between are not used.
         max_per_frame: Max number of landmarks compared with one frame: all near ones first, then
             far ones drawn with a fixed seed.
-        ledgers: Ledgers of all logs; pictures that do not decode are dropped in the camera's.
     """
     marks = list(database)
     rng = np.random.default_rng(0)
     rows: list[tuple[float, bool, int]] = []
     last = None
-    for number, frame in enumerate(frames):
-        place = place_at(frame.t_ns, poses, 1.0, "frame")
+    for number, frame in enumerate(pictures.frames):
+        place = place_at(frame.t_ns, pictures.poses, 1.0, "frame")
         if place is None or (last is not None and math.dist(place.xy_m, last) < every_m):
             continue
         last = place.xy_m
         try:
             seen = matcher.describe(grey_of(frame.picture))
         except LogError as error:
-            drop_picture(ledgers, frame, error)
+            drop_picture(pictures.ledgers, frame, error)
             continue
         apart = [math.dist(mark.place.xy_m, place.xy_m) for mark in marks]
         same = [

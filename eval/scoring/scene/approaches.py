@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -215,14 +215,13 @@ def judge_approaches(
     )
     spans = run_spans(kept)
     pairs = associate(truth.truth.approaches, spans)
+    criteria = _Criteria(threshold, RULES[definition], not_looked_for)
     results, curves = [], []
     for one in truth.truth.approaches:
         mine = _steps_of(kept, pairs.get(one.id), one)
         others = [n for n in spans if n not in pairs.values() and overlap_ns(one, spans[n]) > 0]
-        number, rule = pairs.get(one.id), RULES[definition]
-        result = _result(
-            one, mine, number, len(others), tables, truth, threshold, rule, not_looked_for
-        )
+        number = pairs.get(one.id)
+        result = _result(one, mine, number, len(others), tables, truth, criteria)
         results.append(result)
         if len(mine.t_ns):
             curves.append(_curve(one, mine, truth))
@@ -275,6 +274,14 @@ def _steps_of(belief: BeliefRows, number: int | None, approach: Approach) -> Bel
     )
 
 
+class _Criteria(NamedTuple):
+    """What counts as a detection, and what could not be one."""
+
+    threshold: float
+    rule: Rule
+    not_looked_for: Collection[str]
+
+
 def _result(
     one: Approach,
     steps: BeliefRows,
@@ -282,10 +289,9 @@ def _result(
     splits: int,
     tables: RunTables,
     truth: DriveTruth,
-    threshold: float,
-    rule: Rule,
-    not_looked_for: Collection[str],
+    criteria: _Criteria,
 ) -> ApproachResult:
+    threshold, rule, not_looked_for = criteria
     present = tuple(name for name in FEATURES if has_feature(one, name))
     absent = tuple(name for name in FEATURES if has_feature(one, name) is False)
     above = {name: values > threshold for name, values in steps.features.items()}

@@ -121,10 +121,11 @@ def chain_of(
     else:
         first = 0
     rest = len(stream)
+    candidates = _Candidates(at, end, is_sound, links, keep)
     for k in np.flatnonzero(~links[first:]) + first:
         if not keep[k]:
             continue
-        rest = _repair(int(k), at, end, is_sound, links, keep, len(stream), is_end)
+        rest = _repair(int(k), candidates, len(stream), is_end)
         if rest < 0:
             tally.damage("object of wrong size", f"{place}, offset {at[k]}")
             rest = len(stream)
@@ -138,22 +139,24 @@ def chain_of(
     return Chain(at[is_whole], rest)
 
 
-def _repair(
-    k: int,
-    at: Int64s,
-    end: Int64s,
-    is_sound: NDArray[np.bool_],
-    links: NDArray[np.bool_],
-    keep: NDArray[np.bool_],
-    length: int,
-    is_end: bool,
-) -> int:
+class _Candidates(NamedTuple):
+    """Possible objects of a stream: where they start and end, and what is known of them."""
+
+    at: Int64s
+    end: Int64s
+    is_sound: NDArray[np.bool_]
+    links: NDArray[np.bool_]
+    keep: NDArray[np.bool_]
+
+
+def _repair(k: int, candidates: _Candidates, length: int, is_end: bool) -> int:
     """Examine object ``k``, whose end is not followed by the next signature.
 
     Returns:
         The stream's length if the chain continues, the start of object ``k`` if it needs more
         bytes, or -1 if it is damaged.
     """
+    at, end, is_sound, links, keep = candidates
     if is_sound[k] and end[k] <= length:
         following = int(np.searchsorted(at, end[k]))
         near = at[following] if following < len(at) else length

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from crosscue.eval import cli
-from crosscue.eval.pipeline.detect import choices_of
+from crosscue.eval.pipeline.detect import Detecting, choices_of
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.pipeline.replay import Detecting, replay_drive
+from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.localization.landmarks.database import (
     LandmarkDatabase,
