@@ -5,12 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import crosscue
+from crosscue.detectors.base import Frame, View
+from crosscue.detectors.box_detector import BoxDetector, ScoredBox
 from crosscue.eval import cli
 from support.onnx_models import constant_model
 from support.pictures import picture_folder
@@ -32,6 +35,16 @@ BAD = {
     "other-camera": "outside the images of 24 x 16 pixels",
     "not-counted": "net: no cue counts any of its 2 labels (cat, dog); state what its classes mean",
 }
+
+
+class Everything(BoxDetector):
+    """A detector with a custom label whose box covers the whole picture; named as text below."""
+
+    name, labels, view = "everything", ("whatever",), View(is_grey=True)
+
+    def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
+        """Yield one box."""
+        yield "whatever", 1.0, (0, 0, frame.pixels.shape[1], frame.pixels.shape[0])
 
 
 def card(folder: Path, model: bytes, classes: list[str], width_px: int = 64) -> str:
