@@ -95,7 +95,8 @@ def spread(network: Any, run: Callable[[], object], *, is_last: bool = True) -> 
     done: set[int] = set()
 
     def hook(layer: Any, _: object, output: Any) -> Any:
-        is_other = is_last and layer.bias is None
+        # Distances to the sides of a box (YOLO26) are positive only as untrained or trained.
+        is_other = (is_last and layer.bias is None) or layer.weight.shape[0] == 4
         if id(layer) in done or is_other or not layer.weight.requires_grad:
             return output
         done.add(id(layer))

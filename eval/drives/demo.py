@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from importlib import util
 from pathlib import Path
 from typing import Annotated, ClassVar, Final, Literal
 
@@ -22,7 +23,6 @@ from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
 
 REAL: Final = "pandaset_002"
-MODEL: Final = "yolox-nano"
 FOLLOWED: Final = """
 # Cars are tracked on the road over several frames. The published method uses pairs of frames.
 [cars]
@@ -56,6 +56,8 @@ class DemoSettings:
     Attributes:
         output: Folder for drive, run and report (default: demo, or demo-real).
         real: Replay a real drive, downloaded once, instead of simulating one.
+        road: Also find the road of the real drive, with road-segmentation-adas-0001 (Apache-2.0,
+            0.7 MB, needs openvino), for as much CPU time again as yolox-nano takes.
         source: Folder with the real drive and the weights, to use instead of downloading them.
         layout: Layout of the intersection (default: C).
         run: Run of the layout, from 1 (default: 1).
@@ -66,6 +68,7 @@ class DemoSettings:
 
     output: Path | str | None = None
     real: bool = False
+    road: bool = False
     source: Annotated[Path | str | None, Option("--data", metavar="FOLDER")] = None
     layout: Literal["A", "B", "C", "D", "E", "F", "G", "H"] | None = None
     run: Annotated[int | None, Option(metavar="N")] = None
@@ -81,6 +84,8 @@ class DemoSettings:
         """
         if not self.real and self.source is not None:
             raise UsageError("source: applies only to a real drive; add real=True")
+        if not self.real and self.road:
+            raise UsageError("road: applies only to a real drive; add real=True")
         for name in ("layout", "run", "seed", "width_px") if self.real else ():
             if getattr(self, name) is not None:
                 raise UsageError(f"{name}: applies only to a simulated drive; omit it or real=True")
@@ -134,7 +139,7 @@ class Demo(Result):
             yield f"pictures   {self.drive.attribution}"
 
 
-def fetch_drive(source: Path | str | None = None) -> KnownDrive:
+def fetch_drive(source: Path | str | None = None, *, with_road: bool = False) -> KnownDrive:
     """Download PandaSet's sequence 002 and the network yolox-nano once, and verify them.
 
     Recording and weights are kept in the user's cache. They are copied from ``source`` or from
@@ -142,31 +147,40 @@ def fetch_drive(source: Path | str | None = None) -> KnownDrive:
 
     Args:
         source: Folder with the recording and the weights, to be used without a network.
+        with_road: Also fetch the catalog's road network, for the drive's detectors.
 
     Raises:
         CrosscueError: A file cannot be obtained; the message lists all required files.
-        UsageError: ``source`` has no recording, or another one.
+        UsageError: ``source`` has no recording, or another one; or openvino is missing, which the
+            road network needs.
     """
     from crosscue.datasets.real import recordings
     from crosscue.detectors.catalog.entries import entry
     from crosscue.detectors.catalog.fetch import fetch_weights
+    from crosscue.detectors.catalog.known_models import OBJECTS, ROAD, model
 
     def show(file: str, done: int, of: int) -> None:
         emit(Progress(file, done / 1e6, of / 1e6, "MB"))
 
-    known, card = recordings.recording(REAL), entry(MODEL)
+    if with_road and util.find_spec("openvino") is None:
+        raise UsageError("road: needs the package openvino: pip install openvino")
+    known, names = recordings.recording(REAL), (OBJECTS, *((ROAD,) if with_road else ()))
     given = None if source is None else Path(source)
     try:
         log = recordings.fetch_recording(known, given, show)
-        fetch_weights(MODEL, None if given is None else _below(given, card.weights), show)
+        for name in names:
+            weights = None if given is None else _below(given, entry(name).weights)
+            # The road network has two files.
+            is_folder = weights is not None and len(entry(name).files) > 1
+            fetch_weights(name, weights.parent if weights and is_folder else weights, show)
     except UsageError:
         raise
     except CrosscueError as error:
-        size = sum(file.size_bytes for file in card.files) / 1e6
-        raise type(error)(
-            f"needed: {known.needs()}; model {MODEL}: {size:.1f} MB, {card.licence}; {error}"
-        ) from None
-    return KnownDrive(log, known.vehicle, known.truth, known.attribution)
+        models = [model(name) for name in names]
+        needs = [f"model {one.name}: {one.size_mb:.1f} MB, {one.card.licence}" for one in models]
+        raise type(error)(f"needed: {'; '.join([known.needs(), *needs])}; {error}") from None
+    detectors = names if with_road else None
+    return KnownDrive(log, known.vehicle, known.truth, known.attribution, detectors)
 
 
 @keywords(DemoSettings, 0)
@@ -181,7 +195,7 @@ def demo(settings: DemoSettings) -> Demo:
 
     Examples:
         crosscue demo -o demo
-        crosscue demo --real
+        crosscue demo --real --road
         crosscue demo --real --data FOLDER       on a machine without network
 
     Args:
@@ -193,7 +207,11 @@ def demo(settings: DemoSettings) -> Demo:
         RunError: The folder has other contents.
     """
     folder = Path(settings.output or ("demo-real" if settings.real else "demo"))
-    drive = fetch_drive(settings.source) if settings.real else _simulated(folder, settings)
+    drive = (
+        fetch_drive(settings.source, with_road=settings.road)
+        if settings.real
+        else _simulated(folder, settings)
+    )
     run = replay_drive(
         drive.log,
         folder / "run",

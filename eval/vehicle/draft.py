@@ -8,6 +8,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Annotated
 
+from crosscue.detectors.catalog.known_models import road_sections
 from crosscue.eval.logs.log import WholeDriveGiven, opened
 from crosscue.eval.vehicle.mounting import estimate_mounting
 from crosscue.replay.can.database import CanDatabase
@@ -59,6 +60,8 @@ class DraftSettings:
         camera_pitch_deg: Angle of its axis below the horizon (default: estimated from pictures of a
             straight road).
         camera_yaw_deg: Angle of its axis to the left (default: estimated, too).
+        road: Also set up the catalog's networks for objects and road, yolox-nano and
+            road-segmentation-adas-0001 (both Apache-2.0); the file states their cost.
         overwrite: Replace an existing file.
     """
 
@@ -70,6 +73,7 @@ class DraftSettings:
     camera_height_m: float | None = None
     camera_pitch_deg: float | None = None
     camera_yaw_deg: float | None = None
+    road: bool = False
     overwrite: bool = False
 
     @property
@@ -130,6 +134,8 @@ def draft_vehicle(log: WholeDriveGiven, settings: DraftSettings) -> VehicleDraft
     with opened(log) as drive:
         examined = examine(drive.logs, files)
         text = draft_text(examined, folder, _mounting(examined, given))
+    if settings.road:
+        text = f"{text.rstrip()}\n\n{road_sections()}"
     parse(text, "the draft")
     if path is not None:
         write_text(path, text)
