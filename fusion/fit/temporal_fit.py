@@ -161,7 +161,7 @@ def filtered(drive: AnnotatedDrive, model: TemporalModel) -> NDArray[np.float64]
     """Probabilities after each frame, shape (N, features)."""
     belief = TemporalFilter(model)
     out = []
-    for i, counts in enumerate(_frames(drive)):
+    for i, counts in enumerate(frames_of(drive)):
         belief.update(
             counts,
             drive.ranges[i],
@@ -173,7 +173,8 @@ def filtered(drive: AnnotatedDrive, model: TemporalModel) -> NDArray[np.float64]
     return np.array(out).reshape(len(drive.start_m), len(model.has_feature))
 
 
-def _frames(drive: AnnotatedDrive) -> Iterator[dict[str, int]]:
+def frames_of(drive: AnnotatedDrive) -> Iterator[dict[str, int]]:
+    """Yield the counts of the evaluated cues of each frame."""
     columns = {name: column.tolist() for name, column in drive.counts.items()}
     for i in range(len(drive.start_m)):
         yield {name: column[i] for name, column in columns.items() if column[i] != NOT_EVALUATED}

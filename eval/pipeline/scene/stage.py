@@ -265,7 +265,7 @@ class _Scene:
 
         Only beliefs that depend on successive frames need this.
         """
-        if self.vehicle.fusion.kind not in ("persistent", "temporal"):
+        if self.vehicle.fusion.kind not in ("persistent", "temporal", "combined"):
             return True
         before, self._before = self._before, seen
         return before is None or not is_repeated(before.boxes, seen.boxes)

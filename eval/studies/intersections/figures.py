@@ -97,7 +97,7 @@ def draw_beliefs(curves: Sequence[Curve], path: Path) -> None:
     figure.legend(loc="outside upper center", ncols=len(COLOURS), fontsize=8)
     figure.supxlabel("true distance to the intersection, m (simulated)", fontsize=8)
     figure.supylabel("probability", fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def draw_study_reliability(
@@ -128,7 +128,7 @@ def draw_study_reliability(
         axes.tick_params(labelsize=7)
     grid[0, 0].set_ylabel("observed fraction", fontsize=8)
     grid[0, 0].legend(fontsize=7)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _write(path: Path, size: tuple[float, float], draw: object) -> None:
@@ -137,10 +137,11 @@ def _write(path: Path, size: tuple[float, float], draw: object) -> None:
     figure = Figure(figsize=size, layout="constrained")
     assert callable(draw)
     draw(figure.subplots())
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG."""
     # Without time and version in the file, the same study yields the same bytes.
     write_whole(
         path,

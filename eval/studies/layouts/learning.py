@@ -15,6 +15,7 @@ from crosscue.eval.fit.annotated_runs import (
     annotated_drives,
     graph_of_runs,
 )
+from crosscue.fusion.fit.combined_fit import fit_combined
 from crosscue.fusion.fit.message_fit import fit_messages
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit, fit_temporal
 
@@ -67,7 +68,9 @@ def fit_beliefs(drives: Sequence[LayoutDrive], lessons: Lessons) -> FoldFits:
     calibrated = fit_messages(
         [part for one in drives for part in lessons.approaches[one.name]], graph
     ).calibrated
-    fitted = fit_temporal([part for one in drives for part in lessons.drives[one.name]], graph)
+    parts = [part for one in drives for part in lessons.drives[one.name]]
+    fitted = fit_temporal(parts, graph)
+    combined = fit_combined(parts, graph, fitted)
     by_layout = {one.layout: one.features for one in drives}
     rates = {
         name: float(np.mean([known[name] for known in by_layout.values() if name in known]))
@@ -84,5 +87,6 @@ def fit_beliefs(drives: Sequence[LayoutDrive], lessons: Lessons) -> FoldFits:
         "calibrated": learned,
         "calibrated, base rates": {**learned, "features": priors},
         "temporal": {"kind": "temporal", "temporal": fitted.temporal},
+        "combined": {"kind": "combined", "temporal": fitted.temporal, "combined": combined},
     }
     return FoldFits(fusions, rates, fitted)

@@ -14,11 +14,13 @@ from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.versions import versions
 
+from .figure import draw_trade_off
 from .score import LayoutDifference, LayoutScore
 from .score import LayoutScores as LayoutScores
 from .settings import LayoutStudy, Perception
 
 PAGE: Final = "study.html"
+FIGURE: Final = "trade_off.png"
 TABLES: Final = "study.json"
 TITLE: Final = "Random layouts, simulated: fitted on some, tested on the others"
 NOTES: Final[dict[Perception, str]] = {
@@ -61,8 +63,13 @@ def write_layout_study(
     }
     write_text(out / TABLES, strict_json(tree) + "\n")
     counts = f"{scores.drives} drives over {scores.layouts} layouts in {settings.folds} folds."
+    draw_trade_off(scores.kinds, out / FIGURE)
     write_study_page(
-        out / PAGE, TITLE, [NOTES[settings.perception], counts], study_tables(scores), []
+        out / PAGE,
+        TITLE,
+        [NOTES[settings.perception], counts],
+        study_tables(scores),
+        [out / FIGURE],
     )
     return LayoutFiles(out / PAGE, out / TABLES)
 
@@ -74,6 +81,14 @@ def study_tables(scores: LayoutScores) -> list[PageTable]:
             "Beliefs",
             ("belief", "Brier", "log score", "false a drive", "full", "full, m"),
             tuple(_score_row(kind, one) for kind, one in scores.kinds.items()),
+        ),
+        PageTable(
+            "Fully detected, by false features a drive; each belief with its own threshold",
+            ("belief", *(f"{one.wanted:g}" for one in next(iter(scores.kinds.values())).trade)),
+            tuple(
+                (kind, *(f"{text(p.full, 2)} at {p.threshold:.4g}" for p in one.trade))
+                for kind, one in scores.kinds.items()
+            ),
         ),
         PageTable(
             "Brier score by feature",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from crosscue.eval.scoring.intervals import Mean, fraction, mean
 from crosscue.eval.scoring.scene.belief import brier, log_score
 from crosscue.eval.scoring.scene.detection import CONFIRM_FRAMES, held
+from crosscue.eval.scoring.scene.trade import Reached, TradePoint, reached, trade_off
 from crosscue.eval.scoring.truth import FEATURES as FEATURES
 from crosscue.replay.columns import Floats, Int64s
 
@@ -59,6 +60,7 @@ class LayoutScore:
         full_before_detected: Fraction of pictures in which a direction is above 0.9 but the
             intersection is not.
         silent: Fraction of pictures outside approaches.
+        trade: Full detection at rates of false features, each with its own threshold.
     """
 
     brier: Mean
@@ -69,6 +71,7 @@ class LayoutScore:
     full_m: Mean
     full_before_detected: Mean
     silent: Mean
+    trade: tuple[TradePoint, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,6 +127,7 @@ def score_layouts(beliefs: Sequence[DriveBelief]) -> LayoutScore:
         full_m=mean(found_m, at),
         full_before_detected=_of_pictures(beliefs, _ways_first),
         silent=_of_pictures(beliefs, lambda one: one.is_silent),
+        trade=trade_off([_reached(one) for one in beliefs], drives),
     )
 
 
@@ -202,6 +206,16 @@ def _full_m(one: DriveBelief) -> float | None:
             is_full &= (above | one.established) if name == "intersection" else above
     places = np.flatnonzero(held(is_full & np.isfinite(one.start_m), CONFIRM_FRAMES))
     return float(one.start_m[places[0]]) if len(places) else None
+
+
+def _reached(one: DriveBelief) -> Reached:
+    """Return the thresholds below which the drive's features are detected."""
+    said = ~one.is_silent
+    columns = dict(zip(FEATURES, one.probabilities[said].T, strict=True))
+    is_there = one.features["intersection"]
+    present = [name for name in FEATURES if is_there and one.features.get(name)]
+    absent = [name for name in FEATURES if one.features.get(name) is False]
+    return reached(columns, present, absent, one.established[said])
 
 
 def _ways_first(one: DriveBelief) -> Flags:

@@ -64,3 +64,23 @@ def test_command_writes_a_section_for_the_vehicle_file(
     learned = parse(text, "car.toml").fusion.temporal
     assert learned is not None
     assert learned.model_dump(mode="json") == reported["temporal"]
+
+
+def test_combined_belief_and_threshold_for_a_rate_are_fitted_on_request(
+    drives: Drives, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs, truths = drives
+    section = tmp_path / "combined.toml"
+    command = ["fit", "temporal", *map(str, runs), "--truth", *map(str, truths)]
+
+    options = ["--combined", "--false-features", "0.1", "-o", str(section), "--json"]
+    assert crosscue([*command, *options]) == 0
+
+    reported = json.loads(capsys.readouterr().out)
+    fusion = parse("version = 1\n" + section.read_text(), "car.toml").fusion
+    assert fusion.kind == "combined"
+    assert fusion.combined is not None
+    assert {*fusion.combined.intercepts} == {*fusion.features}
+    assert fusion.established >= min(reported["threshold"]["threshold"], 0.9999)
+    assert reported["threshold"]["false_features"] <= reported["threshold"]["wanted"] == 0.1
+    assert crosscue([*command, "--false-features", "-1"]) == 2
