@@ -31,6 +31,7 @@ from crosscue.eval.scoring.places import group_places
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
 
 from .detection import CONFIRM_FRAMES, RULES, Definition, Rule, held, is_range_right
+from .trade import Reached, TradePoint, reached, trade_off
 
 THRESHOLD: Final = 0.9
 UNLIKELY: Final = "never probable enough"
@@ -67,6 +68,9 @@ class ApproachResult:
         false_features: Absent features that exceeded the threshold at any time before entering.
         at_entering: Last probabilities before entering.
         place: Place of the intersection, as scores resample it.
+        full_below: Threshold below which all present features are detected in several frames; -1
+            for never.
+        greatest: Greatest probability of each absent feature.
     """
 
     drive: str
@@ -89,6 +93,8 @@ class ApproachResult:
     false_features: tuple[str, ...]
     at_entering: dict[str, float]
     place: str = ""
+    full_below: float = -1.0
+    greatest: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +163,8 @@ class ApproachScore:
         not_judged: Number of approaches of runs outside the truth's time.
         rows_not_numbers: Number of belief rows left out because a probability is missing.
         failures: Number of approaches by reason, for detection and full detection.
+        trade: Full detection at rates of false features per approach, each at its own threshold
+            (``trade``).
         by_intersection: Means by intersection, as in Fig. 29.
         by_condition: Means by condition tag.
         results: Results of all approaches.
@@ -179,6 +187,7 @@ class ApproachScore:
     not_judged: int
     rows_not_numbers: int
     failures: dict[str, dict[str, int]]
+    trade: tuple[TradePoint, ...]
     by_intersection: dict[str, ApproachGroup]
     by_condition: dict[str, ApproachGroup]
     results: tuple[ApproachResult, ...]
@@ -315,6 +324,8 @@ def _result(
     distance = truth.start_m(steps.t_ns)
     is_spurious = bool(published.any()) and not detected[np.argmax(published)]
     missing = [name for name in present if not known.get(name, never).any()]
+    is_sure = steps.established if one.control == "none" else never
+    thresholds = reached(steps.features, present, absent, is_sure)
     return ApproachResult(
         drive=truth.drive,
         approach=one.id,
@@ -346,6 +357,8 @@ def _result(
             name: float(values[-1]) for name, values in steps.features.items() if len(values)
         },
         place=truth.places.get(one.id, f"{truth.drive}, approach {one.id}"),
+        full_below=-1.0 if thresholds.full is None else thresholds.full,
+        greatest=thresholds.false,
     )
 
 
@@ -476,6 +489,7 @@ def score_approaches(judged: Sequence[ApproachesJudged]) -> ApproachScore | None
             "detected": _counts([one.why_not_detected for one in results]),
             "full": _counts([one.why_not_full for one in results]),
         },
+        trade=trade_off([Reached(one.full_below, one.greatest) for one in results], at),
         by_intersection=_groups(
             {one.intersection for one in results},
             results,
