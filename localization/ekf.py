@@ -102,7 +102,7 @@ class MotionStep(NamedTuple):
     Attributes:
         mean: Shape (4,): the state after the step.
         by_state: Shape (4, 4): Jacobian by the state before.
-        by_input: Shape (4, 2): Jacobian by the two inputs.
+        by_input: Shape (4, K): Jacobian by the K inputs.
     """
 
     mean: Floats
@@ -146,6 +146,15 @@ def turning(mean: Floats, accel_mps2: float, yaw_rate_radps: float, dt_s: float)
     distance_by = np.array([dt_s, 0.5 * dt_s**2, 0.0])
     turn_by = np.array([0.0, 0.0, dt_s])
     return _drive(mean, accel_mps2, dt_s, distance_m, yaw_rate_radps * dt_s, distance_by, turn_by)
+
+
+def odometry_motion(mean: Floats, distance_m: float, turn_rad: float, by: Floats) -> MotionStep:
+    """The arc that odometry measured, with Jacobians by state and by K parameters of the odometry.
+
+    ``by``, shape (2, K), has the derivatives of distance and turn by the parameters.
+    """
+    distance_by, turn_by = np.column_stack([np.zeros(2), by])
+    return _drive(mean, 0.0, 0.0, distance_m, turn_rad, distance_by, turn_by)
 
 
 def predict_ekf(
@@ -312,7 +321,7 @@ def _drive(
     distance_by: Floats,
     turn_by: Floats,
 ) -> MotionStep:
-    """Transform the arc to the map; ``*_by`` are derivatives by speed and by the two inputs."""
+    """Transform the arc to the map; ``*_by`` are derivatives by speed and by the inputs."""
     step = arc(distance_m, turn_rad)
     heading = mean[HEADING]
     cosine, sine = math.cos(heading), math.sin(heading)
@@ -325,7 +334,8 @@ def _drive(
     by_state = np.eye(4)
     by_state[:2, HEADING] = -moved[1], moved[0]
     by_state[:3, SPEED] = pose_by[:, 0]
-    by_input = np.vstack([pose_by[:, 1:], [dt_s, 0.0]])
+    by_input = np.zeros((4, pose_by.shape[1] - 1))
+    by_input[:3], by_input[SPEED, 0] = pose_by[:, 1:], dt_s
     after = np.array(
         [
             mean[X] + moved[0],

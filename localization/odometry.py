@@ -71,6 +71,7 @@ class OdometrySettings:
         wheel_turn_rad_per_sqrt_m: S.d. of the heading by wheel difference after one metre.
         turn_per_turn: S.d. of the change of heading as a fraction of that change.
         turn_rad_per_sqrt_rad: S.d. of the heading after one radian of turning.
+        wheel_delay_s: Delay of the timestamps of wheel speeds and turn signal.
         turn_delay_s: Delay of the turn signal's timestamps relative to those of the wheel speeds.
         max_gap_s: Distance of samples above which there is a gap: it is counted, and the variances
             grow.
@@ -96,6 +97,7 @@ class OdometrySettings:
     wheel_turn_rad_per_sqrt_m: float = 0.01
     turn_per_turn: float = 0.0
     turn_rad_per_sqrt_rad: float = 0.0
+    wheel_delay_s: float = 0.0
     turn_delay_s: float = 0.0
     max_gap_s: float = 0.5
     gap_accel_mps2: float = 3.0
@@ -118,7 +120,7 @@ class OdometrySettings:
         if not math.isfinite(self.turn_delay_s):
             raise ValueError(f"turn_delay_s: expected finite, got {self.turn_delay_s}")
         noises = [f.name for f in fields(self) if "_per_" in f.name or f.name.startswith("gap_")]
-        for name in (*noises, "wheel_step_mps", "steering_noise_rad_sqrt_m"):
+        for name in (*noises, "wheel_step_mps", "steering_noise_rad_sqrt_m", "wheel_delay_s"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name}: expected >= 0, got {value}")
@@ -321,12 +323,15 @@ def integrate(
     pending = pending or Pending()
     _check_geometry(settings, turn)
     axle_mps, yaw_radps = _at_rear_axle(wheels, settings)
-    clean = _clean(wheels.t_ns, axle_mps, pending.t_ns)
-    t_ns = np.concatenate([pending.t_ns, wheels.t_ns[clean.keep]])
+    wheel_delay_ns = round(settings.wheel_delay_s * 1e9)
+    until_ns = None if until_ns is None else until_ns - wheel_delay_ns
+    wheels_ns = wheels.t_ns - wheel_delay_ns
+    clean = _clean(wheels_ns, axle_mps, pending.t_ns)
+    t_ns = np.concatenate([pending.t_ns, wheels_ns[clean.keep]])
     axle_mps = np.concatenate([pending.axle_mps, axle_mps[clean.keep]])
     yaw_radps = np.concatenate([pending.yaw_radps, yaw_radps[clean.keep]])
     delay_ns = round(settings.turn_delay_s * 1e9)
-    joined, turn_dropped = _join_turn(turn, pending, delay_ns)
+    joined, turn_dropped = _join_turn(turn, pending, delay_ns + wheel_delay_ns)
 
     ready = len(t_ns)
     if joined is not None and until_ns is not None:
@@ -356,7 +361,8 @@ def first_reading(wheels: WheelSamples, settings: OdometrySettings) -> tuple[int
     """Time and rear-axle speed in m/s of the first finite row; None without one."""
     axle_mps, _ = _at_rear_axle(wheels, settings)
     rows = np.flatnonzero(np.isfinite(axle_mps))
-    return (int(wheels.t_ns[rows[0]]), float(axle_mps[rows[0]])) if len(rows) else None
+    t_ns = wheels.t_ns - round(settings.wheel_delay_s * 1e9)
+    return (int(t_ns[rows[0]]), float(axle_mps[rows[0]])) if len(rows) else None
 
 
 def _check_geometry(settings: OdometrySettings, turn: TurnSignal | None) -> None:

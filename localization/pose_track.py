@@ -30,9 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .angles import wrap
+from .constants import Constants, coast_constants, predict_constants, update_constants
 from .ekf import PoseBelief, coast, pack_belief, unpack_belief
 from .odometry import Increments
-from .pose_filter import HEADING, SPEED, major_axis_m, predict_pose, update_state
+from .pose_filter import HEADING, SPEED, State, major_axis_m, predict_pose, update_state
 
 Floats: TypeAlias = NDArray[np.float64]
 Int64s: TypeAlias = NDArray[np.int64]
@@ -152,6 +153,7 @@ class TrackState:
         counted_m: ``travelled_m`` at the last used heading.
         waiting: Headings later than the belief.
         waiting_rows_ns: Times of requested rows later than the belief.
+        constants: Constant errors of the odometry as states; None without them.
     """
 
     belief: PoseBelief
@@ -160,6 +162,7 @@ class TrackState:
     counted_m: float = 0.0
     waiting: Headings = NO_HEADINGS
     waiting_rows_ns: Int64s = field(default_factory=lambda: NO_TIMES)
+    constants: Constants | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,6 +299,7 @@ def advance_pose(
     headings: Headings = NO_HEADINGS,
     rows_ns: Int64s | None = None,
     measurements: MeasurementSource = NO_MEASUREMENTS,
+    by: Floats | None = None,
 ) -> Advance:
     """Predict along the increments, and update with headings in order of time.
 
@@ -308,6 +312,7 @@ def advance_pose(
             choice must be the same in every window.
         measurements: Additional measurements, used after headings of the same time. With a row
             after every interval, there is also a row after each measurement.
+        by: Shape (N, 2, K): ``constants.effects`` of the increments; required with constants.
 
     Returns:
         The state for the next window, the rows, the outcome of each heading that reached the
@@ -318,7 +323,8 @@ def advance_pose(
     if rows_ns is not None:
         wanted = np.sort(np.concatenate([state.waiting_rows_ns, rows_ns]))
     run = _Run(state, settings, headings, wanted, measurements)
-    for start, stop, *interval in zip(
+    effects = [None] * len(increments) if by is None else by
+    for start, stop, *interval, effect in zip(
         increments.start_ns.tolist(),
         increments.stop_ns.tolist(),
         increments.distance_m.tolist(),
@@ -327,8 +333,10 @@ def advance_pose(
         increments.turn_var_rad2.tolist(),
         increments.speed_mps.tolist(),
         increments.speed_var_m2ps2.tolist(),
+        effects,
         strict=True,
     ):
+        run.by = effect
         run.drive(start, stop, *interval)
     return run.result()
 
@@ -350,6 +358,8 @@ class _Run:
         self.settings = settings
         self.t_ns = state.belief.t_ns
         self.state = pack_belief(state.belief)
+        self.constants = state.constants
+        self.by: Floats | None = None
         self.travelled_m = state.travelled_m
         self.counted_ns = state.counted_ns
         self.counted_m = state.counted_m
@@ -407,6 +417,7 @@ class _Run:
                 fraction = (to_ns - self.t_ns) * per_ns
                 self._move(
                     to_ns,
+                    fraction,
                     fraction * distance_m,
                     fraction * turn_rad,
                     fraction * distance_var,
@@ -416,19 +427,29 @@ class _Run:
                 break
             self._handle_events()
         innovation = speed_mps - self.state[SPEED]
-        self.state = update_state(self.state, SPEED, innovation, speed_var)
+        self._set_updated(update_state(self.state, SPEED, innovation, speed_var))
         if self.event_ns == stop_ns:
             self._handle_events()
         if self.every_interval:
             self._keep_row()
 
     def _move(
-        self, to_ns: int, distance_m: float, turn_rad: float, distance_var: float, turn_var: float
+        self,
+        to_ns: int,
+        fraction: float,
+        distance_m: float,
+        turn_rad: float,
+        distance_var: float,
+        turn_var: float,
     ) -> None:
-        speed_var = self.settings.accel_var_m2ps3 * ((to_ns - self.t_ns) * 1e-9)
-        self.state = predict_pose(
-            self.state, distance_m, turn_rad, distance_var, turn_var, speed_var
-        )
+        dt_s = (to_ns - self.t_ns) * 1e-9
+        step = (distance_m, turn_rad, distance_var, turn_var, self.settings.accel_var_m2ps3 * dt_s)
+        if self.constants is None or self.by is None:
+            self.state = predict_pose(self.state, *step)
+        else:
+            self.state, self.constants = predict_constants(
+                self.state, self.constants, step, fraction * self.by, dt_s
+            )
         self.travelled_m += abs(distance_m)
         self.t_ns = to_ns
 
@@ -443,6 +464,8 @@ class _Run:
             after = coast(
                 before, dt_s, self.settings.accel_var_m2ps3, self.settings.coast_turn_var_rad2ps
             )
+            if self.constants is not None:
+                self.constants = coast_constants(before, self.constants, dt_s)
             self.state, self.t_ns = pack_belief(after), to_ns
             if to_ns < stop_ns:
                 self._handle_events()
@@ -468,9 +491,18 @@ class _Run:
         found = self.measurements.update(unpack_belief(self.t_ns, self.state), self.travelled_m)
         if found is None:
             return
-        self.state = pack_belief(found)
+        self._set_updated(pack_belief(found))
         if self.every_interval:
             self._keep_row()
+
+    def _set_updated(self, after: State) -> None:
+        """Set the state after a measurement, which also tells of the constants."""
+        before, self.state = self.state, after
+        # A speed without correlation with the pose, as is usual, tells nothing.
+        same = after._replace(speed_mps=before.speed_mps, vv=before.vv) == before
+        if self.constants is not None and not same:
+            both = unpack_belief(0, before), unpack_belief(0, after)
+            self.constants = update_constants(self.constants, *both)
 
     def _find_event(self) -> None:
         heading_ns, row_ns, measured_ns = _NEVER, _NEVER, _NEVER
@@ -497,7 +529,7 @@ class _Run:
             return
         self.tally["headings_accepted"] += 1
         self.counted_ns, self.counted_m = self.t_ns, self.travelled_m
-        self.state = update_state(self.state, HEADING, innovation, var_rad2)
+        self._set_updated(update_state(self.state, HEADING, innovation, var_rad2))
 
     def _is_due(self) -> bool:
         if self.counted_ns is None:
@@ -526,6 +558,7 @@ class _Run:
             counted_m=self.counted_m,
             waiting=_picked(self.headings, slice(self.next_heading, None)),
             waiting_rows_ns=self.rows[self.next_row :],
+            constants=self.constants,
         )
         columns = PoseColumns(
             np.array(self.pose_times, np.int64),

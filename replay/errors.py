@@ -17,6 +17,7 @@
     * StudyFileError         a study file is unreadable or does not match (exit status 2)
     * WorkerError            a worker process died; finished parts are kept
     * EmptyResultError       the logs contain nothing that was requested
+    * FitError               a fit is worse on held-out data than the values before it
     * AccountError           the row counts do not add up: a bug in crosscue
 
 An invalid argument of the caller's own code raises ``ValueError``. Dropped rows do not stop the
@@ -123,6 +124,10 @@ class WorkerError(CrosscueError):
 
 class EmptyResultError(CrosscueError):
     """The logs contain nothing that was requested."""
+
+
+class FitError(CrosscueError):
+    """A fit is worse than the values before it, on data that it was not fitted to."""
 
 
 class AccountError(CrosscueError):

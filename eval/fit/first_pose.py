@@ -186,7 +186,7 @@ def _first(
     if len(drive.fixes) < 2:
         return None
     made = integrate(drive.wheels, odometry_settings(vehicle), drive.turn).increments
-    pose = start_pose(made, drive.fixes, drive.lever_m, int(drive.wheels.t_ns[0]))
+    pose = start_pose(made, drive.fixes, drive.lever_m, int(made.start_ns[0]))
     heading_sd_rad = math.sqrt(pose.hh)
     if heading_sd_rad > MAX_HEADING_SD_RAD:
         return None

@@ -15,14 +15,15 @@ from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.eval.pipeline.pose import odometry_settings, turn_signal_of
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import circular_mean, wrap_all
+from crosscue.localization.constants import TURN_PARAMETERS, Constants
 from crosscue.localization.fit.compass import persistence
 from crosscue.localization.fit.known_drive import KnownDrive, whitened
-from crosscue.localization.fit.odometry import FIX_DELAY, OdometryFit
+from crosscue.localization.fit.odometry import FIX_DELAY, TURN_NOISE, OdometryFit
 from crosscue.localization.fit.odometry import fit_odometry as fit_parameters
 from crosscue.localization.odometry import OdometrySettings
 from crosscue.replay.base import Log, Selection, name_of
 from crosscue.replay.columns import Floats
-from crosscue.replay.errors import EmptyResultError, VehicleError
+from crosscue.replay.errors import EmptyResultError, FitError, VehicleError
 from crosscue.replay.files.tree_text import toml_document
 from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.vehicle.pose import OdometryFitted
@@ -41,19 +42,9 @@ SHARED: Final = (
     "front_right_scale",
     "slip_per_sqrt_m",
     "turn_delay_s",
-    "turn_rad_per_sqrt_rad",
 )
 # Settings that belong to a single source of turns.
-OF_ONE_TURN: Final = {
-    "yaw rate": ("yaw_rate_scale", "gyro_bias_radps", "gyro_noise_rad_per_sqrt_s"),
-    "steering": (
-        "steering_ratio",
-        "steering_offset_rad",
-        "wheelbase_m",
-        "steering_noise_rad_sqrt_m",
-    ),
-    "wheels": ("right_wheel_scale", "track_width_m", "wheel_turn_rad_per_sqrt_m"),
-}
+OF_ONE_TURN: Final = {turn: (*names, TURN_NOISE[turn]) for turn, names in TURN_PARAMETERS.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +99,7 @@ class DriveFit:
         log: Name of the log.
         reference: Source of the known positions.
         is_of_camera: True if the reference is the camera's track.
+        is_gnss: True if the reference is the log's GNSS, whose delay the vehicle file states.
         start_ns: Start of the fitted half.
         middle_ns: End of the fitted half and start of the held-out half.
         end_ns: End of the held-out half.
@@ -120,6 +112,7 @@ class DriveFit:
     log: str
     reference: str
     is_of_camera: bool
+    is_gnss: bool
     start_ns: int
     middle_ns: int
     end_ns: int
@@ -237,6 +230,7 @@ def fit_odometry(
     output: Annotated[Path | str | None, Option(metavar="V.toml")] = None,
     *,
     truth: Path | str | None = None,
+    keep: bool = False,
     overwrite: bool = False,
 ) -> FittedOdometry:
     """Fit wheels, gyro, steering and noise to a drive.
@@ -244,7 +238,8 @@ def fit_odometry(
     Scales, biases, geometry, delays and noise are fitted to the first half of the drive and tested
     on the second. The reference positions are the log's GNSS or, with --truth, a true track.
     Parameters that the drive does not determine keep their values and are listed. For example, a
-    straight drive determines neither the gyro's scale nor the steering ratio.
+    straight drive determines neither the gyro's scale nor the steering ratio. A fit that makes the
+    error on the second half larger is refused.
 
     Examples:
         crosscue fit odometry drive.mcap --vehicle car.toml -o car.toml
@@ -255,10 +250,12 @@ def fit_odometry(
         vehicle: Vehicle file; without one, the defaults.
         output: Vehicle file to write: a copy of --vehicle with the fit; may be the same file.
         truth: Truth file with the true track, or its folder (default: the log's GNSS).
+        keep: Accept a fit that makes the error on the second half larger.
         overwrite: Replace another existing file.
 
     Raises:
         EmptyResultError: The drive has no wheel speeds, or no positions.
+        FitError: The fit makes the error on the second half larger.
         VehicleError: The drive has too few positions, or is too short.
         SchemaError: The truth file does not fit the drive, or contains no pose.
         OutputError: The output exists, or cannot be written.
@@ -267,7 +264,7 @@ def fit_odometry(
     settings = vehicle_given(vehicle)
     known = None if truth is None else of_truth(Path(truth), settings)
     with opened(log) as drive:
-        found = fit_log_odometry(drive.logs, settings, drive.selection, known)
+        found = fit_log_odometry(drive.logs, settings, drive.selection, known, keep=keep)
     path = write_fit(vehicle, output, lambda text: with_odometry(text, found))
     return FittedOdometry(found, path)
 
@@ -277,6 +274,8 @@ def fit_log_odometry(
     vehicle: Vehicle,
     selection: Selection,
     known: ReferencePositions | None = None,
+    *,
+    keep: bool = False,
 ) -> DriveFit:
     """Fit to the first half of the drive and test on the second.
 
@@ -285,9 +284,11 @@ def fit_log_odometry(
         vehicle: Initial settings.
         selection: The part of the logs to use.
         known: True positions; None for the log's GNSS.
+        keep: Accept a fit that makes the held-out error larger.
 
     Raises:
         EmptyResultError: The drive has no wheel speeds, or no positions.
+        FitError: The first source's fit makes the held-out error larger.
         VehicleError: The drive is too short.
     """
     planned = signal_plan(logs, vehicle)
@@ -322,8 +323,11 @@ def fit_log_odometry(
             wheel_speeds(wheels), turn_samples(turn, found), reference.fixes, reference.lever_m
         )
         try:
-            sources.append(_fitted(drive, given, reference))
-        except VehicleError as error:
+            fitted = _fitted(drive, given, reference)
+            if not keep:
+                _check_held_out(fitted)
+            sources.append(fitted)
+        except (VehicleError, FitError) as error:
             if not sources and turn is first:
                 raise
             not_fitted[_name(turn)] = str(error)
@@ -335,10 +339,11 @@ def fit_log_odometry(
         ", ".join(name_of(log).rstrip("/").rpartition("/")[2] for log in logs),
         reference.name,
         reference.is_of_camera,
+        known is None,
         *span,
         tuple(sources),
         not_fitted,
-        _together(given, sources),
+        _together(given, sources, is_gnss=known is None),
         mean_band(2, 1),
     )
 
@@ -359,19 +364,34 @@ def _middle_ns(drive: KnownDrive) -> int:
 
 
 def _fitted(drive: KnownDrive, given: OdometrySettings, reference: ReferencePositions) -> SourceFit:
-    whole_s = float(drive.seconds[-1]) if len(drive.seconds) else None
     half = drive.until(_middle_ns(drive)) if len(drive.fixes) else drive
-    fit = fit_parameters(half, given, whole_s)
-    before, after = (_errors(drive, car, fit) for car in (given, fit.settings))
+    fit = fit_parameters(half, given)
+    before = _errors(drive, given, fit, None, 0.0)
+    after = _errors(drive, fit.settings, fit, fit.constants, fit.value(FIX_DELAY))
     if reference.heading_rad is None:
         return SourceFit(fit, before, after)
     yaw_rad, sd_rad = _yaw(half, fit, reference)
     return SourceFit(fit, before, after, yaw_rad, sd_rad)
 
 
-def _errors(drive: KnownDrive, settings: OdometrySettings, fit: OdometryFit) -> OdometryErrors:
-    steps = drive.steps(settings, delay_s=fit.value(FIX_DELAY))
-    found = drive.follow(fit.start, steps)
+def _check_held_out(fitted: SourceFit) -> None:
+    before_m, after_m = fitted.before.held_out_m, fitted.after.held_out_m
+    if after_m > before_m:
+        raise FitError(
+            f"odometry, turns from {fitted.fit.source}: the error on the held-out half is "
+            f"{after_m:.2f} m rms with the fit, {before_m:.2f} m with the values before it; "
+            "use a longer drive with turns and changes of speed, or --keep the fit"
+        )
+
+
+def _errors(
+    drive: KnownDrive,
+    settings: OdometrySettings,
+    fit: OdometryFit,
+    constants: Constants | None,
+    delay_s: float,
+) -> OdometryErrors:
+    found = drive.reckon(fit.start, settings, constants, delay_s)
     fixes = drive.fixes
     apart = np.hypot(*(found.xy_m - fixes.xy_m).T)
     cov = np.tile(np.eye(2) * fit.fix_sd_m**2, (len(fixes), 1, 1))
@@ -407,9 +427,15 @@ def _yaw(half: KnownDrive, fit: OdometryFit, reference: ReferencePositions) -> t
     return yaw_rad, math.hypot(spread, math.sqrt(fit.start.hh))
 
 
-def _together(given: OdometrySettings, sources: Sequence[SourceFit]) -> OdometrySettings:
+def _together(
+    given: OdometrySettings, sources: Sequence[SourceFit], *, is_gnss: bool
+) -> OdometrySettings:
     """Return settings with the first source's shared values and each source's own values."""
     values = {name: getattr(sources[0].fit.settings, name) for name in SHARED}
+    if not is_gnss:
+        # A true track that is early means wheel speeds that are late.
+        late_s = given.wheel_delay_s - sources[0].fit.value(FIX_DELAY)
+        values["wheel_delay_s"] = max(late_s, 0.0)
     for source in sources:
         names = OF_ONE_TURN[source.fit.source]
         values |= {name: getattr(source.fit.settings, name) for name in names}
@@ -418,13 +444,39 @@ def _together(given: OdometrySettings, sources: Sequence[SourceFit]) -> Odometry
 
 def odometry_section(found: DriveFit) -> dict[str, object]:
     """Return the fit as a vehicle file's [odometry] section, with its provenance."""
-    names = [*SHARED, *(name for one in found.sources for name in OF_ONE_TURN[one.fit.source])]
+    names = [
+        *SHARED,
+        "wheel_delay_s",
+        *(name for one in found.sources for name in OF_ONE_TURN[one.fit.source]),
+    ]
     values = {
         name: float(f"{value:.6g}")
         for name in names
         if (value := getattr(found.settings, name)) is not None
     }
-    return {**values, "fitted": _provenance(found)}
+    constants = constants_section(found)
+    return {**values, "constants": constants, "fitted": _provenance(found)}
+
+
+def constants_section(found: DriveFit) -> dict[str, object]:
+    """Return the errors of the fitted values as a section [odometry.constants].
+
+    Values of several sources of turns are independent; the first source determines shared ones.
+    """
+    from scipy.linalg import block_diag
+
+    names: list[str] = []
+    blocks: list[Floats] = []
+    drift: dict[str, float] = {}
+    for of in (source.fit.constants for source in found.sources):
+        rows = [i for i, name in enumerate(of.names) if name not in names]
+        names += [of.names[i] for i in rows]
+        blocks.append(of.cov[np.ix_(rows, rows)])
+        walk = zip(of.names, np.sqrt(of.drift_var_per_s).tolist(), strict=True)
+        drift |= {name: float(f"{sd:.3g}") for name, sd in walk if sd > 0.0}
+    cov = block_diag(*blocks)
+    rounded = [[float(f"{value:.9g}") for value in row] for row in cov.tolist()]
+    return {"names": names, "covariance": rounded, "drift_per_sqrt_s": drift}
 
 
 def _provenance(found: DriveFit) -> dict[str, object]:
@@ -433,7 +485,7 @@ def _provenance(found: DriveFit) -> dict[str, object]:
         one
         for source in found.sources
         for one in source.fit.fitted
-        if hasattr(found.settings, one.parameter)
+        if hasattr(found.settings, one.parameter) or one.parameter == FIX_DELAY
     ]
     missing = [one.parameter for source in found.sources for one in source.fit.not_observable]
     rounded = OdometryFitted(
@@ -465,6 +517,9 @@ def with_odometry(text: str, found: DriveFit) -> str:
     section = document.setdefault("odometry", tomlkit.table())
     for key, value in odometry_section(found).items():
         section[key] = value
+    if found.is_gnss and (delay_s := found.sources[0].fit.value(FIX_DELAY)):
+        gnss = document.setdefault("gnss", tomlkit.table())
+        gnss["delay_s"] = round(float(gnss.get("delay_s", 0.0)) + delay_s, 4)
     if (yaw_rad := camera_yaw_of(found)) is not None:
         document.setdefault("camera", tomlkit.table())["yaw_rad"] = yaw_rad
     return tomlkit.dumps(document)

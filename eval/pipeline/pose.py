@@ -21,6 +21,12 @@ from crosscue.eval.runs.tables.measurements import (
     start_rows,
 )
 from crosscue.localization import compass, odometry, pose_track
+from crosscue.localization.constants import (
+    Constants,
+    coast_constants,
+    effects,
+    start_constants,
+)
 from crosscue.localization.fixes import NO_FIXES, Fixes
 from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.landmarks.sighting import Sighting
@@ -66,9 +72,18 @@ def turn_signal_of(planned: SignalPlan, vehicle: Vehicle) -> Signal | None:
 
 def odometry_settings(vehicle: Vehicle) -> OdometrySettings:
     """Return the integrator's settings from the vehicle file."""
-    left_out = {"kind", "heading_from", "accel_var_m2ps3", "fitted", "scale_sd"}
+    left_out = {"kind", "heading_from", "accel_var_m2ps3", "constants", "fitted", "scale_sd"}
     fields = vehicle.odometry.model_dump(exclude=left_out)
     return OdometrySettings(**fields)
+
+
+def odometry_constants(vehicle: Vehicle, turn: Signal | None) -> Constants | None:
+    """Return the constant errors of the odometry with a source of turns; None without any."""
+    stated = vehicle.odometry.constants
+    if stated is None:
+        return None
+    cov = np.array(stated.covariance).reshape(len(stated.names), -1)
+    return start_constants(stated.names, cov, stated.drift_per_sqrt_s, _kind(turn))
 
 
 def track_settings(vehicle: Vehicle) -> TrackSettings:
@@ -250,10 +265,14 @@ class PoseStage:
         assert self._state is not None
         restarts = segment.cause is Cause.SET_BACK
         before_ns = self._state.belief.t_ns
-        crossed = cross_gap(
-            self._state.belief, until_ns, gap_settings(self.vehicle), restarts=restarts
+        before, constants = self._state.belief, self._state.constants
+        crossed = cross_gap(before, until_ns, gap_settings(self.vehicle), restarts=restarts)
+        # After a long gap the mean remains, as if the car had not moved.
+        if constants is not None and crossed.distance_m:
+            constants = coast_constants(before, constants, (until_ns - before_ns) * 1e-9)
+        self._state = replace(
+            self._state, belief=crossed.belief, counted_ns=None, constants=constants
         )
-        self._state = replace(self._state, belief=crossed.belief, counted_ns=None)
         self._measured.append(gap_rows(before_ns, crossed))
         self.landmarks.cross_gap()
         self._gap = None
@@ -295,11 +314,12 @@ class PoseStage:
 
     def _advance(self, window: SampleWindow, until_ns: int | None) -> Iterator[PoseColumns]:
         wheels = window.samples.get(Signal.WHEEL_SPEEDS)
+        settings = odometry_settings(self.vehicle)
         headings = self._headings(window)
         if self.positions is not None:
             self.positions.add(self._fixes(window))
         if self._state is None:
-            first = odometry.first_reading(_wheels(wheels), odometry_settings(self.vehicle))
+            first = odometry.first_reading(_wheels(wheels), settings)
             if first is None:
                 n = 0 if wheels is None else len(wheels.t_ns)
                 self.odometry_counts += odometry.OdometryCounts(rows=n, not_finite=n)
@@ -316,16 +336,17 @@ class PoseStage:
                 self.turn_early += 0 if (turn := self._turn(window)) is None else len(turn)
                 self._let_go(window.end_ns)
                 return
-            self._cross(self._gap, int(wheels.t_ns[0]))
+            self._cross(self._gap, int(wheels.t_ns[0]) - round(settings.wheel_delay_s * 1e9))
         step = odometry.integrate(
             _wheels(wheels),
-            odometry_settings(self.vehicle),
+            settings,
             self._turn(window),
             self._pending,
             until_ns,
         )
         self._pending = step.pending
         self.odometry_counts += step.counts
+        constants = self._state.constants
         made = pose_track.advance_pose(
             self._state,
             step.increments,
@@ -334,6 +355,7 @@ class PoseStage:
             measurements=self.landmarks
             if self.positions is None
             else BothSources(self.landmarks, self.positions),
+            by=None if constants is None else effects(step.increments, settings, constants.names),
         )
         self._state = made.state
         self._measured += [
@@ -374,7 +396,8 @@ class PoseStage:
             position_sd_m=start.position_sd_m,
             heading_sd_rad=sd_rad,
         )
-        self._state = TrackState(belief)
+        constants = None if self.visual else odometry_constants(self.vehicle, self.turn)
+        self._state = TrackState(belief, constants=constants)
         self._measured.append(start_rows(belief))
         return headings
 
@@ -382,9 +405,8 @@ class PoseStage:
         self.track_counts += TrackCounts(headings=len(headings), headings_late=len(headings))
 
     def _turn(self, window: SampleWindow) -> TurnSignal | None:
-        if self.turn is None:
+        if self.turn is None or (kind := _kind(self.turn)) is None:
             return None
-        kind: odometry.TurnKind = "yaw rate" if self.turn is Signal.YAW_RATE else "steering"
         found = window.samples.get(self.turn)
         if found is None:
             return TurnSignal(np.empty(0, np.int64), np.empty(0), kind)
@@ -410,6 +432,12 @@ class PoseStage:
             return NO_HEADINGS
         heading_rad = compass.heading(found.values, compass_settings(self.vehicle))
         return Headings(found.t_ns, heading_rad, np.full(len(found.t_ns), variance))
+
+
+def _kind(turn: Signal | None) -> odometry.TurnKind | None:
+    if turn is None:
+        return None
+    return "yaw rate" if turn is Signal.YAW_RATE else "steering"
 
 
 def _split(window: SampleWindow, at_ns: int) -> tuple[SampleWindow, SampleWindow]:

@@ -45,7 +45,8 @@ def front_wheels(
     if speeds.shape[1] != 4 or settings.wheelbase_m is None:
         return ()
     kept = np.isfinite(speeds).all(axis=1)
-    speeds, t_s = speeds[kept], _seconds(wheels.t_ns[kept], span_ns[0])
+    since_ns = span_ns[0] + round(settings.wheel_delay_s * 1e9)
+    speeds, t_s = speeds[kept], _seconds(wheels.t_ns[kept], since_ns)
     has_own = len(speeds) > 1 and len({column.tobytes() for column in speeds.T}) == 4
     is_driven = ~made.is_gap & (made.distance_m > 0.0)
     is_driven &= (made.start_ns >= span_ns[0]) & (made.stop_ns <= span_ns[1])

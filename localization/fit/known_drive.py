@@ -8,6 +8,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.localization.constants import Constants, effects, predict_constants
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import (
     Increments,
@@ -25,6 +26,8 @@ Int64s: TypeAlias = NDArray[np.int64]
 
 # Maximum duration of an arc of odometry.
 STEP_S: Final = 0.2
+# Time at both ends that signals keep for the fitted delays.
+MARGIN_S: Final = 0.3
 # Normalised innovation squared beyond which a position has less weight; one good position in a
 # thousand exceeds it.
 GATE_NIS: Final = 13.8
@@ -119,20 +122,14 @@ class KnownDrive:
             middle_s = (turn.t_ns - self.fixes.t_ns[0]) * 1e-9 - 0.5 * self.seconds[-1]
             turn = TurnSignal(turn.t_ns, turn.values - drift_radps2 * middle_s, turn.kind)
         made = integrate(self.wheels, settings, turn).increments
+        columns = made.distance_m, made.turn_rad, made.distance_var_m2, made.turn_var_rad2
+        return Steps(self.at_fix, *(self._between(made, column, delay_s) for column in columns))
+
+    def _between(self, made: Increments, column: Floats, delay_s: float) -> Floats:
+        """Sum a column of increments over each arc."""
         edges_s = (np.append(made.start_ns[:1], made.stop_ns) - self.fixes.t_ns[0]) * 1e-9
-        at_s = self.knots_s - delay_s
-
-        def between(column: Floats) -> Floats:
-            sums = np.interp(at_s, edges_s, np.append(0.0, np.cumsum(column)))
-            return np.diff(sums, prepend=sums[0])
-
-        return Steps(
-            self.at_fix,
-            between(made.distance_m),
-            between(made.turn_rad),
-            between(made.distance_var_m2),
-            between(made.turn_var_rad2),
-        )
+        sums = np.interp(self.knots_s - delay_s, edges_s, np.append(0.0, np.cumsum(column)))
+        return np.diff(sums, prepend=sums[0])
 
     def increments(self, settings: OdometrySettings) -> Increments:
         """Return the odometry of the complete log, also outside the positions."""
@@ -142,6 +139,38 @@ class KnownDrive:
         """Estimate the pose at the first position, as an initial value."""
         made = self.increments(settings)
         return start_pose(made, self.fixes, self.lever_m)
+
+    def reckon(
+        self,
+        start: State,
+        settings: OdometrySettings,
+        constants: Constants | None,
+        delay_s: float = 0.0,
+    ) -> Predicted:
+        """Dead reckoning with constant errors of the odometry as states of the filter.
+
+        Args:
+            start: State of the rear axle at the first position.
+            settings: Odometry settings of the car.
+            constants: Constants at the first position, with their covariance with the start.
+            delay_s: Delay of the positions' timestamps.
+        """
+        steps = self.steps(settings, delay_s=delay_s)
+        if constants is None:
+            return self.follow(start, steps)
+        made = self.increments(settings)
+        by = effects(made, settings, constants.names)
+        arcs = np.zeros((len(self.knots_s), *by.shape[1:]))
+        for i, k in np.ndindex(by.shape[1:]):
+            arcs[:, i, k] = self._between(made, by[:, i, k], delay_s)
+        rows = zip(*(column.tolist() for column in steps), strict=True)
+        dt_s = np.diff(self.knots_s, prepend=self.knots_s[0]).tolist()
+        state, found = start, []
+        for (at_fix, *step), arc_by, seconds in zip(rows, arcs, dt_s, strict=True):
+            state, constants = predict_constants(state, constants, (*step, 0.0), arc_by, seconds)
+            if at_fix >= 0:
+                found.append(at_point(state, *self.lever_m))
+        return _predicted(np.array(found))
 
     def follow(self, start: State, steps: Steps, cov_m2: Floats | None = None) -> Predicted:
         """Run the filter along the steps.
@@ -156,9 +185,13 @@ class KnownDrive:
         cov = np.empty((0, 2, 2)) if cov_m2 is None else cov_m2
         # Compiled, because a fit calls it hundreds of times.
         count = kept(_follow)(start, *steps, self.fixes.xy_m, cov, *self.lever_m, found)
-        x, y, heading, _, xx, xy, _, _, yy = found[:count].T[:9]
-        spread = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
-        return Predicted(np.stack([x, y], axis=1), heading, spread)
+        return _predicted(found[:count])
+
+
+def _predicted(states: Floats) -> Predicted:
+    x, y, heading, _, xx, xy, _, _, yy = states.T[:9]
+    spread = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+    return Predicted(np.stack([x, y], axis=1), heading, spread)
 
 
 def _follow(
@@ -223,5 +256,7 @@ def _covered(wheels: WheelSamples, turn: TurnSignal | None, fixes: Fixes) -> Fix
     spans = [wheels.t_ns] + ([] if turn is None else [turn.t_ns])
     if any(len(t_ns) < 2 for t_ns in spans):
         return fixes.take(slice(0, 0))
-    first, last = max(int(t[0]) for t in spans), min(int(t[-1]) for t in spans)
+    margin_ns = round(MARGIN_S * 1e9)
+    first = max(int(t[0]) for t in spans) + margin_ns
+    last = min(int(t[-1]) for t in spans) - margin_ns
     return fixes.take((fixes.t_ns >= first) & (fixes.t_ns <= last))

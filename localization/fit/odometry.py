@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from crosscue.localization.angles import wrap
+from crosscue.localization.constants import EFFECTS, TURN_PARAMETERS, Constants
 from crosscue.localization.fit.compass import NotObservable, persistence
 from crosscue.localization.fit.front_wheels import front_wheels
 from crosscue.localization.fit.known_drive import GATE_NIS, KnownDrive, Steps, whitened
@@ -52,12 +53,24 @@ REACH: Final = 4.5
 ROUNDS: Final = 8
 # Relative change of the noise below which it has converged.
 SETTLED: Final = 0.05
-MIN_FIXES: Final = 15
-MIN_DISTANCE_M: Final = 100.0
+# Step of numerical derivatives, in units of the plausible deviation.
+DERIVATIVE_STEP: Final = 1e-4
+# Typical noise of a car without its constant errors, and the factor by which a car's plausibly
+# differs.
+TYPICAL: Final = OdometrySettings(track_width_m=1.5)
+NOISE_FACTOR: Final = 3.0
+# Positions and distance with which anything is observable; more is judged by the parameters' s.d.
+MIN_FIXES: Final = 5
+MIN_DISTANCE_M: Final = 20.0
 _MIN_SD: Final = 1e-6
+# Factor of typical noise under which a drive with any plausible error of the car is likely.
+WIDE: Final = 50.0
+# Logarithm of noise beyond any car's.
+_LOUD: Final = 2.0
 
 START: Final = ("start_x_m", "start_y_m", "start_heading_rad")
 FIX_DELAY: Final = "fix_delay_s"
+BIAS: Final = "gyro_bias_radps"
 DRIFT: Final = "gyro_drift_radps2"
 FRONT: Final = ("front_left_scale", "front_right_scale")
 
@@ -86,11 +99,11 @@ PARAMETERS: Final[Mapping[str, _Kind]] = {
     "start_y_m": _Kind(10.0, False, ""),
     "start_heading_rad": _Kind(0.5, False, ""),
 }
-# Parameters by turn source.
-OF_TURN: Final[Mapping[str, tuple[str, ...]]] = {
-    "yaw rate": ("gyro_bias_radps", DRIFT, "yaw_rate_scale", "turn_delay_s"),
-    "steering": ("steering_ratio", "steering_offset_rad", "wheelbase_m", "turn_delay_s"),
-    "wheels": ("right_wheel_scale", "track_width_m"),
+# Parameters by turn source, other than those that a filter takes for constant.
+ALSO_OF_TURN: Final[Mapping[str, tuple[str, ...]]] = {
+    "yaw rate": (DRIFT, "turn_delay_s"),
+    "steering": ("turn_delay_s",),
+    "wheels": (),
 }
 TURN_NOISE: Final[Mapping[str, str]] = {
     "yaw rate": "gyro_noise_rad_per_sqrt_s",
@@ -120,6 +133,7 @@ class OdometryFit:
         not_observable: Other parameters, and the kind of drive that they need.
         start: Pose of the rear axle at the first position, with the covariance of the fit.
         start_ns: Time of the first position.
+        constants: Errors of the parameters, as states of a filter that starts with ``start``.
         fix_sd_m: S.d. of the positions, by the residuals.
         residual_rms: Root mean square of the whitened residuals; 1 if consistent.
         fixes: Number of positions used.
@@ -132,6 +146,7 @@ class OdometryFit:
     not_observable: tuple[NotObservable, ...]
     start: State
     start_ns: int
+    constants: Constants
     fix_sd_m: float
     residual_rms: float
     fixes: int
@@ -142,17 +157,13 @@ class OdometryFit:
         return next((one.value for one in self.fitted if one.parameter == parameter), otherwise)
 
 
-def fit_odometry(
-    drive: KnownDrive, given: OdometrySettings, whole_s: float | None = None
-) -> OdometryFit:
+def fit_odometry(drive: KnownDrive, given: OdometrySettings) -> OdometryFit:
     """Fit scale, biases, geometry, delays and noise to known positions.
 
     Args:
         drive: The drive. Only the ratios of its positions' covariances matter; their scale is
             fitted.
         given: Initial values, which parameters that are not observable keep.
-        whole_s: Duration of a drive over which the noise covers the remaining uncertainty of the
-            fit; None for that of the fitted drive.
 
     Raises:
         VehicleError: There are too few positions, the distance is too short, or no signal measures
@@ -161,9 +172,8 @@ def fit_odometry(
     _check(drive, given)
     names = _free(drive, given)
     # Large noise at first: a filter that trusts a wrong bias diverges, and derivatives are useless.
-    plausible = {name: _unit(given, name) for name in names}
-    wide = _with_doubt(given, drive.steps(given), plausible, float(drive.seconds[-1]), 1.0)
-    fit = _Fit(drive, names, wide, 1.0)
+    loud = {n: WIDE * getattr(TYPICAL, n) for n in ("slip_per_sqrt_m", TURN_NOISE[drive.source])}
+    fit = _Fit(drive, names, _changed(given, loud), 1.0)
     values = fit.solve(fit.first_guess())
     fit = replace(fit, given=given)
     values = fit.solve(values)
@@ -178,6 +188,7 @@ def fit_odometry(
             values = fit.solve({name: values[name] for name in keep})
         elif fit.is_like(before):
             break
+    fit = fit.with_noise(values, is_upper=True)
     sd = fit.deviations(values)
     same = [name for name in _own(fit.names) if abs(values[name] - _given(given, name)) < sd[name]]
     if same:
@@ -187,8 +198,7 @@ def fit_odometry(
         ]
         fit = replace(fit, names=tuple(name for name in fit.names if name not in same))
         values = fit.solve({name: values[name] for name in fit.names})
-    doubt = {**sd, **fit.deviations(values)}
-    return _result(fit, values, given, tuple(missing), doubt, whole_s)
+    return _result(fit, names, values, given, tuple(missing))
 
 
 def _own(names: tuple[str, ...]) -> tuple[str, ...]:
@@ -212,7 +222,8 @@ def _check(drive: KnownDrive, given: OdometrySettings) -> None:
 
 
 def _free(drive: KnownDrive, given: OdometrySettings) -> tuple[str, ...]:
-    names = ("wheel_scale", *OF_TURN[drive.source], FIX_DELAY, *START)
+    of_turn = (*TURN_PARAMETERS[drive.source], *ALSO_OF_TURN[drive.source])
+    names = ("wheel_scale", *of_turn, FIX_DELAY, *START)
     speeds = drive.wheels.wheels_mps
     one_speed = bool(np.array_equal(speeds[:, -2], speeds[:, -1]))
     if drive.source == "wheels" and one_speed:
@@ -245,14 +256,17 @@ class _Fit:
         return _changed(self.given, own)
 
     def whitened(self, values: Values) -> tuple[Floats, Floats]:
-        drive = self.drive
-        steps = drive.steps(
-            self.settings(values), values.get(DRIFT, 0.0), values.get(FIX_DELAY, 0.0)
-        )
+        return self._seen(values, self._steps(values, {}), self.fix_scale)
+
+    def _steps(self, values: Values, noise: Values) -> Steps:
+        car = _changed(self.settings(values), noise)
+        return self.drive.steps(car, values.get(DRIFT, 0.0), values.get(FIX_DELAY, 0.0))
+
+    def _seen(self, values: Values, steps: Steps, fix_scale: float) -> tuple[Floats, Floats]:
         x, y, heading = (values[name] for name in START)
         start = State(x, y, heading, *(0.0,) * 11)
-        cov = drive.fixes.cov_m2 * self.fix_scale**2
-        return whitened(drive.follow(start, steps, cov), drive.fixes.xy_m, cov)
+        fixes, cov = self.drive.fixes, self.drive.fixes.cov_m2 * fix_scale**2
+        return whitened(self.drive.follow(start, steps, cov), fixes.xy_m, cov)
 
     def solve(self, values: Values) -> Values:
         """Fit the most likely values under the current noise."""
@@ -274,27 +288,40 @@ class _Fit:
             bounds=(low, high),
             loss="soft_l1",
             f_scale=LOSS_SD,
-            diff_step=1e-4,
+            diff_step=DERIVATIVE_STEP,
             xtol=1e-6,
             ftol=1e-6,
             gtol=1e-6,
             max_nfev=max_nfev,
         )
 
-    def covariance(self, values: Values) -> Floats:
-        """Covariance of the parameters in their own units, corrected for correlated residuals."""
+    def per_sample(self, values: Values) -> float:
+        """Variance of a residual per independent sample, where residuals are correlated."""
         white, _ = self.whitened(values)
         t_ns = self.drive.fixes.t_ns
         independent = min(persistence(t_ns, white[:, i]).independent for i in range(2))
-        excess = max(float(np.median(white**2)) / 0.455, 1.0)
-        unit = self._units()
-        inverse = _inverse(self.information(values))
-        return inverse * np.outer(unit, unit) * excess * len(t_ns) / independent
+        return max(float(np.median(white**2)) / 0.455 * len(t_ns) / independent, 1.0)
 
     def deviations(self, values: Values) -> dict[str, float]:
         """Standard deviations of the parameters in their own units."""
-        sd = np.sqrt(np.diagonal(self.covariance(values)))
+        inverse = _inverse(self.information(values)) * self.per_sample(values)
+        sd = np.sqrt(np.diagonal(inverse)) * self._units()
         return dict(zip(self.names, sd.tolist(), strict=True))
+
+    def mean_square_error(self, values: Values, given: OdometrySettings) -> Floats:
+        """Expected products of the parameters' errors, also of those that keep their given values.
+
+        Each parameter is plausibly as far from its given value as its unit; this prior and the
+        residuals determine mean and covariance (one Gauss-Newton step). What keeps its given value
+        is off by the mean's distance, too, and the others compensate for that.
+        """
+        found = self._least_squares(values, max_nfev=1)
+        unit, samples = self._units(), self.per_sample(values)
+        prior = np.array([0.0 if name in START else 1.0 for name in self.names])
+        away = np.array([values[name] - _given(given, name) for name in self.names]) / unit
+        cov = _inverse(found.jac.T @ found.jac / samples + np.diag(prior))
+        off = cov @ (found.grad / samples + prior * away)
+        return (cov + np.outer(off, off)) * np.outer(unit, unit)
 
     def observable(self, values: Values) -> tuple[tuple[str, ...], list[NotObservable]]:
         """Names of the observable parameters, and the others, removed from the worst on."""
@@ -315,35 +342,50 @@ class _Fit:
                 sure = "no effect on this drive"
             lost.append(NotObservable(name, f"{sure}; it needs {PARAMETERS[name].needs}"))
 
-    def with_noise(self, values: Values) -> _Fit:
-        """Fit the noise that maximises the likelihood of the residuals."""
+    def with_noise(self, values: Values, *, is_upper: bool = False) -> _Fit:
+        """Fit the noise that is most likely by the residuals, and for a car.
+
+        ``is_upper`` adds the noise's own s.d., because parameters fitted to the same residuals make
+        these smaller.
+        """
         from scipy.optimize import minimize
 
-        names = self._noises()
+        slip, turn = self._noises()
         min_scale = MIN_FIX_SD_M / self.drive.fix_sd_m
-        begin = [max(getattr(self.given, name), _MIN_SD) for name in names] + [self.fix_scale]
-
-        def at(logs: Floats) -> _Fit:
-            *noise, scale = np.exp(logs).tolist()
-            scale = max(scale, min_scale)
-            return replace(
-                self,
-                given=_changed(self.given, dict(zip(names, noise, strict=True))),
-                fix_scale=scale,
-            )
+        current = (getattr(self.given, slip), getattr(self.given, turn), self.fix_scale)
+        typical = np.log([getattr(TYPICAL, name) for name in (slip, turn)])
+        # Variances are linear in the noise's, so odometry is integrated thrice and not hundredfold.
+        silent = self._steps(values, {slip: 0.0, turn: 0.0})
+        by_slip = self._steps(values, {slip: 1.0, turn: 0.0}).distance_var_m2
+        by_turn = self._steps(values, {slip: 0.0, turn: 1.0}).turn_var_rad2
 
         def unlikely(logs: Floats) -> float:
-            white, log_det = at(logs).whitened(values)
+            slip_var, turn_var, _ = np.exp(2.0 * logs)
+            steps = silent._replace(
+                distance_var_m2=silent.distance_var_m2
+                + slip_var * (by_slip - silent.distance_var_m2),
+                turn_var_rad2=silent.turn_var_rad2 + turn_var * (by_turn - silent.turn_var_rad2),
+            )
+            white, log_det = self._seen(values, steps, max(math.exp(logs[2]), min_scale))
             nis = np.sum(white**2, axis=1)
             far = np.sqrt(np.maximum(nis * GATE_NIS, 0.0))
             robust = np.where(nis > GATE_NIS, 2.0 * far - GATE_NIS, nis)
-            return 0.5 * float(np.sum(robust + log_det))
+            # Positions cannot tell small noise from none, but a car has some.
+            apart = (logs[:2] - typical) / math.log(NOISE_FACTOR)
+            return 0.5 * float(np.sum(robust + log_det) + np.sum(apart**2))
 
-        first = np.log(begin)
-        around = np.vstack([first, first + np.diag([-1.0, -1.0, -1.0])])
-        options = {"xatol": 0.02, "fatol": 0.02, "maxfev": 200, "initial_simplex": around}
-        found = minimize(unlikely, first, method="Nelder-Mead", options=options)
-        return at(found.x)
+        first = np.log(np.maximum(current, _MIN_SD))
+        simplex = np.vstack([first, first + np.diag([-1.0, -1.0, -1.0])])
+        options = {"xatol": 0.02, "fatol": 0.02, "maxfev": 200, "initial_simplex": simplex}
+        logs = minimize(unlikely, first, method="Nelder-Mead", options=options).x
+        for i in range(2 if is_upper else 0):
+            step = 0.05 * np.eye(3)[i]
+            limit = unlikely(logs) + 0.5
+            while logs[i] < _LOUD and unlikely(logs + step) < limit:
+                logs = logs + step
+        *noise, scale = np.exp(logs)
+        given = _changed(self.given, dict(zip((slip, turn), map(float, noise), strict=True)))
+        return replace(self, given=given, fix_scale=max(float(scale), min_scale))
 
     def _noises(self) -> tuple[str, str]:
         return "slip_per_sqrt_m", TURN_NOISE[self.drive.source]
@@ -393,24 +435,27 @@ def _unit(settings: OdometrySettings, name: str) -> float:
 
 def _result(
     fit: _Fit,
+    names: tuple[str, ...],
     values: Values,
     given: OdometrySettings,
     missing: tuple[NotObservable, ...],
-    sd: Values,
-    whole_s: float | None,
 ) -> OdometryFit:
     drive = fit.drive
-    cov = fit.covariance(values)
     white, _ = fit.whitened(values)
-    at = [fit.names.index(name) for name in START]
+    every = {name: values.get(name, _given(given, name)) for name in names}
+    cov = replace(fit, names=names).mean_square_error(every, given)
+    sd = dict(zip(names, np.sqrt(np.diagonal(cov)).tolist(), strict=True))
+    at = [names.index(name) for name in START]
     (xx, xy, xh), (_, yy, yh), (_, _, hh) = cov[np.ix_(at, at)].tolist()
     x, y, heading = (values[name] for name in START)
     settings = fit.settings(values)
-    steps = drive.steps(settings, 0.0, values.get(FIX_DELAY, 0.0))
-    factor = 1.0 if whole_s is None else max(whole_s / float(drive.seconds[-1]), 1.0)
-    settings = _with_doubt(settings, steps, sd, float(drive.seconds[-1]) * factor, factor)
     span_ns = int(drive.fixes.t_ns[0]), int(drive.fixes.t_ns[-1])
     front = front_wheels(drive.wheels, drive.increments(settings), settings, span_ns)
+    constant = tuple(name for name in names if name in EFFECTS)
+    rows = [names.index(name) for name in constant]
+    cross = np.vstack([cov[np.ix_(at, rows)], np.zeros(len(rows))])
+    # Its own s.d. is no drift.
+    drift_var = max(values.get(DRIFT, 0.0) ** 2 - sd.get(DRIFT, 0.0) ** 2, 0.0) * drive.seconds[-1]
     return OdometryFit(
         source=drive.source,
         settings=_changed(settings, {one.setting: one.scale for one in front}),
@@ -424,56 +469,18 @@ def _result(
         not_observable=missing,
         start=State(x, y, wrap(heading), 0.0, xx, xy, xh, 0.0, yy, yh, 0.0, hh, 0.0, 0.0),
         start_ns=span_ns[0],
+        constants=Constants(
+            constant,
+            np.zeros(len(rows)),
+            cov[np.ix_(rows, rows)],
+            cross,
+            np.array([drift_var if name == BIAS else 0.0 for name in constant]),
+        ),
         fix_sd_m=fit.fix_scale * drive.fix_sd_m,
         residual_rms=float(np.sqrt(np.mean(white**2))),
         fixes=len(drive.fixes),
         outliers=int((np.sum(white**2, axis=1) > GATE_NIS).sum()),
     )
-
-
-def _with_doubt(
-    settings: OdometrySettings, steps: Steps, sd: Values, seconds: float, factor: float
-) -> OdometrySettings:
-    """Increase the noise to cover the remaining uncertainty of the fit at the end of a drive.
-
-    A filter without states for scales and biases ignores that their errors are constant. A scale
-    error moves the pose in proportion to the drive's displacement from its start, regardless of the
-    path, because left and right turns cancel.
-    """
-    way_m = float(np.abs(steps.distance_m).sum()) * factor
-    turned_rad = float(np.abs(steps.turn_rad).sum()) * factor
-    heading_rad = np.cumsum(steps.turn_rad)
-    along = steps.distance_m * np.exp(1j * heading_rad)
-    away_m = float(np.abs(np.cumsum(along)).max(initial=0.0)) * factor
-    off_rad = float(np.abs(heading_rad).max(initial=0.0)) * factor
-    ratio, base = settings.steering_ratio, settings.wheelbase_m or 1.0
-    scales = (
-        sd.get("yaw_rate_scale", 0.0),
-        sd.get("steering_ratio", 0.0) / ratio,
-        sd.get("wheelbase_m", 0.0) / base,
-        sd.get("track_width_m", 0.0) / settings.track_width_m,
-    )
-    more = {
-        "slip_per_sqrt_m": sd.get("wheel_scale", 0.0) * _per_sqrt(away_m, way_m),
-        "gyro_noise_rad_per_sqrt_s": math.hypot(
-            sd.get("gyro_bias_radps", 0.0), 0.5 * sd.get(DRIFT, 0.0) * seconds
-        )
-        * math.sqrt(seconds),
-        "steering_noise_rad_sqrt_m": sd.get("steering_offset_rad", 0.0) / ratio * math.sqrt(way_m),
-        "wheel_turn_rad_per_sqrt_m": sd.get("right_wheel_scale", 0.0)
-        / settings.track_width_m
-        * math.sqrt(way_m),
-        "turn_rad_per_sqrt_rad": math.hypot(*scales) * _per_sqrt(off_rad, turned_rad),
-    }
-    return _changed(
-        settings,
-        {name: math.hypot(getattr(settings, name), doubt) for name, doubt in more.items()},
-    )
-
-
-def _per_sqrt(reach: float, way: float) -> float:
-    """Density of a random walk whose s.d. is ``reach`` after the distance ``way``."""
-    return reach / math.sqrt(way) if way > 0.0 else 0.0
 
 
 def _changed(settings: OdometrySettings, values: Values) -> OdometrySettings:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Final, Literal, TypeAlias
+from itertools import product
+from typing import Final, Literal, Self, TypeAlias
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from .section import Finite, NotNegative, Positive, Section
 
@@ -41,6 +42,44 @@ class OdometryFitted(Section):
     """Standard deviation of each fitted value."""
     not_observable: tuple[str, ...] = ()
     """Parameters that the span does not determine; they keep their values."""
+
+
+ConstantName: TypeAlias = Literal[
+    "wheel_scale",
+    "gyro_bias_radps",
+    "yaw_rate_scale",
+    "steering_ratio",
+    "steering_offset_rad",
+    "wheelbase_m",
+    "right_wheel_scale",
+    "track_width_m",
+]
+
+
+class OdometryConstants(Section):
+    """Values of ``[odometry]`` whose errors are states of the pose filter: constant, or drifting.
+
+    ``crosscue fit odometry`` writes this section.
+    """
+
+    names: tuple[ConstantName, ...]
+    """Names of the values; each is in ``[odometry]``."""
+    covariance: tuple[tuple[Finite, ...], ...]
+    """Covariance of their errors, one row per name."""
+    drift_per_sqrt_s: dict[ConstantName, NotNegative] = Field(default_factory=dict)
+    """Standard deviation of a value's change in one second, as a random walk; by default 0."""
+
+    @model_validator(mode="after")
+    def _is_covariance(self) -> Self:
+        cov, k = self.covariance, len(self.names)
+        if len(cov) != k or any(len(row) != k for row in cov):
+            raise ValueError(f"covariance: expected {k} rows of {k} numbers, one for each name")
+        for i, j in product(range(k), range(k)):
+            limit = math.sqrt(max(cov[i][i], 0.0) * max(cov[j][j], 0.0)) * 1.000001
+            if cov[i][j] != cov[j][i] or abs(cov[i][j]) > limit:
+                both = f"{self.names[i]} and {self.names[j]}"
+                raise ValueError(f"covariance of {both}: {cov[i][j]:g}, not that of any errors")
+        return self
 
 
 class Odometry(Section):
@@ -86,10 +125,14 @@ class Odometry(Section):
     turn_per_turn: NotNegative = 0.0
     turn_rad_per_sqrt_rad: NotNegative = 0.0
     """Standard deviation of the heading after a turn of one radian."""
+    wheel_delay_s: NotNegative = 0.0
+    """Delay of the time stamps of wheel speeds, yaw rate and steering relative to the positions."""
     turn_delay_s: Finite = 0.0
     """Delay of the time stamps of yaw rate or steering relative to those of the wheel speeds."""
     max_gap_s: Positive = 0.5
     accel_var_m2ps3: NotNegative = 1.0
+    constants: OdometryConstants | None = None
+    """Constant errors of the values above. By default there are none, as published."""
     fitted: OdometryFitted | None = None
 
 

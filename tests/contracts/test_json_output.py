@@ -57,7 +57,7 @@ MADE: Final[dict[str, tuple[str, int]]] = {
     "fit ranges": ("photos/heights.csv --cue stop_sign", 0),
     "fit signs": ("photos/labels.csv --label yield", 1),
     "fit compass": ("COMPASS --vehicle ITS_CAR", 0),
-    "fit odometry": ("COMPASS --vehicle ITS_CAR --truth ITS_TRUTH", 0),
+    "fit odometry": ("COMPASS --vehicle ITS_CAR --truth ITS_TRUTH --keep", 0),
     "fit landmarks": ("--pairs photos/pairs.csv --false-match-rate 0.4", 0),
     "landmarks add": ("new.db --images photos --coordinates photos/places.csv", 0),
     "landmarks match": ("new.db photos/seen1.png", 0),

@@ -33,7 +33,7 @@ FINE: Final[dict[str, tuple[str, int]]] = {
     "detect": ("DRIVE --vehicle CAR -o found --no-cache", 0),
     "replay": ("DRIVE --vehicle CAR -o run --no-cache", 0),
     "fit compass": ("COMPASS --vehicle ITS_CAR", 0),
-    "fit odometry": ("COMPASS --vehicle ITS_CAR --truth ITS_TRUTH", 0),
+    "fit odometry": ("COMPASS --vehicle ITS_CAR --truth ITS_TRUTH --keep", 0),
     "truth from-gnss": ("COMPASS -o truth", 1),
 }
 # Commands whose LOG is text, but must be on this machine.

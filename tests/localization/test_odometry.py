@@ -20,6 +20,7 @@ from crosscue.localization.odometry import (
     Pending,
     TurnSignal,
     WheelSamples,
+    first_reading,
     integrate,
 )
 from crosscue.replay.columns import Floats, Int64s
@@ -155,6 +156,33 @@ def test_turn_delay_shifts_the_turn_signal_back() -> None:
         integrate(both_wheels(5.0), car, late).increments.turn_rad,
         integrate(both_wheels(5.0), CAR, on_time).increments.turn_rad,
     )
+
+
+def test_wheel_delay_shifts_wheels_and_turns_back_in_any_windows() -> None:
+    late_ns = 85_000_000
+    turn = TurnSignal(times(101), np.sin(times(101) * 1e-9), "yaw rate")
+    speeds = both_wheels(5.0)
+    car = replace(CAR, wheel_delay_s=0.085)
+    on_time = integrate(speeds, CAR, turn).increments
+    late = WheelSamples(speeds.t_ns + late_ns, speeds.wheels_mps)
+    late_turn = replace(turn, t_ns=turn.t_ns + late_ns)
+
+    whole = integrate(late, car, late_turn).increments
+    np.testing.assert_array_equal(whole.start_ns, on_time.start_ns)
+    np.testing.assert_array_equal(whole.turn_rad, on_time.turn_rad)
+    assert first_reading(late, car) == first_reading(speeds, CAR)
+
+    cut_ns = int(late.t_ns[40]) + 1
+    pending, turned = Pending(), []
+    for before, until_ns in ((True, cut_ns), (False, None)):
+        wheel_rows = (late.t_ns < cut_ns) == before
+        turn_rows = (late_turn.t_ns < cut_ns) == before
+        some = WheelSamples(late.t_ns[wheel_rows], late.wheels_mps[wheel_rows])
+        rates = TurnSignal(late_turn.t_ns[turn_rows], late_turn.values[turn_rows], "yaw rate")
+        step = integrate(some, car, rates, pending, until_ns)
+        pending = step.pending
+        turned.append(step.increments.turn_rad)
+    np.testing.assert_array_equal(np.concatenate(turned), on_time.turn_rad)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, -0.5])

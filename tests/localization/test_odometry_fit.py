@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -58,7 +57,7 @@ def turning() -> tuple[KnownDrive, OdometryFit]:
     rng = np.random.default_rng(seed=4)
     found = simulated_drive(drive(rng, seconds=120.0), rng)
     half = found.until(int(found.fixes.t_ns[FITTED]))
-    return found, fit_odometry(half, CAR, 120.0)
+    return found, fit_odometry(half, CAR)
 
 
 def test_turning_drive_recovers_scales_and_bias_within_four_sd(
@@ -78,7 +77,7 @@ def test_nees_of_held_out_positions_is_in_its_band(
     turning: tuple[KnownDrive, OdometryFit],
 ) -> None:
     found, fit = turning
-    path = found.follow(fit.start, found.steps(fit.settings))
+    path = found.reckon(fit.start, fit.settings, fit.constants)
     apart = path.xy_m - found.fixes.xy_m
     cov = path.cov_m2 + 0.25 * np.eye(2)
     nees = np.einsum("ni,nij,nj->n", apart, np.linalg.inv(cov), apart)[FITTED:]
@@ -86,27 +85,37 @@ def test_nees_of_held_out_positions_is_in_its_band(
     assert 0.05 < nees.mean() < 7.4  # 95 % of a chi-square with two degrees of freedom
 
 
-def test_claimed_error_matches_the_effect_of_uncertain_parameters(
-    turning: tuple[KnownDrive, OdometryFit],
-) -> None:
-    found, fit = turning
-    claimed = found.follow(fit.start, found.steps(fit.settings))
-    caused_m2 = 0.0
-    for one in fit.fitted:
-        if hasattr(CAR, one.parameter):
-            change: dict[str, Any] = {one.parameter: one.value + one.sd}
-            off = replace(fit.settings, **change)
-            moved = found.follow(fit.start, found.steps(off)).xy_m - claimed.xy_m
-            caused_m2 += float(np.mean(np.sum(moved**2, axis=1)))
-    claimed_m2 = float(np.mean(np.trace(claimed.cov_m2, axis1=1, axis2=2)))
+def test_stated_sd_of_turning_drives_is_that_of_the_errors() -> None:
+    """Eight drives (seeds 109 to 116), some too calm for the gyro's scale, which is 3 % off.
 
-    assert 0.5 < np.sqrt(claimed_m2 / caused_m2) < 3.0
+    A parameter that keeps a wrong value biases the others, and noise fitted to few positions is too
+    small: without regard to both, the s.d. of the bias was 1.6 to 4 times too small.
+    """
+    off = []
+    for seed in range(109, 117):
+        rng = np.random.default_rng(seed)
+        fit = fit_odometry(simulated_drive(drive(rng, seconds=60.0), rng), CAR)
+        sd = np.sqrt(np.diagonal(fit.constants.cov))
+        apart = [getattr(fit.settings, n) - TRUE[n] for n in fit.constants.names]
+        off.append(np.array(apart) / sd)
+    rms = np.sqrt(np.mean(np.square(off), axis=0))
+
+    assert (rms < 1.8).all(), rms
+    assert (rms > 0.3).all(), rms
 
 
-def straight(seconds: float = 60.0) -> Truth:
+def test_constants_carry_parameters_that_keep_their_values() -> None:
+    fit = fit_odometry(simulated_drive(straight(), np.random.default_rng(seed=2)), CAR)
+    sd = dict(zip(fit.constants.names, np.sqrt(np.diagonal(fit.constants.cov)), strict=True))
+
+    assert sd["yaw_rate_scale"] == pytest.approx(0.02, rel=0.05)  # as plausible for a car
+    assert sd["wheel_scale"] < 0.005
+
+
+def straight(seconds: float = 60.0, period_s: float = 47.0) -> Truth:
     rng = np.random.default_rng(seed=1)
     there = drive(rng, seconds=seconds)
-    speed = 12.0 + 3.0 * np.sin(np.arange(len(there.t_ns)) / 150.0)
+    speed = 12.0 + 3.0 * np.sin(2.0 * np.pi * np.arange(len(there.t_ns)) / 20.0 / period_s)
     x = np.concatenate([[0.0], np.cumsum(0.025 * (speed[1:] + speed[:-1]))])
     zero = np.zeros(len(x))
     return Truth(there.t_ns, np.column_stack([x, zero, zero]), speed, zero)
@@ -121,6 +130,24 @@ def test_straight_drive_leaves_turn_parameters_unobservable() -> None:
     assert fit.settings.yaw_rate_scale == CAR.yaw_rate_scale
     assert fit.settings.turn_delay_s == CAR.turn_delay_s
     assert fit.value("wheel_scale") == pytest.approx(1.02, abs=0.005)
+
+
+def test_nine_positions_fit_what_they_show() -> None:
+    """Half of 20 s: the delay of the wheel speeds is observable, the gyro's scale is not."""
+    there = straight(period_s=8.0)
+    late = simulated_drive(there, np.random.default_rng(seed=3), sd_m=0.05)
+    wheels_late = replace(late.wheels, t_ns=late.wheels.t_ns + 85_000_000)
+    assert late.turn is not None
+    turn = replace(late.turn, t_ns=late.turn.t_ns + 85_000_000)
+    found = KnownDrive(wheels_late, turn, late.fixes, LEVER).until(int(there.t_ns[185]))
+
+    fit = fit_odometry(found, CAR)
+
+    assert fit.fixes == 9
+    (delay,) = (one for one in fit.fitted if one.parameter == "fix_delay_s")
+    assert abs(delay.value + 0.085) < 3.0 * delay.sd
+    assert delay.sd < 0.05
+    assert "yaw_rate_scale" in {one.parameter for one in fit.not_observable}
 
 
 def shifted(fixes: Fixes, turn_rad: float, by_m: Floats) -> Fixes:

@@ -10,6 +10,14 @@ from crosscue.replay.vehicle.vehicle import parse
     ("text", "message"),
     [
         ("version = 1\n[odometry]\nwheel_scal = 1.0", r"car.toml:3: odometry.* wheel_scale"),
+        (
+            'version = 1\n[odometry.constants]\nnames = ["wheel_scale"]\ncovariance = [[1.0, 0.0]]',
+            r"constants: value error, covariance: expected 1 rows of 1 numbers, one for each name",
+        ),
+        (
+            'version = 1\n[odometry.constants]\nnames = ["wheel_scale"]\ncovariance = [[-1.0]]',
+            r"covariance of wheel_scale and wheel_scale: -1, not that of any errors",
+        ),
         ("version = 1\n[compass]\nheading_sd_deg = 3.0", r":3: .*did you mean heading_sd_rad"),
         ("version = 1\n\n[can.wheel_speeds]\nrear_left = 'A.B'", r":3: .*rear_right: missing"),
         ("version = 1\n[odometry]\nwheelbase_m = '2.7'", r":3: .*valid number, got '2.7'"),

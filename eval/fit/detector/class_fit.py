@@ -69,6 +69,11 @@ class HeldOut:
     detections: int
 
     @property
+    def is_worse(self) -> bool:
+        """Whether the calibrated scores have a larger error than the network's."""
+        return self.error_after > self.error_before
+
+    @property
     def precision(self) -> float:
         """Precision; NaN without detections."""
         return self.right / self.of if self.of else math.nan

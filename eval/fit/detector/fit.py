@@ -34,7 +34,7 @@ from crosscue.eval.pipeline.run import Run, open_run
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import FitError, UsageError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.safe_text import visible
@@ -193,6 +193,7 @@ class DetectorFitSettings:
         date: Date of the fit, to record in the card (default: that of the first picture).
         logs: Folder that the run's logs have moved to; they are recognised by content.
         limits: Limits for reading the logs.
+        keep: Accept calibrations that are worse on the held-out images.
         overwrite: Replace another existing card.
     """
 
@@ -212,6 +213,7 @@ class DetectorFitSettings:
     date: Annotated[str, Option(metavar="DATE")] = ""
     logs: Annotated[Path | str | None, Option(metavar="DIR")] = None
     limits: LimitsGiven = DEFAULT_LIMITS
+    keep: bool = False
     overwrite: bool = False
 
     def __post_init__(self) -> None:
@@ -273,6 +275,7 @@ def fit_detector(
         SchemaError: Labels cannot be read, or do not belong to the run.
         VehicleError: The card cannot be read.
         OutputError: The card cannot be written.
+        FitError: The calibration of a class is worse on the held-out images.
     """
     given = [runs] if isinstance(runs, Run | Path | str) else list(runs)
     theirs = [labels] if isinstance(labels, Path | str) else list(labels)
@@ -312,6 +315,17 @@ def fit_detector(
     )
     if len({part.is_by_picture for part in whole}) > 1:
         raise UsageError("labels: some are of boxes, others of pictures; expected one kind")
+    worse = [one for one in fits if one.held_out and one.held_out.is_worse]
+    if worse and not settings.keep:
+        errors = ", ".join(
+            f"{one.name} {of.error_after:.4f} after, {of.error_before:.4f} before"
+            for one in worse
+            if (of := one.held_out)
+        )
+        raise FitError(
+            f"fit detector: the calibration error on the held-out images is larger: {errors}; "
+            "use more images, --calibration none, or --keep the fit"
+        )
     written = None
     if output is not None and source is not None and any(one.scores for one in fits):
         written = Path(output)

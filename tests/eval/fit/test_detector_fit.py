@@ -13,6 +13,7 @@ import pytest
 import crosscue
 from crosscue.datasets.truth.box_labels import read_box_labels
 from crosscue.detectors.catalog.card import read_card
+from crosscue.detectors.catalog.class_scores import Platt
 from crosscue.detectors.training.platt import fit_isotonic, fit_platt
 from crosscue.eval.fit.detector.threshold import (
     TRIED,
@@ -21,7 +22,7 @@ from crosscue.eval.fit.detector.threshold import (
     lower_bound,
 )
 from crosscue.eval.scoring.boxes.reliability import class_calibration
-from crosscue.replay.errors import SchemaError, UsageError
+from crosscue.replay.errors import FitError, SchemaError, UsageError
 from support.onnx_models import bright_box_model, constant_model
 
 
@@ -143,6 +144,22 @@ def test_fitted_card_reaches_required_precision_of_cues(drive: Path) -> None:
 
     again = crosscue.fit_detector(drive / "run", drive / "labels", card=drive / "net_fitted.toml")
     assert again.classes[0].scores == one.scores
+
+
+def test_calibration_that_is_worse_on_held_out_images_is_refused(
+    drive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = Platt(kind="platt", slope=1.0, offset=-3.0)
+    monkeypatch.setattr("crosscue.eval.fit.detector.class_fit.fit_platt", lambda *_: wrong)
+    output = drive / "net_worse.toml"
+
+    with pytest.raises(FitError, match=r"traffic light 0\.\d+ after, 0\.\d+ before"):
+        crosscue.fit_detector(drive / "run", drive / "labels", output)
+
+    assert not output.exists()
+    kept = crosscue.fit_detector(drive / "run", drive / "labels", keep=True).classes[0].held_out
+    assert kept is not None
+    assert kept.error_after > kept.error_before
 
 
 def test_held_out_calibration_is_reported_without_threshold(drive: Path) -> None:

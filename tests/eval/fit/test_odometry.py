@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 import pytest
+import tomlkit
 
 import crosscue
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
+from crosscue.eval import cli
 from crosscue.eval.fit.odometry import FittedOdometry
+from crosscue.eval.fit.reference import ReferencePositions, of_truth
+from crosscue.eval.fit.turns import turn_samples, wheel_speeds
+from crosscue.eval.pipeline.pose import odometry_constants
+from crosscue.localization.odometry import TurnSignal, WheelSamples
+from crosscue.replay.errors import FitError
+from crosscue.replay.signals.kinds import Samples, Signal
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 BIAS = 0.002
 
@@ -41,3 +56,92 @@ def test_fit_reduces_held_out_error_and_nees_is_within_band(
 
     assert one.after.held_out_m < one.before.held_out_m
     assert one.after.all_nees < fitted.fitted.nees_band[1]
+
+
+def test_vehicle_file_states_the_constant_errors(fitted: FittedOdometry, files: DriveFiles) -> None:
+    assert fitted.path is not None
+    vehicle = crosscue.load_vehicle(fitted.path)
+    constants = odometry_constants(vehicle, Signal.YAW_RATE)
+    fit = fitted.fitted.sources[0].fit
+
+    assert vehicle.odometry.constants is not None
+    assert constants is not None
+    assert constants.names[:3] == ("wheel_scale", "gyro_bias_radps", "yaw_rate_scale")
+    np.testing.assert_allclose(constants.cov[:3, :3], fit.constants.cov, rtol=1e-6)
+    assert odometry_constants(crosscue.load_vehicle(files.vehicle), Signal.YAW_RATE) is None
+
+
+def test_replay_with_zero_covariance_is_the_published_one(
+    fitted: FittedOdometry, files: DriveFiles, tmp_path: Path
+) -> None:
+    assert fitted.path is not None
+    fit = crosscue.load_vehicle(fitted.path).odometry.constants
+    assert fit is not None
+    zero = np.zeros((len(fit.names), len(fit.names))).tolist()
+    poses = []
+    for name, constants in (("none", None), ("zero", {"covariance": zero}), ("fitted", {})):
+        document = tomlkit.parse(fitted.path.read_text())
+        section: Any = document["odometry"]
+        if constants is None:
+            del section["constants"]
+        else:
+            section["constants"].update(constants)
+            section["constants"]["drift_per_sqrt_s"] = {}
+        vehicle = fitted.path.with_name(f"{name}.toml")
+        vehicle.write_text(tomlkit.dumps(document))
+        run = crosscue.replay_drive(files.log, tmp_path / name, vehicle)
+        poses.append(run.pose.to_pydict())
+
+    none, of_zero, of_fit = poses
+    assert none == of_zero
+    assert of_fit["major_axis_m"][-1] > none["major_axis_m"][-1]
+
+
+def test_fit_that_is_worse_on_the_held_out_half_is_refused(
+    files: DriveFiles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Positions of the fitted half are stretched by 5 %, those of the other half are right."""
+
+    def stretched(path: Path, vehicle: Vehicle) -> ReferencePositions:
+        right = of_truth(path, vehicle)
+        fixes, at = right.fixes, right.fixes.xy_m
+        first = fixes.t_ns < (fixes.t_ns[0] + fixes.t_ns[-1]) // 2
+        wrong = np.where(first[:, None], at[0] + 1.05 * (at - at[0]), at)
+        return replace(right, fixes=replace(fixes, xy_m=wrong))
+
+    monkeypatch.setattr("crosscue.eval.fit.odometry.of_truth", stretched)
+    output = tmp_path / "out.toml"
+    arguments = ["fit", "odometry", str(files.log), "--vehicle", str(files.vehicle)]
+    arguments += ["--truth", str(files.truth), "-o", str(output)]
+
+    with pytest.raises(FitError, match=r"held-out half is .* m rms with the fit, .* m with"):
+        crosscue.fit_odometry(files.log, files.vehicle, output, truth=files.truth)
+    assert cli.run(arguments) == 1
+    assert not output.exists()
+    kept = crosscue.fit_odometry(files.log, files.vehicle, output, truth=files.truth, keep=True)
+    assert kept.fitted.sources[0].after.held_out_m > kept.fitted.sources[0].before.held_out_m
+    assert output.exists()
+
+
+def test_delay_of_wheel_speeds_is_written_and_used(
+    files: DriveFiles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wheel speeds and gyro are 85 ms late, as on a real nuScenes scene."""
+
+    def late(samples: Samples) -> WheelSamples:
+        made = wheel_speeds(samples)
+        return replace(made, t_ns=made.t_ns + 85_000_000)
+
+    def late_turn(signal: Signal | None, found: Mapping[Signal, Samples]) -> TurnSignal | None:
+        turn = turn_samples(signal, found)
+        return None if turn is None else replace(turn, t_ns=turn.t_ns + 85_000_000)
+
+    monkeypatch.setattr("crosscue.eval.fit.odometry.wheel_speeds", late)
+    monkeypatch.setattr("crosscue.eval.fit.odometry.turn_samples", late_turn)
+    output = tmp_path / "late.toml"
+    crosscue.fit_odometry(files.log, files.vehicle, output, truth=files.truth, keep=True)
+    vehicle = crosscue.load_vehicle(output).odometry
+
+    assert vehicle.wheel_delay_s == pytest.approx(0.085, abs=0.03)
+    assert vehicle.fitted is not None
+    assert 0.0 < vehicle.fitted.sd["fix_delay_s"] < 0.03
