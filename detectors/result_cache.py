@@ -14,13 +14,13 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 
 from crosscue.replay.errors import OutputError
 from crosscue.replay.files import door
+from crosscue.replay.files.closing import Closing
 from crosscue.replay.files.tree_text import json_tree
 
 from .base import Detections, Found, RoadMask
@@ -45,7 +45,7 @@ def picture_key(picture: Encoded) -> bytes:
     return digest.digest()
 
 
-class ResultCache:
+class ResultCache(Closing):
     """A result cache in a file, or in memory if the path is None; a context manager."""
 
     def __init__(self, path: Path | None) -> None:
@@ -94,15 +94,8 @@ class ResultCache:
                 f"{self._path}: {error}; free disk space, or use another --cache"
             ) from None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Close the file."""
         self._file.close()
 
 

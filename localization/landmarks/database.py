@@ -26,6 +26,7 @@ import numpy as np
 
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogError, OutputError, UsageError
+from crosscue.replay.files.closing import Closing
 
 from .features import Keypoints
 from .file import (
@@ -130,7 +131,7 @@ class Nearby(NamedTuple):
     sigmas: float
 
 
-class LandmarkDatabase:
+class LandmarkDatabase(Closing):
     """A landmark database open for reading. Use it as a context manager.
 
     Attributes:
@@ -245,17 +246,6 @@ class LandmarkDatabase:
     def close(self) -> None:
         """Release the file."""
         self._sql.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _nearby(self, row: tuple[object, ...], xy_m: Floats, cov_m2: Floats) -> Nearby:
         place = _place(row, self.path)

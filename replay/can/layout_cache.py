@@ -22,8 +22,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, overload
 
+from crosscue.replay.errors import OutputError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.files.whole_file import write_bytes
 from crosscue.replay.limits import MIB
 
 from .layout import CanMessage, CanSignal
@@ -92,25 +94,11 @@ class LayoutEntry:
         heads = [_head(message) for message in messages]
         parts = [{"notices": notices, "messages": heads}, *map(_signals, messages)]
         body = "\n".join(json.dumps(one, separators=(",", ":")) for one in parts).encode()
-        with suppress(OSError):
+        with suppress(OSError, OutputError):
             folder = self._path.parent
             folder.mkdir(parents=True, exist_ok=True)
-            _replace(self._path, _HEAD + _checksum(body) + b"\n" + body)
+            write_bytes(self._path, _HEAD + _checksum(body) + b"\n" + body)
             _prune(folder)
-
-
-def _replace(path: Path, content: bytes) -> None:
-    """Write a file atomically: other processes see either the old or the new content."""
-    import tempfile
-
-    number, name = tempfile.mkstemp(prefix=".", suffix=".partial", dir=path.parent)
-    try:
-        with os.fdopen(number, "wb") as file:
-            file.write(content)
-        Path(name).replace(path)
-    except OSError:
-        Path(name).unlink()
-        raise
 
 
 def _prune(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Base class of open logs, which are closed at the end of a ``with`` block."""
+"""Base class of what is open, and closed at the end of a ``with`` block."""
 
 from __future__ import annotations
 

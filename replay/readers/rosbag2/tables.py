@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -11,7 +12,6 @@ from crosscue.replay.columns import Topic
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.limits import Limits
 
-from .definitions import known_definition
 from .sqlite import FAULTS, Database, explained
 
 _TABLES: Final = {
@@ -183,3 +183,15 @@ def _topics(
             )
         topics[one.name] = Topic(one.name, one.type_name, one.encoding, text, coding, count)
     return topics
+
+
+@cache
+def known_definition(type_name: str) -> bytes:
+    """Return the ROS 2 Humble definition of ``type_name`` and of the types it uses, or empty."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    if type_name not in store.fielddefs:
+        return b""
+    text, _ = store.generate_msgdef(type_name, ros_version=2)
+    return text.encode()

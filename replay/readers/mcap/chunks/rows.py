@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.readers.mcap.chunks.scan import Scan, scan_of
+from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.readers.mcap.records import (
     ATTACHMENT,
     CHANNEL,
@@ -252,13 +252,13 @@ def rows_by_scan(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], max_reco
     Raises:
         BrokenRecordError: More than ``max_records`` records, or too many definitions.
     """
-    scan = scan_of(buffer, stop_at, max_records + 1)
-    if len(scan.offset) > max_records:
+    begins, end, codes = _scan(buffer, stop_at, max_records + 1)
+    if len(begins) > max_records:
         raise BrokenRecordError(f"holds more than {max_records} records")
-    is_message = scan.opcode == MESSAGE
-    offset = scan.offset[is_message]
-    end = scan.end
-    after = np.append(scan.offset, end)[1:][is_message]
+    is_message = codes == MESSAGE
+    offset = begins[is_message]
+    ends = np.append(begins, end)[1:]
+    after = ends[is_message]
     short = np.flatnonzero(after - offset < MESSAGE_HEAD.itemsize)
     if len(short):  # a message shorter than its fields: nothing after it is trusted
         end = int(offset[short[0]])
@@ -273,24 +273,49 @@ def rows_by_scan(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], max_reco
         head.sequence.copy(),
         head.log.copy(),
         head.publish.copy(),
-        *_definitions(buffer, scan, end),
+        *_definitions(buffer, begins, ends, codes, end),
         end,
     )
 
 
-def _definitions(buffer: NDArray[np.uint8], scan: Scan, end: int) -> tuple[list[Definition], int]:
-    begins, ends = scan.offset, np.append(scan.offset, scan.end)[1:]
-    wanted = ((scan.opcode == SCHEMA) | (scan.opcode == CHANNEL)) & (begins < end)
+def _scan(buffer: Bytes, stop_at: NDArray[np.bool_], max_records: int) -> tuple[Int64s, int, Bytes]:
+    """Return the offsets of the records, the end of the last one, and their operation codes.
+
+    The offset of a record depends on the length of the previous one, so the scan cannot be
+    vectorised. A plain loop takes 0.15 us per record, a quarter of the total reading time. A loop
+    compiled by Numba was faster only from four million records on, and its import took 140 MB of
+    memory. The scan ends at the first record that is incomplete or has operation code 0.
+    """
+    view, unpack = buffer.data, PREFIX.unpack_from
+    stops = frozenset(np.flatnonzero(stop_at).tolist()) | {0}
+    at, size, last = 0, len(buffer), len(buffer) - PREFIX.size
+    offsets: list[int] = []
+    codes = bytearray()
+    while at <= last and len(offsets) < max_records:
+        code, length = unpack(view, at)
+        after = at + PREFIX.size + length
+        if after > size or code in stops:
+            break
+        offsets.append(at)
+        codes.append(code)
+        at = after
+    return np.array(offsets, dtype=np.int64), at, np.frombuffer(codes, dtype=np.uint8)
+
+
+def _definitions(
+    buffer: Bytes, begins: Int64s, ends: Int64s, codes: Bytes, end: int
+) -> tuple[list[Definition], int]:
+    wanted = ((codes == SCHEMA) | (codes == CHANNEL)) & (begins < end)
     at = np.flatnonzero(wanted)
     if len(at) > MAX_DEFINITIONS:
         raise BrokenRecordError(f"holds more than {MAX_DEFINITIONS} schemas and channels")
     definitions = [
         Definition(b, code, buffer[b + PREFIX.size : e].tobytes())
         for b, e, code in zip(
-            begins[at].tolist(), ends[at].tolist(), scan.opcode[at].tolist(), strict=True
+            begins[at].tolist(), ends[at].tolist(), codes[at].tolist(), strict=True
         )
     ]
-    messages = int(((scan.opcode == MESSAGE) & (begins < end)).sum())
+    messages = int(((codes == MESSAGE) & (begins < end)).sum())
     return definitions, int((begins < end).sum()) - messages - len(definitions)
 
 
