@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
@@ -50,11 +50,12 @@ def inflated(
         parts.append(part)
         size += len(part)
         if size >= BLOCK_BYTES or i + 1 == len(messages):
-            yield slice(first, i + 1), _joined(parts), bad
+            yield slice(first, i + 1), joined(parts), bad
             first, parts, bad, size = i + 1, [], {}, 0
 
 
-def _joined(parts: list[bytes]) -> Messages:
+def joined(parts: Sequence[bytes | memoryview]) -> Messages:
+    """Return messages in one buffer."""
     length = np.fromiter(map(len, parts), dtype=np.int64, count=len(parts))
     stop = np.cumsum(length)
     return Messages(np.frombuffer(b"".join(parts), dtype=np.uint8), stop - length, stop)

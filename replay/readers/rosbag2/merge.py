@@ -12,6 +12,8 @@ import numpy as np
 
 from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Block, Messages
 
+from .inflate import joined
+
 # Maximum payload bytes held back; beyond it, rows are yielded before their order is certain.
 HELD_BYTES: Final = 16 * BLOCK_BYTES
 
@@ -127,15 +129,12 @@ def _joined(blocks: list[Block]) -> Block:
         for rows in (cast("Messages", b.rows) for b in blocks)
         for i in range(len(rows))
     ]
-    length = np.fromiter(map(len, payloads), dtype=np.int64, count=len(payloads))
-    stop = np.cumsum(length)
-    buffer = np.frombuffer(b"".join(payloads), dtype=np.uint8)
     published = [block.publish_ns for block in blocks if block.publish_ns is not None]
     counters = [block.sequence for block in blocks if block.sequence is not None]
     return Block(
         blocks[0].topic,
         np.concatenate([block.log_ns for block in blocks]),
-        Messages(buffer, stop - length, stop),
+        joined(payloads),
         publish_ns=np.concatenate(published) if len(published) == len(blocks) else None,
         sequence=np.concatenate(counters) if len(counters) == len(blocks) else None,
     )
