@@ -80,6 +80,7 @@ HOW_OTHERS_DO: Final = {
     "detectors/training/samples.py": "files that the user names",
     "eval/landmarks.py": "files that the user names",
     "eval/logs/log.py": "a call of the user for one picture, which raises",
+    "eval/pipeline/visual.py": "frames with detections, thus decoded before",
     "eval/report/worst_boxes.py": "frames with detections, thus decoded before",
     "eval/studies/intersections/contact_sheet.py": "frames with detections, thus decoded before",
     "eval/vehicle/mounting.py": "a function of its own below, because it needs intrinsics",
