@@ -16,6 +16,9 @@ from crosscue.replay.errors import (
     EmptyResultError as EmptyResultError,
 )
 from crosscue.replay.errors import (
+    FitError as FitError,
+)
+from crosscue.replay.errors import (
     LogError as LogError,
 )
 from crosscue.replay.errors import (
