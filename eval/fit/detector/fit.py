@@ -137,8 +137,11 @@ def _class_lines(one: ClassFit, precision: float) -> list[str]:
             f"              precision at least {held.bound:.3f} with {CONFIDENCE:.0%} confidence: "
             f"{precision:g} {is_shown} shown"
         )
+    has_threshold = one.scores is not None and one.scores.threshold is not None
+    if held is not None and has_threshold and not held.of:
+        lines.append(f"  held out    no detection above it, recall 0.000 (0 of {held.labels:,})")
     if held is not None:
-        start = "" if held.of else "held out"
+        start = "" if has_threshold else "held out"
         lines.append(
             f"  {start:11} calibration error {held.error_before:.3f} before, "
             f"{held.error_after:.3f} after, {held.detections:,} detections"

@@ -140,6 +140,12 @@ def labelled_run(
     order = sorted(placed, key=lambda t: frames[t][0])
     sizes = [frames[t][1] for t in order]
     truth = _truth([placed[t] for t in order], sizes, of_labels, left_out)
+    # That no picture shows an object is a label, too.
+    if not truth and not labels.is_by_picture:
+        raise EmptyResultError(
+            f"{placed[order[0]].name} and {len(order) - 1} other labelled images: no box of a "
+            "class that the detector reports; use labels with some"
+        )
     numbers = {name: k for k, name in enumerate(classes)}
     found, not_judged = _found(run, chosen.name, order, of_found, numbers, left_out)
     return LabelledRun(
@@ -319,11 +325,6 @@ def _truth(
                 continue
             means = of_labels[one.label] if one.label else None
             rows.append((number, means, one.box, one.is_ignored or means is None, one.range_m))
-    if not rows:
-        raise EmptyResultError(
-            f"{pictures[0].name} and {len(pictures) - 1} other labelled images: no box of a class "
-            "that the detector reports; use labels with some"
-        )
     return rows
 
 
@@ -331,7 +332,7 @@ def _as_boxes(
     rows: Sequence[tuple[int, str | None, tuple[float, float, float, float], bool, float]],
     numbers: Mapping[str, int],
 ) -> LabelledBoxes:
-    picture, means, boxes, is_ignored, range_m = zip(*rows, strict=True)
+    picture, means, boxes, is_ignored, range_m = zip(*rows, strict=True) if rows else ((),) * 5
     label = [NOBODY if one is None else numbers.get(one, NOBODY - 1) for one in means]
     found = LabelledBoxes(
         np.array(picture, np.int64),

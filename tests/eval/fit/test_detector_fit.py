@@ -380,3 +380,40 @@ def test_damaged_labels_of_pictures_are_refused_with_their_line(
         read_box_labels(path)
 
     assert "\n" not in str(caught.value)
+
+
+def test_pictures_without_an_object_are_labels_to_test_on(tmp_path: Path) -> None:
+    run = two_labels_on_one_object(tmp_path)
+    labels = tmp_path / "none.csv"
+    labels.write_text("picture,car\n" + "".join(f"frame_{i}.png,no\n" for i in range(3)))
+
+    (one,) = crosscue.fit_detector(run, labels).classes
+
+    assert (one.labels, one.detections, one.right) == (0, 1, 0)
+    assert one.notes == ("not labelled",)
+
+
+@pytest.mark.slow
+def test_recall_is_said_where_nothing_is_above_the_threshold(drive: Path, tmp_path: Path) -> None:
+    """The run to test on has three lights, all with low scores."""
+    (tmp_path / "log").mkdir()
+    for number in range(3):
+        pixels = np.zeros((SIZE[1], SIZE[0]), np.uint8)
+        pixels[8:24, 16:32] = 140 + number
+        cv2.imwrite(str(tmp_path / "log" / f"frame_{number}.png"), pixels)
+    (tmp_path / "log" / "timestamps.txt").write_text("rate_hz: 10\n")
+    dark = crosscue.detect_drive(
+        tmp_path / "log", tmp_path / "run", detectors=[str(drive / "net.toml")]
+    )
+    labels = tmp_path / "dark.csv"
+    labels.write_text("picture,traffic light\n" + "".join(f"frame_{i}.png,1\n" for i in range(3)))
+
+    found = crosscue.fit_detector(
+        drive / "run",
+        picture_labels(drive, tmp_path / "lights.csv"),
+        test=[dark],
+        test_labels=[labels],
+        calibration="none",
+    )
+
+    assert "  held out    no detection above it, recall 0.000 (0 of 3)" in str(found)
