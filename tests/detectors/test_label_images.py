@@ -30,3 +30,7 @@ def test_drawn_object_is_recovered_with_box_mask_and_score(label: str) -> None:
     assert back.scores[0] == pytest.approx(0.8, abs=1 / 255)
     np.testing.assert_array_equal(back.boxes_px, [[10, 5, 12, 8]])
     np.testing.assert_array_equal(rle.decode_mask(back.masks[0], SIZE_PX)[5:8, 10:12], mask)
+
+
+def test_black_image_has_no_objects() -> None:
+    assert len(found()) == 0

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.localization.angles import circular_mean, wrap_all
+from crosscue.localization.angles import circular_mean, interpolate_angle, wrap_all
 from crosscue.localization.compass import CompassSettings, Matrix, heading
 from crosscue.localization.fit.compass import (
     HARD_IRON,
@@ -192,3 +192,12 @@ def test_persistence_recovers_the_correlation_time_of_errors(persists_s: float) 
     assert found.next_correlation == pytest.approx(kept, abs=0.02)
     assert found.independent == pytest.approx(3600.0 / (2 * persists_s), rel=0.25)
     assert not found.is_bound
+
+
+def test_interpolated_angles_take_the_shorter_way() -> None:
+    t_ns = np.array([0, 10], np.int64)
+    found = interpolate_angle(np.array([-1, 0, 5, 10, 11]), t_ns, np.array([3.0, -3.0]))
+
+    assert np.isnan(found[[0, 4]]).all()
+    assert max_difference_deg(found[1:4], np.array([3.0, math.pi, -3.0])) < 1e-9
+    assert np.isnan(interpolate_angle(t_ns, np.empty(0, np.int64), np.empty(0))).all()

@@ -42,3 +42,12 @@ def test_distinct_scales_of_four_wheels_are_recovered() -> None:
         off = one.scale - FRONT[one.setting]
         assert abs(off) < 4.0 * one.sd
         assert one.sd < 0.5 * abs(FRONT[one.setting] - 1.0)
+
+
+def test_equal_front_and_rear_speeds_yield_no_front_scales() -> None:
+    truth = drive(np.random.default_rng(seed=7))
+    rear = wheels(truth, CAR).wheels_mps
+    car = WheelSamples(truth.t_ns, np.hstack([rear, rear]))
+    made = integrate(car, CAR).increments
+
+    assert front_wheels(car, made, CAR, (int(truth.t_ns[0]), int(truth.t_ns[-1]))) == ()

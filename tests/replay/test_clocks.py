@@ -179,3 +179,11 @@ def test_memory_is_independent_of_log_length() -> None:
 
     peak(2)
     assert peak(80) < 1.5 * peak(8)
+
+
+def test_gaps_beyond_the_kept_ones_are_counted() -> None:
+    steps = np.full(60_000, 10 * MS)
+    steps[::10] = 100 * MS
+    log = log_report(START_NS + np.cumsum(steps), 60_000)
+
+    assert log.gaps == 6000 - 1

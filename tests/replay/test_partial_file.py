@@ -136,3 +136,17 @@ def test_run_after_kill_leaves_no_partial_files(
         assert cli.run(argv) == 0
         assert not _partials(out)
     assert left
+
+
+def test_files_of_other_programs_are_not_swept(tmp_path: Path) -> None:
+    others = [".a.txt.1234.partial", "a.partial", ".drive.crosscue-xyz.partial", ".a.partial"]
+    for name in others:
+        (tmp_path / name).write_text("of another program")
+    (tmp_path / f".folder.crosscue-{'0' * 16}.partial").mkdir()
+    (tmp_path / f".link.crosscue-{'0' * 16}.partial").symlink_to(tmp_path / others[0])
+    os.mkfifo(tmp_path / f".pipe.crosscue-{'0' * 16}.partial")
+    before = sorted(path.name for path in tmp_path.iterdir())
+
+    sweep(tmp_path, again=True)
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == before

@@ -20,6 +20,7 @@ from crosscue.replay.seal.seal import digests_of, read_seal, seal_path
 from support.accounted import read
 from support.can_files import candump, random_frames
 from support.every_format import EVERY_FORMAT
+from support.pictures import picture_folder
 from support.rosbag_files import rows_of, write_folder
 
 
@@ -294,3 +295,29 @@ def test_interrupted_seal_leaves_files_unchanged(
         assert "Traceback" not in capsys.readouterr().err
     assert seal_path(long_log).read_bytes() == before
     assert sorted(path.name for path in long_log.parent.iterdir()) == names
+
+
+def test_missing_and_new_files_are_reported_in_one_line_each(tmp_path: Path) -> None:
+    log = picture_folder(tmp_path / "front", 12, "rate_hz: 10\n")
+    assert run(["seal", str(log)]) == 0
+    for number in range(5):
+        (log / f"frame_{number}.png").unlink()
+    (log / "frame_99.png").write_bytes((log / "frame_7.png").read_bytes())
+
+    reported = [drop.detail for drop in read(log)[1].drops() if drop.reason == CHANGED]
+
+    assert reported == [
+        "missing: frame_0.png, frame_1.png, frame_2.png and 2 more",
+        "not in the seal: frame_99.png",
+    ]
+
+
+def test_log_added_to_sealed_folder_is_not_sealed(tmp_path: Path) -> None:
+    place = write_folder(tmp_path / "bag", rows_of(50))
+    assert run(["seal", str(place)]) == 0
+    late = place / "can.log"
+    late.write_bytes(candump(random_frames(30)))
+
+    assert read(late)[1].is_whole
+    assert "sealed" not in read(late)[1].integrity
+    assert not read(place)[1].is_whole

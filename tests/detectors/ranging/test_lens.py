@@ -48,3 +48,11 @@ def test_lenses_of_a_real_intersection_match_manual_labels(
     picture = np.asarray(cv2.imread(str(folder / f"{frame:02d}.jpg")), np.uint8)
 
     assert lens_of(picture, np.array(box, np.float64)) == lens
+
+
+def test_small_grey_or_outside_box_has_an_unknown_lens() -> None:
+    picture = housing("red")
+
+    assert lens_of(picture, BOX * 0.2) == "unknown"
+    assert lens_of(picture[:, :, 0].copy(), BOX) == "unknown"
+    assert lens_of(picture, BOX + 200.0) == "unknown"

@@ -54,3 +54,11 @@ def test_left_turn_is_positive() -> None:
 
     assert found is not None
     assert np.rad2deg(found.turned_rad) == pytest.approx(1.0, abs=0.15)
+
+
+def test_pictures_without_points_or_motion_yield_none() -> None:
+    black = np.zeros(SIZE_PX[::-1], np.uint8)
+    still = street(np.zeros(3), Rotation.identity())
+
+    assert travel_between(black, black, FOCAL_PX, CENTER_PX) is None
+    assert travel_between(still, still, FOCAL_PX, CENTER_PX) is None

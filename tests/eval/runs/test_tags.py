@@ -76,3 +76,13 @@ def test_damaged_tags_are_reported_and_not_overwritten(runs: Path) -> None:
     assert "3" in path.read_text()
     assert not (runs / "a/tuesday/tags.json").exists()
     assert "tags.json: unreadable" in crosscue.catalog(runs).left_out["a/monday"]
+
+
+def test_removing_the_last_tag_restores_the_run_folder(runs: Path) -> None:
+    before = tree(runs / "a/monday")
+
+    crosscue.tag_runs([runs / "a/monday"], {"weather": "rain"})
+    assert tree(runs / "a/monday") != before
+    crosscue.tag_runs([runs / "a/monday"], remove=["weather", "never_set"])
+
+    assert tree(runs / "a/monday") == before

@@ -69,3 +69,10 @@ def test_change_points_do_not_depend_on_order_of_drives_or_scale() -> None:
     assert scaled.by == pytest.approx(1000.0 * points[0].by)
     assert places(results(values[::-1])) == [[2]]
     assert places(results(values[:, ::-1])) == [[VERSIONS - 2]]
+
+
+def test_constant_missing_and_single_version_results_have_no_change() -> None:
+    assert places(results(np.ones((DRIVES, VERSIONS)))) == [[]]
+    assert places(results(np.ones((DRIVES, 1)))) == [[]]
+    assert places(results(np.full((DRIVES, VERSIONS), np.nan))) == [[]]
+    assert change_points({}) == {}

@@ -345,3 +345,7 @@ def test_trajectories_that_cannot_be_scored_are_refused(
 ) -> None:
     with pytest.raises(error, match=message):
         call()
+
+
+def test_statistics_of_empty_array_are_nan() -> None:
+    assert math.isnan(statistics(np.empty(0)).rmse)

@@ -19,6 +19,7 @@ from crosscue.eval.scoring.scene.belief import (
     judge_belief,
     log_score,
     reliability_bins,
+    score_belief,
 )
 from crosscue.eval.scoring.scene.detection import Definition
 from crosscue.eval.scoring.scene.ranges import judge_range, score_range
@@ -294,3 +295,18 @@ def test_true_ranges_are_interpolated_only_near_rows() -> None:
     assert start[:2] == pytest.approx([29.5, 0.5])
     assert end[0] == pytest.approx(39.5)
     assert math.isnan(start[2])
+
+
+def test_nan_values_are_excluded_and_counted() -> None:
+    broken = tables(
+        belief=belief_table({"intersection": {10: 0.95, 12: math.nan, 13: 0.95}, "left": {}}),
+        ranges=range_table(8, 45, math.nan),
+    )
+    judged = judge_approaches(broken, truth())
+    assert judged is not None
+
+    assert judged.rows_not_numbers == 1
+    assert score_belief(judge_belief(broken, truth()))["intersection"].left_out["not a number"] == 1
+    assert score_range(judge_range(broken, truth()))["start"].left_out == {"not a number": 37}
+    # A range that is not a number is not a range.
+    assert judged.results[0].why_not_detected == "no range"

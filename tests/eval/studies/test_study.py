@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +38,22 @@ from crosscue.eval.studies.town.settings import (
     RangeStudy,
     load_study,
 )
-from crosscue.localization.town.drive import DriveResult
+from crosscue.eval.studies.town.work import chunks_of, run
+from crosscue.localization.town.drive import DriveResult, Keys, drive_many
 from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
+from crosscue.replay.columns import Floats
 from crosscue.replay.errors import RunError, StudyFileError
+
+
+def counting(calls: list[int], fail_at: int | None = None) -> Callable[[TownDrive, Keys], Floats]:
+    def drive(settings: TownDrive, seeds: Keys) -> Floats:
+        calls.append(len(seeds))
+        if fail_at is not None and len(calls) >= fail_at:
+            raise MemoryError("the worker died here")
+        return drive_many(settings, seeds)
+
+    return drive
+
 
 TOWN = TownDrive(city=City(largest_km2=2.0))
 SMALL = LandmarkStudy(
@@ -294,3 +308,16 @@ def test_field_runs_are_reused(tmp_path: Path) -> None:
     assert all(run.is_whole and run.minutes == pytest.approx(2.0, abs=0.01) for run in first)
     with pytest.raises(RunError, match="other settings"):
         list(drive_field(FieldStudy(minutes=3.0), tmp_path, 1, through_log))
+
+
+def test_damaged_chunk_is_simulated_again(tmp_path: Path) -> None:
+    chunks = chunks_of(SMALL.cases(), SMALL.drives, SMALL.seed)
+    list(run(chunks, tmp_path, 1))
+    victim = tmp_path / "chunks" / f"{chunks[1].name}.parquet"
+    damaged = bytearray(victim.read_bytes())
+    damaged[len(damaged) // 3] ^= 0xFF
+    victim.write_bytes(damaged)
+    calls: list[int] = []
+    list(run(chunks, tmp_path, 1, drive=counting(calls)))
+
+    assert calls == [chunks[1].count]

@@ -74,3 +74,14 @@ def test_real_street_pictures_match_only_their_neighbours() -> None:
     assert ORB.match(seen[0], seen[1]).score > 100
     assert ORB.match(seen[2], seen[3]).score > 100
     assert max(ORB.match(seen[i], seen[j]).score for i in (0, 1) for j in (2, 3)) < 12
+
+
+@pytest.mark.parametrize("size", [(31, 31), (1, 1), (3000, 40), (40, 3000)])
+def test_features_of_any_picture_size_are_in_its_pixels(size: tuple[int, int]) -> None:
+    width, height = size
+    features = ORB.describe(wall(5, width, height))
+
+    assert (features.width_px, features.height_px) == size
+    if len(features):
+        assert (features.points_px <= [width, height]).all()
+        assert features.points_px.max() > 0.5 * max(size)

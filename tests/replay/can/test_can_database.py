@@ -158,3 +158,25 @@ def test_arxml_file_defines_frames(tmp_path: Path) -> None:
     huge = ARXML.replace("<LENGTH>16<", "<LENGTH>99999999999<")
     with pytest.raises(LogTooLargeError, match=r"bus\.arxml:30: length or position"):
         CanDatabase.load([write_file(tmp_path, huge, "bus.arxml")])
+
+
+def test_only_message_with_oversized_signals_is_not_decodable(tmp_path: Path) -> None:
+    broken = replace(YAW, length=4)
+
+    database = CanDatabase.load([write_file(tmp_path, dbc_text([broken, WHEEL]))])
+
+    assert database.named("Yaw").problem == "signal load does not fit into 4 bytes"
+    assert not database.named("Wheel").problem
+    assert any("Yaw cannot be decoded" in notice for notice in database.notices)
+
+
+def test_message_with_branch_but_no_multiplexer_is_not_decodable(tmp_path: Path) -> None:
+    text = dbc_text([YAW, WHEEL]).replace("SG_ state ", "SG_ state m3")
+
+    database = CanDatabase.load([write_file(tmp_path, text)])
+
+    assert (
+        database.named("Yaw").problem
+        == "signal state is multiplexed, but its multiplexer is not specified"
+    )
+    assert not database.named("Wheel").problem

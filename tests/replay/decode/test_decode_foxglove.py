@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
+from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import pytest
 from google.protobuf import (  # type: ignore[import-untyped]
     descriptor_pb2,
@@ -212,3 +214,17 @@ def test_invalid_json_message_is_dropped_alone(raw: bytes) -> None:
 def test_json_schema_that_is_not_an_object_is_refused() -> None:
     with pytest.raises(SchemaError, match="not a JSON object"):
         decoder_for(Topic("/t", "made.Thing", "json", b"[1, 2", "jsonschema"))
+
+
+def test_json_values_keep_dtype_and_missing_values_are_nan() -> None:
+    rows: list[Mapping[str, Any]] = [
+        {"n": 2**53 + 1, "b": True, "in": {"x": 1}},
+        {"n": 2, "b": False, "in": {"x": 0.5, "y": 2}, "s": "text", "l": [1, 2]},
+    ]
+    table = decoder_of(Topic("/t", "made.Thing", "json"))(json_block(*rows), Ledger("x")).rows
+
+    assert isinstance(table, Table)
+    assert table["n"].tolist() == [2**53 + 1, 2]
+    assert table["b"].dtype == np.bool_
+    np.testing.assert_array_equal(table["in.y"], [np.nan, 2.0])
+    np.testing.assert_array_equal(table["l.length"], [np.nan, 2.0])

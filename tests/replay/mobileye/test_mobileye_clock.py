@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from crosscue.replay.columns import Int64s
 from crosscue.replay.mobileye.clock import (
     SET_ANEW,
+    WENT_BACK,
     unwrap,
 )
 
@@ -66,3 +67,12 @@ def test_device_restart_is_followed_and_reported() -> None:
 
     np.testing.assert_allclose(found.image_ns[280:], image_ns[280:], atol=2 * MS)
     assert any(n.startswith(f"{SET_ANEW} (1 times") for n in found.notices)
+
+
+def test_log_clock_set_back_restarts_image_times() -> None:
+    image_ns, counter_ms = camera(100)
+    log_ns = np.where(np.arange(100) < 50, image_ns, image_ns - 10**12)
+    found = unwrap(counter_ms, log_ns)
+
+    np.testing.assert_allclose(found.image_ns, log_ns, atol=MS)
+    assert found.notices == (f"{WENT_BACK} (1 times, first at {log_ns[50]} ns)",)

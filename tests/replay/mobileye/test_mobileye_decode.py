@@ -15,6 +15,7 @@ from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import DevicePosition
+from crosscue.replay.mobileye.layout import VARIANTS
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from support.mobileye_frames import MS, frames, random_drive, status, values
 
@@ -153,3 +154,11 @@ def rows_of(table: Table | None) -> set[tuple[str, ...]]:
     skip = ("burst", "t_ns")
     names = [name for name in table.columns if name not in skip]
     return set(zip(*([str(v) for v in table[name]] for name in names), strict=True))
+
+
+def test_both_revisions_on_one_bus_are_a_notice() -> None:
+    blocks = [frames([status(0, 0)]), frames([status(0, 66, length=7)], [66 * MS])]
+    tables, ledger = decode(blocks)
+
+    assert [VARIANTS[k] for k in tables["status"]["layout"]] == ["classic", "2.32"]
+    assert any("status frames of both revisions" in n for n in ledger.notices)

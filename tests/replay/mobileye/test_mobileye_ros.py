@@ -181,3 +181,12 @@ def test_unused_messages_are_skipped_by_topic_and_reason() -> None:
         "/parsed_tx/lane": {"message was not decoded to columns": 1},
     }
     assert ledger.details[0].detail == "obstacle_pos_x"
+
+
+def test_obstacles_without_status_keep_their_own_time() -> None:
+    statuses, obstacles = obstacle_drive()
+    bag, ledger = tables_from_bag([statuses.take(np.arange(4) != 2), obstacles])
+
+    assert bag["obstacles"]["burst"].tolist() == [0, 0, 1, 1, -1, -1, 2, 2]
+    assert bag["obstacles"]["slot"].tolist() == [0, 1, 0, 1, -1, -1, 0, 1]
+    assert any("keep their own time" in n for n in ledger.notices)

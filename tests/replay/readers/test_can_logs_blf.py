@@ -17,12 +17,14 @@ from crosscue.replay.ledger import NOT_ASKED_TIME
 from crosscue.replay.logs.opening import open_log
 from support.can_files import (
     START_NS,
+    Sent,
     assert_equal_to_python_can,
     blf,
     by_bus,
     random_frames,
     read_back,
 )
+from support.data import shared
 
 
 def _log(folder: Path, content: bytes) -> Path:
@@ -149,3 +151,28 @@ def test_every_deleted_object_is_reported_as_dropped(
     assert found == by_bus(kept)
     assert ledger.topic("").dropped.total() == len(deleted)
     assert ledger.is_whole == (not deleted)
+
+
+def test_object_signature_inside_payload_is_ignored(tmp_path: Path) -> None:
+    frames = [Sent(f.t_ns, f.bus, 0x7, b"xLOBJabc", False) for f in random_frames(20)]
+
+    found, ledger = read_back(_log(tmp_path, blf(frames, container=333)))
+
+    assert found == by_bus(frames)
+    assert ledger.is_whole
+
+
+def test_invalid_containers_after_frames_are_reported(tmp_path: Path) -> None:
+    false = struct.pack("<4sHHLLH6xL4x", b"LOBJ", 16, 1, 0xFFFF, 10, 2, 0xFFFF)
+    nested = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 8, 10)
+
+    for junk in (false * 20_000, nested * 20_000, b"LOBJ" * 100_000):
+        found, ledger = read_back(_log(tmp_path, blf(random_frames(30)) + junk))
+
+        assert sum(map(len, found.values())) == 30
+        assert not ledger.is_whole
+
+
+def test_real_log_matches_python_can() -> None:
+    path = shared("can", "python_can", "issue_1905.blf")
+    assert_equal_to_python_can(path, _read_with_python_can(path), "can/{}")

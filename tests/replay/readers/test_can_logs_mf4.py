@@ -234,3 +234,22 @@ def test_time_range_reads_only_overlapping_blocks(
     assert account.skipped.total() == count - 2_000
     assert ledger.is_whole
     assert "of other times, were not read" in ledger.integrity
+
+
+@pytest.mark.slow
+def test_time_range_of_bus_log_equals_filtered_complete_pass() -> None:
+    path = shared(*REAL)
+    whole, _ = read_back(path)
+    times = sorted(f.t_ns for frames in whole.values() for f in frames)
+    for begin, end in ((0.5, 0.51), (0.0, 0.1), (0.98, 1.0), (0.3, 0.3)):
+        start_ns, end_ns = times[int(begin * len(times))], times[int(end * (len(times) - 1))]
+
+        part, ledger = read_back(path, Selection(None, start_ns, end_ns))
+
+        expected = {
+            name: [f for f in frames if start_ns <= f.t_ns < end_ns]
+            for name, frames in whole.items()
+        }
+        assert part == {name: frames for name, frames in expected.items() if frames}
+        assert ledger.is_whole
+        assert sum(account.found for account in ledger.accounts.values()) == len(times)

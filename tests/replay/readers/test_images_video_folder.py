@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.columns import Block, Images
+from crosscue.replay.limits import Limits
 from support.accounted import read
 from support.pictures import picture, picture_folder
 
@@ -65,3 +66,13 @@ def test_named_pipe_instead_of_picture_is_dropped(tmp_path: Path) -> None:
 
     assert len(pictures_read(blocks)) == 1
     assert ledger.topic("front").dropped == {"picture cannot be opened": 1}
+
+
+def test_picture_over_size_limit_is_skipped(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 3, "0.5\n1.5\n2.5")
+    (folder / "frame_1.png").write_bytes(picture(1) + bytes(5000))
+
+    blocks, ledger = read(folder, limits=Limits(message_bytes=4000))
+
+    assert len(pictures_read(blocks)) == 2
+    assert ledger.topic("front").skipped == {"picture over the size limit": 1}

@@ -12,6 +12,7 @@ from support.mcap_files import (
     ChunkOf,
     McapFile,
     Message,
+    attachment,
     channel,
     message,
     read_back,
@@ -103,3 +104,22 @@ def test_unknown_record_kinds_are_ignored_in_recording_without_chunks(tmp_path: 
 
     assert reading.messages == {"/a": [message_read(1, b"x")], "/b": [message_read(2, b"y")]}
     assert reading.ledger.is_whole
+
+
+def test_attachment_checksums_are_verified(tmp_path: Path) -> None:
+    good, bad = attachment("a.txt", b"text"), attachment("b.txt", b"text", crc=7)
+    file = McapFile([good, ChunkOf([*DEFINITIONS, message(1, 1)]), bad])
+
+    reading = read_back(stored(tmp_path / "x.mcap", file))
+
+    assert "1 of 2 attachments" in reading.ledger.integrity
+    assert any("attachments" in notice for notice in reading.ledger.notices)
+    assert reading.count() == 1
+
+
+def test_chunk_without_checksum_among_others_is_reported(tmp_path: Path) -> None:
+    chunks = [ChunkOf([*DEFINITIONS, message(1, 1)]), ChunkOf([message(1, 2)], crc=0)]
+    reading = read_back(stored(tmp_path / "x.mcap", McapFile(chunks)))
+
+    assert reading.count() == 2
+    assert any("1 of 2 chunks have no checksum" in notice for notice in reading.ledger.notices)

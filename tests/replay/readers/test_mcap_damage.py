@@ -265,3 +265,19 @@ def test_chunks_without_checksum_are_read_after_damaged_one(
 
     assert reading.count() == 575
     assert any(f"bytes {at} to " in drop.detail for drop in reading.ledger.drops())
+
+
+def test_chunk_with_zeroed_header_and_checksum_is_reported(tmp_path: Path) -> None:
+    parts = sound_parts("zstd", is_chunked=True)
+    third = parts[2]
+    assert isinstance(third, ChunkOf)
+    coded = bytearray(McapFile(parts).coded())
+    at = coded.index(third.coded())
+    coded[at + 9 : at + 9 + 40 + 4] = bytes(44)
+    path = tmp_path / "log.mcap"
+    path.write_bytes(coded)
+
+    reading = read_back(path)
+
+    assert reading.count() == 575
+    assert not reading.ledger.is_whole

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -143,3 +144,27 @@ def test_truncated_compressed_file_yields_readable_part(tmp_path: Path, storage:
     assert not reading.ledger.is_whole
     dropped = sum(a.dropped.total() for n, a in reading.ledger.accounts.items())
     assert dropped == len(rows) - len(reading.rows)
+
+
+def test_same_recording_in_two_formats_is_read_once(tmp_path: Path) -> None:
+    rows = rows_of(100)
+    folder = folder_of_parts(tmp_path / "bag", rows)
+    other = write_folder(tmp_path / "other", rows, "mcap")
+    shutil.copy(next(other.glob("*.mcap")), folder / "part_0.mcap")
+    write_metadata(folder, "part_0.db3")
+    reading = read_rows(folder)
+
+    assert by_topic(reading.rows) == by_topic(rows)
+    assert any("in another format" in sentence for sentence in reading.ledger.notices)
+
+
+def test_two_types_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
+    rows = rows_of(100)
+    folder = folder_of_parts(tmp_path / "bag", rows[:50], rows[50:])
+    with sqlite3.connect(folder / "part_1.db3") as db:
+        db.execute("UPDATE topics SET type = 'std_msgs/msg/Int8' WHERE name = '/can'")
+    db.close()
+    reading = read_rows(folder)
+    odd = count_by_topic(rows[50:])["/can"]
+
+    assert reading.ledger.topic("/can").skipped == {"another message type on the same topic": odd}

@@ -146,3 +146,17 @@ def test_mobileye_is_recognised_by_message_lengths() -> None:
     assert not Bus("can1", ids={(key, False): of for key, of in other_lengths.items()}).mobileye
     assert not Bus("can1", ids={(key, True): of for key, of in mobileye_lengths.items()}).mobileye
     assert not Bus("can1", ids={(0x738, False): {7}}).mobileye
+
+
+def test_signs_are_undetermined_without_wheels_and_gnss() -> None:
+    bend = 0.02 * np.sin(0.3 * T_S)
+    steering = np.arctan(2.7 * bend / SPEED) * 15.0
+    found = choices_among(
+        candidate_signal(SignalKind.SPEED, "A.SPEED", SPEED),
+        candidate_signal(SignalKind.YAW_RATE, "A.YAW", -bend),
+        candidate_signal(SignalKind.STEERING, "A.ANGLE", -steering),
+        with_gnss=False,
+    )
+
+    assert found.yaw_rates[0].verdict.agrees_with == 0
+    assert found.steering[0].verdict.agrees_with == 0
