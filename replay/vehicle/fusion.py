@@ -338,8 +338,9 @@ class Fusion(Section):
             raise _refused(
                 "kind combined needs [fusion.combined]; make it with: fit temporal --combined"
             )
-        for name in self.features if self.kind == "combined" and self.combined else ():
-            if name not in self.combined.intercepts or name not in self.combined.weights:
+        combined = self.combined if self.kind == "combined" else None
+        for name in self.features:
+            if combined is not None and not {name} <= combined.intercepts.keys() & combined.weights:
                 raise _refused(
                     f"combined: no feature {name!r}; fit it: crosscue fit temporal --combined"
                 )
