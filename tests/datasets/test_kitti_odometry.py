@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import crosscue
 from crosscue.datasets.adapters.kitti_odometry import read_kitti_poses, write_kitti_odometry_truth
 from crosscue.datasets.truth.truth import read_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
+from crosscue.replay.errors import LogFormatError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from support.kitti_odometry_drive import (
@@ -62,3 +64,13 @@ def test_drafted_vehicle_has_published_intrinsics(tmp_path: Path) -> None:
 
     assert camera.focal_px == FOCAL_PX
     assert camera.center_px == (607.19, 185.22)
+
+
+def test_sequence_without_poses_has_pictures_but_no_truth(tmp_path: Path) -> None:
+    folder = kitti_odometry_drive(tmp_path)
+    (tmp_path / "poses" / "04.txt").unlink()
+
+    with open_log(folder) as log:
+        assert [topic.name for topic in log.topics] == ["image_2"]
+    with pytest.raises(LogFormatError, match="sequences 00 to 10"):
+        write_kitti_odometry_truth(folder, tmp_path / "truth")

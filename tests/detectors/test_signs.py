@@ -14,6 +14,7 @@ from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.signs.detector import build, orb_points
 from crosscue.detectors.signs.matching import nearest, window_counts
 from crosscue.detectors.signs.templates import AMERICAN, Kind, draw_sign_template
+from crosscue.detectors.training.operating_point import Verdicts, rates_at, threshold_at_precision
 from crosscue.eval.cli import run
 from crosscue.replay.columns import Block, Bytes, Images, Messages, Topic
 from crosscue.replay.ledger import Ledger
@@ -230,3 +231,13 @@ def test_invalid_label_rows_are_reported_on_one_line(
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_threshold_is_the_lowest_that_meets_the_precision() -> None:
+    judged = Verdicts(np.array([0.9, 0.8, 0.7, 0.6]), np.array([True, True, False, True]), 4)
+
+    assert threshold_at_precision(judged, 0.95) == 0.8
+    assert threshold_at_precision(judged, 0.6) == 0.6
+    assert rates_at(judged, 0.8).precision == 1.0
+    assert rates_at(judged, 0.8).recall == 0.5
+    assert threshold_at_precision(Verdicts(np.array([0.9]), np.array([False]), 1), 0.95) is None

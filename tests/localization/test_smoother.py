@@ -132,3 +132,15 @@ def test_smoother_is_consistent_and_more_accurate_than_the_filter() -> None:
     assert low < np.mean(nees) < high
     assert np.sqrt(np.mean(smoother_m2)) < 0.9 * np.sqrt(np.mean(filter_m2))
     assert np.median(ends) < 0.2
+
+
+def test_gaps_and_inconsistent_shapes_are_refused() -> None:
+    made = straight(4, 0.5)
+    late = start_belief(9_000_000_000, 0.0, 0.0, 0.0)
+    early = start_belief(-1, 0.0, 0.0, 0.0)
+    with pytest.raises(ValueError, match="expected odometry after 9000000000 ns"):
+        smooth_poses(late, made, NO_HEADINGS)
+    with pytest.raises(ValueError, match="expected no gaps, got one at -1 ns"):
+        smooth_poses(early, made, NO_HEADINGS)
+    with pytest.raises(ValueError, match=r"expected xy_m \(1, 2\)"):
+        Fixes(np.zeros(1, np.int64), np.zeros((2, 2)), np.zeros((1, 2, 2)))

@@ -132,3 +132,16 @@ def test_unavailable_url_is_refused_in_one_line(
 
     assert "\n" not in str(caught.value)
     assert url in str(caught.value)
+
+
+def test_failed_fetch_leaves_no_file(
+    bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = _put(f"{bucket}/a.log", b"abc")
+    short = remote._Object(f"{bucket.removeprefix('memory:/')}/a.log", "a.log", 5, "")
+    monkeypatch.setattr(remote, "_objects", lambda *_: [short])
+
+    with pytest.raises(LogError, match=r"a\.log is not as long as its store reports"):
+        fetch_log(url)
+
+    assert not list((tmp_path / "store").rglob("a.log"))

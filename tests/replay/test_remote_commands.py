@@ -14,9 +14,11 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from crosscue.eval.cli import run as crosscue
+from crosscue.replay.base import Selection
 from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.files.identity import log_identity
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.write.convert import LogWriter
 from support.can_files import candump, random_frames
@@ -224,3 +226,16 @@ def test_estimate_of_remote_window_transfers_only_the_window(
     del web.files["drive.mcap"]
     assert crosscue(["estimate", str(out), "-q"]) == 4
     assert {one.name: one.read_bytes() for one in out.glob("*.parquet")} == before
+
+
+def test_missing_topic_of_remote_log_transfers_only_index(
+    drive: Path, web: Served, capsys: pytest.CaptureFixture[str]
+) -> None:
+    web.files["drive.mcap"] = drive.read_bytes()
+
+    with open_log(f"{web.base}/drive.mcap") as log:
+        assert not list(log.read(Ledger(""), Selection(frozenset({"none"}), 0, 1)))
+    assert crosscue(["info", "--quick", f"{web.base}/drive.mcap"]) == 0
+
+    assert web.base in capsys.readouterr().out
+    assert web.sent < 400_000

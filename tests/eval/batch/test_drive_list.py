@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
-from crosscue.replay.errors import CrosscueError, UsageError
+from crosscue.replay.errors import CrosscueError, LogError, UsageError
 
 
 def _touch(folder: Path, *names: str) -> Path:
@@ -205,3 +205,22 @@ def test_drive_names_are_unique_and_safe_file_names(texts: list[str]) -> None:
         assert name == Path(name).name
         assert name not in (".", "..")
         assert len(name.encode()) < 200
+
+
+def test_nested_data_set_folders_are_named_by_their_path(tmp_path: Path) -> None:
+    for route, segment in (("one", "40"), ("one", "41"), ("two", "40")):
+        (tmp_path / route / segment / "processed_log").mkdir(parents=True)
+
+    found = drives_of([str(tmp_path)])
+
+    assert _names(found.drives) == ["one__40", "one__41", "two__40"]
+
+
+def test_unreadable_folder_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+
+    with pytest.raises(LogError, match="Permission denied"):
+        drives_of([str(tmp_path)])

@@ -1,5 +1,6 @@
 """Progress of a batch, and details of its failures."""
 
+import json
 import math
 import os
 import subprocess
@@ -112,3 +113,14 @@ def test_stale_drive_of_another_machine_is_processed_again(tmp_path: Path) -> No
     assert states(tmp_path / "runs") == {"drive0": "running"}
     assert error_of_abandoned_drive(1.0e9) is None
     assert states(tmp_path / "runs") == {"drive0": "done"}
+
+
+@pytest.mark.parametrize("torn", ["", "[]", '{"drives": 3}', "{"])
+def test_invalid_plan_does_not_hide_started_drives(
+    batch: list[Job], tmp_path: Path, torn: str
+) -> None:
+    folder = tmp_path / "runs"
+    (folder / ".drives" / "plans" / "all.json").write_text(torn)
+
+    assert len(states(folder)) == len(batch)
+    assert json.loads((folder / ".drives" / "drive0.json").read_text())["exit_status"] == 0

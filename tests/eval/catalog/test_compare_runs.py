@@ -9,9 +9,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from crosscue.eval import cli
-from crosscue.eval.catalog.compare import compare_runs, read_tolerance
+from crosscue.eval.catalog.compare import compare_runs, open_scored, read_tolerance
 from crosscue.eval.runs.account import Account, line
 from crosscue.eval.runs.folder import open_run
+from crosscue.eval.scoring.by_drive import by_drive_table
 from crosscue.replay.errors import UsageError
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -161,3 +162,16 @@ def test_control_characters_in_names_are_not_printed(
 
     assert cli.run(["compare", *(str(run.path) for run in runs)]) == 1
     assert "\x1b" not in capsys.readouterr().out
+
+
+def test_metrics_of_unpaired_drives_are_not_compared(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        folder = tmp_path / name
+        folder.mkdir()
+        drives = {name: {"distance_m": 8.0}, "both": {"distance_m": float(name == "a")}}
+        (folder / "metrics.json").write_text(json.dumps({"pose": {"by_drive": drives}}))
+        pq.write_table(by_drive_table(iter([])), folder / "by_drive.parquet")
+
+    found = compare_runs(open_scored(tmp_path / "a"), open_scored(tmp_path / "b"))
+
+    assert [one.path for one in found.metrics] == ["pose.by_drive.both.distance_m"]

@@ -13,7 +13,7 @@ import pytest
 import crosscue
 from crosscue.eval import cli
 from crosscue.eval.failures.approach_level import flips_without_truth
-from crosscue.eval.failures.record import Failure, read_failures, write_failures
+from crosscue.eval.failures.record import Failure, distance_bin, read_failures, write_failures
 from crosscue.eval.scoring.columns import BeliefRows
 from support.scene_run import scene_run
 from support.scoring import at, truth_folder
@@ -173,3 +173,15 @@ def test_where_option_selects_runs(
     assert cli.run([*line, "--where", "false"]) == 1
     assert "no run where false" in capsys.readouterr().err
     assert cli.run([*line, str(drive[0]), "--where", "true"]) == 2
+
+
+def test_each_distance_has_one_bin() -> None:
+    assert [distance_bin(d) for d in (None, -1.0, 0.0, 9.9, 10.0, 79.9, 80.0)] == [
+        "unknown",
+        "0-10 m",
+        "0-10 m",
+        "0-10 m",
+        "10-20 m",
+        "40-80 m",
+        "80 m and more",
+    ]

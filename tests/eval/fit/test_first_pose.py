@@ -20,6 +20,7 @@ from crosscue.eval.fit.first_pose import with_start, with_start_of
 from crosscue.eval.fit.gnss_truth import write_gnss_truth
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.runs.folder import RunFolder, create
+from crosscue.eval.scoring.pose.smoother import score_smoother
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Floats, Table, Topic
 from crosscue.replay.errors import VehicleError
@@ -137,3 +138,12 @@ def test_fused_gnss_positions_bound_the_drift_of_odometry(tmp_path: Path) -> Non
 
     assert errors_m["start"] > 5.0
     assert errors_m["fuse"] < 1.0
+
+
+def test_smoother_uses_gnss_positions_of_the_filter(tmp_path: Path) -> None:
+    pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
+    vehicle = with_start([straight_drive()], LONG_WHEELS, EVERYTHING, gnss="fuse")
+    run = replayed(tmp_path / "run", vehicle)
+    truth = write_gnss_truth([straight_drive()], Vehicle(version=1), EVERYTHING, tmp_path / "truth")
+
+    assert score_smoother(run, truth, {}).smoother_rmse_m < 1.0

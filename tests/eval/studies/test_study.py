@@ -38,11 +38,11 @@ from crosscue.eval.studies.town.settings import (
     RangeStudy,
     load_study,
 )
-from crosscue.eval.studies.town.work import chunks_of, run
+from crosscue.eval.studies.town.work import assemble, chunks_of, run
 from crosscue.localization.town.drive import DriveResult, Keys, drive_many
 from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
 from crosscue.replay.columns import Floats
-from crosscue.replay.errors import RunError, StudyFileError
+from crosscue.replay.errors import RunError, StudyFileError, WorkerError
 
 
 def counting(calls: list[int], fail_at: int | None = None) -> Callable[[TownDrive, Keys], Floats]:
@@ -321,3 +321,19 @@ def test_damaged_chunk_is_simulated_again(tmp_path: Path) -> None:
     list(run(chunks, tmp_path, 1, drive=counting(calls)))
 
     assert calls == [chunks[1].count]
+
+
+def test_study_resumes_after_failed_worker(tmp_path: Path) -> None:
+    chunks = chunks_of(SMALL.cases(), SMALL.drives, SMALL.seed)
+    with pytest.raises(WorkerError, match="finished chunks are kept"):
+        list(run(chunks, tmp_path / "a", 1, drive=counting([], fail_at=5)))
+    kept = len(list((tmp_path / "a/chunks").glob("*.parquet")))
+    calls: list[int] = []
+    list(run(chunks, tmp_path / "a", 1, drive=counting(calls)))
+    assemble(chunks, tmp_path / "a")
+    clean = run_drives(SMALL, tmp_path / "b")
+
+    assert kept == 4
+    assert len(calls) == len(chunks) - kept
+    a, b = (folder / "drives.parquet" for folder in (tmp_path / "a", clean))
+    assert a.read_bytes() == b.read_bytes()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import resource
+import signal
 import sqlite3
 import subprocess
 import sys
@@ -21,6 +23,25 @@ from crosscue.localization.landmarks.database import (
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogError, LogFormatError, OutputError
 from support.landmark_files import database_of, place_at, some_features
+
+
+def _in_child(
+    path: Path, count: int, *more: str, max_bytes: int | None = None
+) -> subprocess.CompletedProcess[str]:
+    def limit() -> None:
+        if max_bytes is not None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, max_bytes))
+
+    return subprocess.run(
+        [sys.executable, "-c", WRITE_MANY, str(path), str(count), *more],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        preexec_fn=limit,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
 
 GRID = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0)), axis=-1).reshape(-1, 2) * 50.0
 
@@ -226,3 +247,18 @@ def test_query_distance_includes_the_landmark_covariance(tmp_path: Path) -> None
     with LandmarkDatabase(vague) as database:
         (one,) = database.near(np.zeros(2), cov)
     assert one.sigmas == pytest.approx(30.0 / np.sqrt(500.0))
+
+
+def test_full_disk_is_reported_and_leaves_previous_landmarks(tmp_path: Path) -> None:
+    """A size limit of the kernel has the effect of a full disk."""
+    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
+
+    done = _in_child(path, 200, max_bytes=200_000)
+
+    assert done.returncode == 1
+    assert "OutputError" in done.stderr
+    with LandmarkDatabase(path) as database:
+        assert [len(database.features(one.key)) for one in database] == [20, 20, 20]
+    fresh = tmp_path / "fresh.sqlite"
+    assert "OutputError" in _in_child(fresh, 200, max_bytes=200_000).stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]

@@ -20,6 +20,7 @@ from crosscue.localization.town.streets import (
     draw_goal,
     draw_landmarks,
     draw_place,
+    has_intersection,
     has_way,
     make_streets,
     node_position,
@@ -93,3 +94,10 @@ def test_landmarks_are_distinct_and_of_the_requested_density() -> None:
 
     assert np.mean([len(one) for one in drawn]) == pytest.approx(2.0 * streets.area_km2, rel=0.1)
     assert all(len(set(one.tolist())) == len(one) for one in drawn)
+
+
+def test_single_street_has_no_intersection() -> None:
+    ways = np.array([1, 5, 4], np.uint8)
+    street = Streets(np.arange(3.0), np.zeros(1), ways, np.ones(3, np.bool_), 1.0)
+
+    assert not has_intersection(street)

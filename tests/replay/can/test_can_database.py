@@ -180,3 +180,21 @@ def test_message_with_branch_but_no_multiplexer_is_not_decodable(tmp_path: Path)
         == "signal state is multiplexed, but its multiplexer is not specified"
     )
     assert not database.named("Wheel").problem
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "utf-8-sig", "utf-16"])
+def test_units_are_read_in_every_text_encoding(encoding: str, tmp_path: Path) -> None:
+    path = write_file(tmp_path, dbc_text([YAW]).encode(encoding))
+
+    assert CanDatabase.load([path]).named("Yaw").signal("rate").unit == "°/s"
+
+
+def test_messages_of_same_name_get_distinct_topic_names(tmp_path: Path) -> None:
+    text = dbc_text([YAW, replace(YAW, arbitration_id=0x124)])
+
+    database = CanDatabase.load([write_file(tmp_path, text)])
+
+    assert [m.topic_name for m in database.messages] == ["Yaw_0x123", "Yaw_0x124"]
+    assert database.named("Yaw_0x124").arbitration_id == 0x124
+    with pytest.raises(ValueError, match="2 messages are named 'Yaw'; choose one of: Yaw_0x123"):
+        database.named("Yaw")

@@ -214,3 +214,10 @@ def test_concurrent_loads_do_not_interfere(tmp_path: Path, cache_dir: Path) -> N
 
     assert [one.wait(timeout=60) for one in running] == [0, 0, 0]
     assert not list(cache_dir.glob(".*"))
+
+
+def test_old_cache_entries_are_removed(tmp_path: Path, cache_dir: Path) -> None:
+    for k in range(70):
+        CanDatabase.load([_dbc_file(tmp_path, name=f"{k}.dbc")])
+
+    assert len(list(cache_dir.iterdir())) == 64

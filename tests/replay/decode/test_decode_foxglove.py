@@ -228,3 +228,24 @@ def test_json_values_keep_dtype_and_missing_values_are_nan() -> None:
     assert table["b"].dtype == np.bool_
     np.testing.assert_array_equal(table["in.y"], [np.nan, 2.0])
     np.testing.assert_array_equal(table["l.length"], [np.nan, 2.0])
+
+
+def test_compressed_images_are_byte_ranges_of_payloads() -> None:
+    topic = proto_topic("CompressedImage", IMAGE)
+    cls = message_class(topic.schema, "CompressedImage")
+    pictures = [b"\xff\xd8" + bytes(300), b"\x89PNG\r\n\x1a\n" + bytes(9)]
+    payloads = []
+    for i, picture in enumerate(pictures):
+        message = stamped(cls, 5 + i, 7)
+        message.data, message.format, message.frame_id = picture, "jpeg", "front"
+        payloads.append(message.SerializeToString())
+    ledger = Ledger("made")
+
+    block = decoder_of(topic)(block_of("/t", [payloads[0], payloads[1], b""]), ledger)
+
+    assert isinstance(block.rows, Images)
+    assert block.rows.coding == ("jpeg", "png")
+    assert [block.rows.bytes_.payload(i).tobytes() for i in range(2)] == pictures
+    assert block.header_ns is not None
+    assert block.header_ns.tolist() == [5_000_000_007, 6_000_000_007]
+    assert ledger.topic("/t").skipped == {"empty picture": 1}

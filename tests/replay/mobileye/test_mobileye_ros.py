@@ -21,6 +21,7 @@ from crosscue.replay.mobileye.settings import MobileyeSettings
 from support.mobileye_frames import (
     MS,
     frames,
+    join,
     random_drive,
     random_words,
     status,
@@ -190,3 +191,8 @@ def test_obstacles_without_status_keep_their_own_time() -> None:
     assert bag["obstacles"]["burst"].tolist() == [0, 0, 1, 1, -1, -1, 2, 2]
     assert bag["obstacles"]["slot"].tolist() == [0, 1, 0, 1, -1, -1, 0, 1]
     assert any("keep their own time" in n for n in ledger.notices)
+
+
+def test_topics_of_other_types_are_ignored() -> None:
+    reader = RosMobileye("ros", {"/imu": "sensor_msgs/msg/Imu"}, Ledger("log"), BUS_SETTINGS)
+    assert reader(join([replace(frames([status(0, 0)]), topic="/imu")])) == []

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.replay.limits import DEFAULT_LIMITS
+from crosscue.replay.limits import DEFAULT_LIMITS, MIB
 from support.can_files import blf, random_frames
 from support.measured import measured
 from support.mf4_files import unsorted
@@ -186,3 +186,18 @@ def test_gzip_file_is_refused_without_decompression(tmp_path: Path) -> None:
     assert status == 4, output
     assert peak_mb < MAX_MB
     assert "gzip" in output
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["message", "file"])
+def test_max_chunk_option_limits_zstd_size_in_bag(tmp_path: Path, kind: str) -> None:
+    path = (
+        _in_db3(_zstd_with_declared_size)(tmp_path)
+        if kind == "message"
+        else _bag_with_zstd_file_of_declared_size(tmp_path)
+    )
+
+    status, output, _ = measured(["info", str(path), "--max-chunk", "2"])
+
+    assert status == (3 if kind == "message" else 4)
+    assert f"declares {BOMB_BYTES} bytes, the limit is {2 * MIB} (--max-chunk)" in output

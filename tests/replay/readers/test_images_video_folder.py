@@ -14,6 +14,9 @@ from crosscue.replay.limits import Limits
 from support.accounted import read
 from support.pictures import picture, picture_folder
 
+FIVE = "0.5\n1.5\n2.5\n3.5\n4.5\n"
+
+
 S = 1_000_000_000
 
 
@@ -76,3 +79,23 @@ def test_picture_over_size_limit_is_skipped(tmp_path: Path) -> None:
 
     assert len(pictures_read(blocks)) == 2
     assert ledger.topic("front").skipped == {"picture over the size limit": 1}
+
+
+def test_coding_is_detected_from_content_not_suffix(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5")
+    (folder / "frame_1.png").write_bytes(picture(1, ".jpg"))
+
+    (block,), _ = read(folder)
+
+    assert isinstance(block.rows, Images)
+    assert block.rows.coding == ("png", "jpeg")
+
+
+def test_numbering_gap_with_matching_number_of_times_is_reported(tmp_path: Path) -> None:
+    folder = picture_folder(tmp_path / "front", 6, FIVE)
+    (folder / "frame_2.png").unlink()
+
+    blocks, ledger = read(folder)
+
+    assert len(pictures_read(blocks)) == 5
+    assert "1 numbers are missing" in ledger.notices[0]

@@ -12,6 +12,7 @@ import pytest
 import zstandard
 
 from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.mcap.reader import McapLog
 from support.mcap_damage import Kind, copies, judge, sound_files, sound_parts
@@ -280,4 +281,31 @@ def test_chunk_with_zeroed_header_and_checksum_is_reported(tmp_path: Path) -> No
     reading = read_back(path)
 
     assert reading.count() == 575
+    assert not reading.ledger.is_whole
+
+
+def test_file_truncated_while_open_is_reported(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    coded = McapFile(sound_parts("zstd", is_chunked=True)).coded()
+    path.write_bytes(coded)
+    ledger = Ledger(str(path))
+    with McapLog(path, DEFAULT_LIMITS) as log:
+        with path.open("r+b") as stream:
+            stream.truncate(len(coded) // 2)
+        given = sum(len(block) for block in log.read(ledger))
+
+    assert 200 < given < 400
+    assert sum(a.dropped.total() for a in ledger.accounts.values()) == 600 - given
+
+
+def test_recording_after_truncated_one_is_read(tmp_path: Path) -> None:
+    first = McapFile(sound_parts("zstd", is_chunked=True)).coded()
+    other = [schema(1, "c/D"), channel(1, 1, "/other"), *(message(1, i, b"o") for i in range(9))]
+    path = tmp_path / "log.mcap"
+    path.write_bytes(first[: len(first) // 2] + McapFile([ChunkOf(other)]).coded())
+
+    reading = read_back(path)
+
+    assert len(reading.messages["/other"]) == 9
+    assert 200 < reading.count() < 400
     assert not reading.ledger.is_whole

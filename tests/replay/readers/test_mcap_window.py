@@ -123,3 +123,17 @@ def test_wrong_time_in_index_without_checksum_is_detected(tmp_path: Path) -> Non
 
     assert [m[0] for m in reading.messages["/t0"]] == [*range(405, 410), *range(500, 505)]
     assert any("does not match the chunk" in notice for notice in reading.ledger.notices)
+
+
+def test_inconsistent_message_counts_are_reported(tmp_path: Path) -> None:
+    file = McapFile([*DEFINITIONS, *map(chunk, range(9))], summary_crc=False)
+    counts = struct.pack("<HQ", 0, 90)
+    before, _, after = file.coded().rpartition(counts)
+    coded = before + struct.pack("<HQ", 0, 91) + after
+    path = tmp_path / "x.mcap"
+    path.write_bytes(coded)
+
+    reading = read_back(path, Selection(None, 400, 405))
+
+    assert any("do not add up" in notice for notice in reading.ledger.notices)
+    assert reading.ledger.accounts["/t0"].dropped.total() == 1

@@ -168,3 +168,16 @@ def test_two_types_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
     odd = count_by_topic(rows[50:])["/can"]
 
     assert reading.ledger.topic("/can").skipped == {"another message type on the same topic": odd}
+
+
+def test_messages_of_unreadable_listed_file_are_dropped(tmp_path: Path) -> None:
+    rows = rows_of(300)
+    folder = folder_of_parts(tmp_path / "bag", rows[:100], rows[100:])
+    write_metadata(folder, "part_0.db3", "part_1.db3", counts=count_by_topic(rows))
+    (folder / "part_1.db3").write_bytes(b"nothing of the kind")
+    reading = read_rows(folder)
+
+    assert by_topic(reading.rows) == by_topic(rows[:100])
+    dropped = sum(account.dropped.total() for account in reading.ledger.accounts.values())
+    assert dropped == 200
+    assert any("part_1.db3" in sentence for sentence in reading.ledger.notices)

@@ -282,3 +282,22 @@ def _as_text(value: Any) -> str:
     if isinstance(value, list):
         return "[" + ", ".join(map(_as_text, value)) + "]"
     return repr(value.tolist()) if isinstance(value, np.ndarray) else repr(value)
+
+
+def test_from_to_and_topics_select_messages(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, out = tmp_path / "in.mcap", tmp_path / "out.mcap"
+    write_source(source)
+    part = ["--topics", "/imu", "--from", "10000000000ns", "--to", "20000000000ns"]
+
+    status = crosscue(["convert", str(source), "-o", str(out), *part, "--json"])
+
+    report = json.loads(capsys.readouterr().out)
+    assert status == 0
+    assert {name: row["messages"] for name, row in report["written"].items()} == {"/imu": 10}
+    for account in report["topics"].values():
+        skipped, lost = sum(account["skipped"].values()), sum(account["dropped"].values())
+        assert account["found"] == account["written"] + skipped
+        if account["declared"] is not None:
+            assert account["declared"] == account["found"] + lost
