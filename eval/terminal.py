@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
@@ -77,14 +77,6 @@ class ProgressLine:
         )
         # Nothing is drawn before the first progress.
         bar.start()
-
-    def counting(self, unit: str, per: float = 1.0) -> Callable[[float, float | None], None]:
-        """Return a callback for the amount done and the total, in 1/``per`` of the shown unit."""
-
-        def count(done: float, of: float | None) -> None:
-            self.at(Done(done / per, None if of is None else of / per, unit))
-
-        return count
 
     def end(self) -> None:
         """Remove the line."""
