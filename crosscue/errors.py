@@ -19,6 +19,7 @@ from crosscue.replay.errors import (
     FitError as FitError,
 )
 from crosscue.replay.errors import (
+    FitError as FitError,
     LogError as LogError,
 )
 from crosscue.replay.errors import (
