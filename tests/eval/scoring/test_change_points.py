@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring import change_points as module
-from crosscue.eval.scoring.change_points import FALSE_ALARMS, Results, change_points
+from crosscue.eval.scoring.change_points import FALSE_ALARMS, MIN_PLACES, Results, change_points
 
 DRIVES, VERSIONS = 8, 6
 
@@ -76,3 +76,19 @@ def test_constant_missing_and_single_version_results_have_no_change() -> None:
     assert places(results(np.ones((DRIVES, 1)))) == [[]]
     assert places(results(np.full((DRIVES, VERSIONS), np.nan))) == [[]]
     assert change_points({}) == {}
+
+
+def test_drives_of_one_place_count_once_and_are_shuffled_alike() -> None:
+    rng = np.random.default_rng(6)
+    values = history(rng, {3: 1.0}, drives=12)
+
+    def at(places: int) -> list[int]:
+        where = np.arange(12) % places
+        (found,) = change_points({"a": Results(values, np.ones(12), where)}).values()
+        return [point.at for point in found]
+
+    assert at(12) == at(MIN_PLACES) == [3]
+    assert at(MIN_PLACES - 1) == []
+    alike = module._shuffled(values, np.ones(values.shape, np.bool_), np.zeros(12, np.int64))
+    first = np.array([[np.flatnonzero(values[d] == one)[0] for one in alike[7, d]] for d in (0, 5)])
+    assert (first[0] == first[1]).all()
