@@ -345,3 +345,11 @@ def test_train_mask_rcnn_measures_a_network_without_training(
     reported = capsys.readouterr().out
     assert "embedded on 3 pictures, 100 proposals" in reported
     assert "score from 0.95" in reported
+
+
+def test_picture_of_another_size_than_annotated_is_refused(tmp_path: Path) -> None:
+    labelled = _changed(tmp_path, images=_with({"width": 130, "height": 97}))
+    sampler = Sampler(labelled, plan_of(), WINDOW, 0)
+
+    with pytest.raises(SchemaError, match=r"0\.png: expected a picture of 130 x 97"):
+        [sampler(number) for number in range(20)]

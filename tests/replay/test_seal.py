@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,17 +12,19 @@ import numpy as np
 import pytest
 
 from crosscue.eval.cli import run
+from crosscue.replay.base import Selection
 from crosscue.replay.errors import LogError
 from crosscue.replay.formats import FORMATS
-from crosscue.replay.ledger import CHANGED, DIFFERS
+from crosscue.replay.ledger import CHANGED, DIFFERS, Ledger
 from crosscue.replay.limits import MIB
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.seal import seal as sealing
 from crosscue.replay.seal.seal import digests_of, read_seal, seal_path
 from support.accounted import read
 from support.can_files import candump, random_frames
 from support.every_format import EVERY_FORMAT
 from support.pictures import picture_folder
-from support.rosbag_files import rows_of, write_folder
+from support.rosbag_files import rows_of, write_bag, write_folder
 
 
 def _sealed(folder: Path, kind: str) -> Path:
@@ -321,3 +324,36 @@ def test_log_added_to_sealed_folder_is_not_sealed(tmp_path: Path) -> None:
     assert read(late)[1].is_whole
     assert "sealed" not in read(late)[1].integrity
     assert not read(place)[1].is_whole
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["mcap", "rosbag1"])
+def test_window_of_indexed_log_checks_only_its_blocks(tmp_path: Path, kind: str) -> None:
+    rows = rows_of(40_000)
+    if kind == "mcap":
+        log = next(write_folder(tmp_path / "bag", rows, "mcap").glob("*.mcap"))
+    else:
+        log = write_bag(tmp_path / "log.bag", rows, chunk_bytes=300_000)
+    assert log.stat().st_size > 3 * MIB
+    assert run(["seal", str(log)]) == 0
+    total = read_seal(seal_path(log)).blocks
+    early = Selection(end_ns=rows[200].log_ns)
+
+    def losses(selection: Selection) -> list[str]:
+        ledger = Ledger(str(log))
+        with open_log(log) as opened:
+            for _ in opened.read(ledger, selection):
+                pass
+        (checked,) = re.findall(r"(\d+) of \d+ blocks|$", ledger.integrity)[:1]
+        assert selection != early or 0 < int(checked) < total, ledger.integrity
+        return [drop.detail for drop in ledger.drops() if drop.reason == DIFFERS]
+
+    assert losses(early) == losses(Selection()) == []
+    middle = total // 2
+    _flip(log, middle * MIB + 77)
+    assert losses(early) == []
+    assert losses(Selection()) == [f"{log.name}: bytes {middle * MIB} to {(middle + 1) * MIB}"]
+    _flip(log, middle * MIB + 77)
+    at = rows[10].payload[4:20]
+    _flip(log, log.read_bytes().index(at)) if at in log.read_bytes() else _flip(log, 5000)
+    assert losses(early) == [f"{log.name}: bytes 0 to {MIB}"]

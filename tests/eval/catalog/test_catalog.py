@@ -7,7 +7,8 @@ import pytest
 import crosscue
 from crosscue.eval.batch.merge import merge_runs
 from crosscue.eval.runs.account import Account, Line
-from crosscue.eval.runs.folder import MANIFEST, RunFolder, create
+from crosscue.eval.runs.folder import MANIFEST, TIMINGS, RunFolder, create, write_timings
+from crosscue.eval.runs.manifest import Timings
 from crosscue.replay.errors import UsageError
 from support.catalog_runs import add_run, runs_below
 
@@ -131,3 +132,20 @@ def test_table_with_damaged_data_pages_is_left_out(tmp_path: Path) -> None:
     assert rows.to_pylist() == [{"run": "good", "n": 50, "ok": True}]
     assert found.left_out.keys() == {"torn"}
     assert "belief.parquet: damaged" in found.left_out["torn"]
+
+
+def test_wall_time_comes_from_timings_file_which_may_be_missing_or_damaged(tmp_path: Path) -> None:
+    for name in ("timed", "without", "torn"):
+        write_timings(add_run(tmp_path / name, name), Timings(seconds=2.5))
+    (tmp_path / "without" / TIMINGS).unlink()
+    (tmp_path / "torn" / TIMINGS).write_text('{"seconds"')
+
+    found = crosscue.catalog(tmp_path)
+
+    rows = found.query("select run, seconds, exit_status from runs").to_pylist()
+    assert {row["run"]: row["seconds"] for row in rows} == {
+        "timed": 2.5,
+        "without": None,
+        "torn": None,
+    }
+    assert not found.left_out

@@ -175,3 +175,11 @@ def test_metrics_of_unpaired_drives_are_not_compared(tmp_path: Path) -> None:
     found = compare_runs(open_scored(tmp_path / "a"), open_scored(tmp_path / "b"))
 
     assert [one.path for one in found.metrics] == ["pose.by_drive.both.distance_m"]
+
+
+def test_damaged_scores_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good, worse = _pair(tmp_path)
+    for text in ("{", "[]", "[" * 100_000):
+        (worse / "score" / "metrics.json").write_text(text)
+        assert cli.run(["compare", str(good), str(worse)]) == 4
+        assert "run crosscue score again" in capsys.readouterr().err

@@ -19,7 +19,7 @@ from crosscue.eval.fit.truth_check import check_truth
 from crosscue.eval.runs.folder import write_manifest
 from crosscue.eval.runs.manifest import EstimateManifest
 from crosscue.eval.training.mask_rcnn import MaskRcnnTrainingSettings
-from crosscue.replay.errors import OutputError, UsageError
+from crosscue.replay.errors import OutputError, SchemaError, UsageError
 from crosscue.replay.progress import watching
 from support.scene_run import SIZE, scene_run
 from support.scoring import at, truth_folder
@@ -134,3 +134,29 @@ def test_deleted_run_is_left_out_of_the_export_with_its_reason(worst: Path, tmp_
     assert run == gone.run
     assert "no manifest.json" in str(reason)
     assert found.pictures == len({one.t_ns for one in kept})
+
+
+def test_missing_pictures_are_counted_and_unknown_or_duplicate_ones_refused(
+    exported: Path, tmp_path: Path
+) -> None:
+    tree = json.loads(exported.read_text())
+    gone = tree["images"].pop()
+    tree["annotations"] = [one for one in tree["annotations"] if one["image_id"] != gone["id"]]
+    (tmp_path / "fewer.json").write_text(json.dumps(tree))
+    found = crosscue.import_truth(
+        tmp_path / "fewer.json", tmp_path / "fewer", export=exported.parent
+    )
+    assert isinstance(found, ImportedLabels)
+    assert found.missing == 1
+
+    tree["images"].append({**tree["images"][0], "id": 999})
+    (tmp_path / "twice.json").write_text(json.dumps(tree))
+    with pytest.raises(SchemaError, match=r"expected once, found 2 times"):
+        crosscue.import_truth(tmp_path / "twice.json", tmp_path / "twice", export=exported.parent)
+    tree["images"].pop()
+
+    tree["images"][0]["file_name"] = "another.jpg"
+    (tmp_path / "other.json").write_text(json.dumps(tree))
+    with pytest.raises(SchemaError, match=r"another.jpg: not in the export"):
+        crosscue.import_truth(tmp_path / "other.json", tmp_path / "other", export=exported.parent)
+    assert not (tmp_path / "other").exists()

@@ -249,3 +249,34 @@ def test_compressed_images_are_byte_ranges_of_payloads() -> None:
     assert block.header_ns is not None
     assert block.header_ns.tolist() == [5_000_000_007, 6_000_000_007]
     assert ledger.topic("/t").skipped == {"empty picture": 1}
+
+
+def test_unknown_protobuf_type_has_dotted_columns() -> None:
+    fields = (
+        STAMP,
+        ("count", 2, F.TYPE_UINT64),
+        ("gain", 3, F.TYPE_FLOAT),
+        ("on", 4, F.TYPE_BOOL),
+        ("list", 5, F.TYPE_INT32, "", True),
+        ("again", 6, F.TYPE_MESSAGE, ".foxglove.Made"),
+        ("name", 7, F.TYPE_STRING),
+    )
+    topic = proto_topic("Made", fields)
+    cls = message_class(topic.schema, "Made")
+    message = stamped(cls, 9, 1)
+    message.count, message.gain, message.on = 2**64 - 1, 0.5, True
+    message.list.extend([1, 2, 3])
+    message.again.count = 5
+    ledger = Ledger("made")
+
+    block = decoder_of(topic)(block_of("/t", [message.SerializeToString()]), ledger)
+
+    assert isinstance(block.rows, Table)
+    assert {name: column.tolist() for name, column in block.rows.columns.items()} == {
+        "count": [2**64 - 1],
+        "gain": [0.5],
+        "on": [True],
+        "list.length": [3],
+    }
+    assert block.header_ns is not None
+    assert block.header_ns.tolist() == [9_000_000_001]

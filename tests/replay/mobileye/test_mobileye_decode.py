@@ -162,3 +162,9 @@ def test_both_revisions_on_one_bus_are_a_notice() -> None:
 
     assert [VARIANTS[k] for k in tables["status"]["layout"]] == ["classic", "2.32"]
     assert any("status frames of both revisions" in n for n in ledger.notices)
+
+
+def test_rows_that_are_not_can_frames_are_refused() -> None:
+    decoder = MobileyeDecoder("can1", Ledger("log"))
+    with pytest.raises(ValueError, match="can1: expected CanFrames, got Table"):
+        decoder(Block("can1", np.zeros(0, dtype=np.int64), Table({})))

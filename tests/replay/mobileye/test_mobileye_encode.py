@@ -10,11 +10,25 @@ from hypothesis import strategies as st
 from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
-from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
+from crosscue.replay.mobileye.can.encode import LATENCY_NS, bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.layout import Columns, Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from support.mobileye_frames import MS, block_of, random_drive, random_words, values
+
+
+def encode_burst(
+    image_ns: int,
+    objects: Table,
+    settings: MobileyeSettings,
+    *,
+    latency_ns: int = LATENCY_NS,
+) -> Block:
+    """Return the frames of one image: a status frame, then A, B and C of each sent obstacle."""
+    times = np.array([image_ns], dtype=np.int64)
+    objects = Table({**objects.columns, "t_ns": np.full(len(objects), image_ns, dtype=np.int64)})
+    return encode_tables(bursts_of(times, objects, settings, latency_ns=latency_ns), settings)
+
 
 ROTATED = MobileyeSettings(mounting=DevicePosition(1.85, -0.1, 0.02))
 UNROTATED = MobileyeSettings(mounting=DevicePosition(1.85, -0.1))
@@ -154,3 +168,18 @@ def test_decoded_obstacles_are_within_half_a_step(seed: int, n: int) -> None:
         radar[is_matched], values(sent, "radar_vx_mps")[is_matched], atol=1 / 32
     )
     assert np.isnan(radar[~is_matched]).all()
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("width_m", np.nan, r"obstacles width_m, row 0: cannot encode nan; expected 0 to 12.5 m"),
+        ("type", 9, r"obstacles type, row 0: cannot encode 9; expected 0 to 7"),
+        ("obstacle_id", -1, r"obstacles obstacle_id, row 0: cannot encode -1; expected 0 to 255"),
+        ("radar_x_m", 400.0, r"obstacles radar_x_m, row 0: cannot encode"),
+    ],
+)
+def test_value_out_of_message_range_is_refused(column: str, value: float, message: str) -> None:
+    objects = Table({"x_m": np.array([30.0]), "y_m": np.array([0.0]), column: np.array([value])})
+    with pytest.raises(ValueError, match=message):
+        encode_burst(10**18, objects, UNROTATED)

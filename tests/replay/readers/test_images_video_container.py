@@ -163,3 +163,13 @@ def test_damaged_video_is_read_or_refused_in_one_line(tmp_path: Path, at: int, j
         blocks = []
         assert "\n" not in str(error)  # noqa: PT017
     assert sum(len(b) for b in blocks) <= 2 * N
+
+
+def test_constant_rate_is_reported(tmp_path: Path) -> None:
+    path = video(tmp_path / "a.mp4", N, "libx264", NO_REORDERING)
+    path.with_suffix(".txt").write_text("rate_hz: 10")
+
+    blocks, ledger = read(path)
+
+    assert [t for b in blocks for t in b.log_ns.tolist()] == [100_000_000 * i for i in range(N)]
+    assert "times are computed from a constant rate of 10 Hz, from 0 on" in ledger.notices

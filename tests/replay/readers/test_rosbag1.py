@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag1 import Reader
 
-from crosscue.replay.errors import LogFormatError
+from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.limits import Limits
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.rosbag1.reader import BagLog
@@ -260,3 +260,8 @@ def test_any_damage_is_reported(tmp_path: Path, kind: str) -> None:
             silent.append((how, verdict))
 
     assert not silent
+
+
+def test_encrypted_bag_is_refused_with_instructions(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"encrypted by 'rosbag/AesCbcEncryptor'.*rosbag decrypt"):
+        open_log(bag(tmp_path / "a.bag", encryptor=b"rosbag/AesCbcEncryptor"))
