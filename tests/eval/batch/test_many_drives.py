@@ -133,17 +133,16 @@ from crosscue.eval.cli import _guarded
 from crosscue.eval.batch.jobs import run_many
 from crosscue.eval.batch.processes import Processes
 from support.drive_work import letters, write_jobs
-import argparse, types
+import argparse
 
 def run(args):
     run_many(write_jobs(Path(sys.argv[1]), ["slow", "slow", "slow"]), letters, Processes(2))
-    return 0
 
 if __name__ == "__main__":
     # Tests started in the background of a shell ignore this signal.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     args = argparse.Namespace(verbose=False, quiet=True, json=False)
-    sys.exit(_guarded(types.SimpleNamespace(run=run), args, argparse.ArgumentParser()))
+    sys.exit(_guarded(run, args, argparse.ArgumentParser()))
 """
 
 
