@@ -512,7 +512,7 @@ def _over_drive(graph: FactorGraph, fusion: Fusion) -> TemporalFilter | None:
     if fusion.kind not in ("temporal", "combined"):
         return None
     if fusion.temporal is None or (fusion.kind == "combined" and fusion.combined is None):
-        raise ValueError(f"fusion: expected what crosscue fit {fusion.kind} wrote, got None")
+        raise ValueError("fusion.temporal: expected what crosscue fit temporal wrote, got None")
     model = temporal_model(graph, fusion.temporal)
     if fusion.kind == "combined" and fusion.combined is not None:
         return CombinedFilter(graph, model, fusion.combined)

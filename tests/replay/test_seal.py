@@ -108,7 +108,7 @@ def test_changed_byte_is_reported_with_its_block(
     assert status in (3, 4)
     assert "the seal" in "".join(capsys.readouterr()) or status == 4
     assert run(["check", str(log)]) == 3
-    assert f"{name}: bytes 0 to {size} differ from the seal" in capsys.readouterr().err
+    assert f"{name}: bytes 0 to {size} differ from the seal" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("is_cut", [True, False])
