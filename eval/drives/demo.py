@@ -19,6 +19,7 @@ from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.files import door
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.progress import Progress, emit
+from crosscue.replay.safe_text import terminal_width, wrapped
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
 
@@ -124,7 +125,8 @@ class Demo(Result):
         """Yield what was found, the scores and the summary of the replay."""
         whose = "our annotations" if self.drive.attribution else "the truth of the simulation"
         yield f"against {whose}:"
-        yield from judged_sentences(self.scored.scored.one)
+        for sentence in judged_sentences(self.scored.scored.one):
+            yield wrapped(sentence, min(terminal_width(), 80), lead="")
         yield ""
         yield repr(self.scored)
         yield ""
