@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.detectors.base import Detections, Found
 from crosscue.detectors.cues.observed import Place
 from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.images import Encoded
@@ -20,23 +21,31 @@ from crosscue.eval.runs.stored_images import pictures_at, run_camera
 from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import CrosscueError
+from crosscue.replay.vehicle.cue_table import CUES
 
 WIDTH_PX: Final = 800
 SMALL_PX: Final = 240
 QUALITY: Final = 72
+# Scores from which a detection is drawn in a report: of any object, and of one whose cue was found.
+LIKELY: Final = 0.5
+COUNTED: Final = 0.3
 SIDES: Final = ("left", "straight", "right")
 
 # Callback for the time of a frame, its picture and its thumbnail, both as JPEG.
 Keep = Callable[[int, bytes, bytes], None]
 
 
-def draw_pictures(run: RunFolder, times: Iterable[int], keep: Keep) -> str:
+def draw_pictures(
+    run: RunFolder, times: Iterable[int], keep: Keep, *, has_candidates: bool = True
+) -> str:
     """Draw some frames of a run.
 
     Args:
         run: The run.
         times: Times of the frames, as in the run's tables.
         keep: Called for each picture that could be read.
+        has_candidates: False to draw only likely detections (``LIKELY``, or ``COUNTED`` where
+            their cue was found), without those stored in case other frames support them.
 
     Returns:
         The reason why pictures are missing; empty if none is.
@@ -54,7 +63,10 @@ def draw_pictures(run: RunFolder, times: Iterable[int], keep: Keep) -> str:
             regions = partial(_regions, run, places.get(t_ns))
             frame = found.get(t_ns)
             results = () if frame is None else frame.found
-            canvas = draw_frame(picture, results, cues.get(t_ns, {}), regions, WIDTH_PX)
+            counts = cues.get(t_ns, {})
+            if not has_candidates:
+                results = tuple(_likely(one, _labels(run, counts)) for one in results)
+            canvas = draw_frame(picture, results, counts, regions, WIDTH_PX)
             if t_ns in plans:
                 canvas = _with_plan(canvas, plans[t_ns])
             keep(t_ns, _jpeg(canvas, WIDTH_PX), _jpeg(canvas, SMALL_PX))
@@ -63,6 +75,28 @@ def draw_pictures(run: RunFolder, times: Iterable[int], keep: Keep) -> str:
     except CrosscueError as error:
         return str(error)
     return ""
+
+
+def _labels(run: RunFolder, counts: Mapping[str, int]) -> frozenset[str]:
+    """Return the labels of the cues that were found."""
+    vehicle = run.drive_manifest().settings
+    positive = [CUES[cue] for cue, count in counts.items() if count and cue in CUES]
+    return frozenset(label for cue in positive for label in vehicle.labels_of(cue))
+
+
+def _likely(found: Found, counted: frozenset[str]) -> Found:
+    if not isinstance(found, Detections):
+        return found
+    least = np.array([COUNTED if one in counted else LIKELY for one in found.labels])
+    rows = np.flatnonzero(found.scores >= least) if len(least) else np.arange(0)
+    return Detections(
+        found.t_ns,
+        found.size_px,
+        found.boxes_px[rows],
+        found.scores[rows],
+        tuple(found.labels[i] for i in rows),
+        tuple(found.masks[i] for i in rows),
+    )
 
 
 def _found(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, StoredFrame]:

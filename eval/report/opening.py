@@ -112,7 +112,11 @@ def opening_of(
     def keep(t_ns: int, picture: bytes, _: bytes) -> None:
         pictures[t_ns] = base64.b64encode(picture).decode()
 
-    missing = draw_pictures(run, [one.t_ns for one in moments], keep) if moments else ""
+    missing = (
+        draw_pictures(run, [one.t_ns for one in moments], keep, has_candidates=False)
+        if moments
+        else ""
+    )
     shown = tuple(replace(one, picture=pictures.get(one.t_ns, "")) for one in moments)
     return Opening(sentences, shown, missing)
 
