@@ -248,6 +248,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder of the recorded drives")
     parser.add_argument("--work", type=Path, default=Path("pose_nees"), help="folder for truths")
     parser.add_argument("--simulated", type=int, default=20, help="number of simulated drives")
+    parser.add_argument("--first-seed", type=int, default=0, help="seed of the first of them")
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
@@ -259,7 +260,7 @@ def main() -> None:
         odometry_settings(Vehicle(version=1)), track_width_m=TRACK_WIDTH_M, wheelbase_m=WHEELBASE_M
     )
     for kind in args.kinds:
-        for seed in range(args.simulated):
+        for seed in range(args.first_seed, args.first_seed + args.simulated):
             found += tested(f"simulated, {kind}", simulated(kind, seed), car, 10 * seed)
     print("\n".join(table(found)))
     if args.json is not None:
