@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.moments import seconds_into, span_ns
+from crosscue.eval.runs.moments import frame_times, seconds_into, span_ns
 from crosscue.eval.scoring.runs import SceneJudged, read_run_tables
 from crosscue.replay.vehicle.vehicle import CUES
 
@@ -88,10 +88,7 @@ def _placed(run: RunFolder, found: list[Failure]) -> tuple[Failure, ...]:
     if not found:
         return ()
     first_ns, last_ns = span_ns(run)
-    moved: dict[int, int] = {}
-    if run.file("frames.parquet").exists():
-        table = run.table("frames", ["t_ns", "log_t_ns"])
-        moved = dict(zip(table["log_t_ns"].to_pylist(), table["t_ns"].to_pylist(), strict=True))
+    moved = frame_times(run)
 
     def of_run(log_ns: int) -> int:
         return min(max(moved.get(log_ns, log_ns), first_ns), last_ns)

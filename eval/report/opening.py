@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.moments import span_ns
+from crosscue.eval.runs.moments import frame_times, span_ns
 from crosscue.eval.scoring.columns import NONE, CueRows, RangeRows, RunTables
 from crosscue.eval.scoring.runs import RunScored, read_run_tables
 from crosscue.eval.scoring.scene.approaches import ApproachResult, Curve
@@ -36,7 +36,7 @@ class Moment:
     """A moment of a drive, shown with its picture.
 
     Attributes:
-        t_ns: Log time of the picture.
+        t_ns: Time of the picture in the run's tables.
         at_s: Seconds from the run's first frame, as ``crosscue view --at`` expects.
         what: What happened.
         is_wrong: True if the run was wrong.
@@ -96,17 +96,21 @@ def opening_of(
     tables = read_run_tables(run)
     sentences = _told(run, tables, threshold) if scored is None else judged_sentences(scored)
     events = [*_events(tables, threshold)]
+    moved = frame_times(run)
     if scored is not None:
-        events += _mistakes(scored.judged.cues, worst)
+        logged = {t_ns: log_ns for log_ns, t_ns in moved.items()}
+        placed = [replace(one, t_ns=logged.get(one.t_ns, one.t_ns)) for one in worst]
+        events += _mistakes(scored.judged.cues, placed)
     kept = sorted(sorted(events, key=lambda one: (one.rank, one.t_ns))[:MAX_MOMENTS], key=_when)
     frames = tables.frames_ns
     if frames is None or not len(frames):
         return Opening(sentences)
     start_ns = span_ns(run)[0]
-    moments = [
-        _moment(tables, scored, at, start_ns, [one for one in kept if _frame(frames, one) == at])
-        for at in sorted({_frame(frames, one) for one in kept})
-    ]
+    moments = []
+    for at in sorted({_frame(frames, one) for one in kept}):
+        found = _moment(tables, scored, at, [one for one in kept if _frame(frames, one) == at])
+        t_ns = moved.get(at, at)
+        moments.append(replace(found, t_ns=t_ns, at_s=(t_ns - start_ns) * 1e-9))
     pictures: dict[int, str] = {}
 
     def keep(t_ns: int, picture: bytes, _: bytes) -> None:
@@ -326,9 +330,9 @@ def _moment(
     tables: RunTables,
     scored: RunScored | None,
     t_ns: int,
-    start_ns: int,
     events: Sequence[_Event],
 ) -> Moment:
+    """Return a moment at a log time; its seconds are set by the caller."""
     whats = dict.fromkeys(one.what for one in events)
     believed = [one.removesuffix(" believed") for one in whats if one.endswith(" believed")]
     others = [one for one in whats if not one.endswith(" believed")]
@@ -344,7 +348,7 @@ def _moment(
         distance = _place(true_m)
     return Moment(
         t_ns,
-        (t_ns - start_ns) * 1e-9,
+        0.0,
         text,
         any(one.rank == MISTAKE for one in events),
         distance,

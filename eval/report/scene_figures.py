@@ -223,7 +223,7 @@ class WorstFrame:
 
     Attributes:
         run: Name of the drive in the scores.
-        t_ns: Log time.
+        t_ns: Time in the run's tables.
         cue: Name of the cue.
         count: Number of objects found.
         true_count: True number of objects, or None if unknown.

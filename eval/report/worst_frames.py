@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.moments import frame_times
 from crosscue.eval.runs.stored_images import run_camera
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.eval.scoring.scene.cues import CueFrames, is_wrong
@@ -48,18 +49,21 @@ def _wrong(scored: RunScored) -> list[WorstFrame]:
     if not mistakes:
         return []
     vehicle = scored.run.drive_manifest().settings
-    times = {int(cue.t_ns[i]) for cue, rows in mistakes for i in rows}
+    moved = frame_times(scored.run)
+    times = {moved.get(int(cue.t_ns[i]), int(cue.t_ns[i])) for cue, rows in mistakes for i in rows}
     scores = _scores(scored.run, times)
     found = []
     for cue, rows in mistakes:
         labels = _labels(cue.cue, vehicle)
-        sure = [_confidence(scores.get(int(cue.t_ns[i]), []), labels) for i in rows]
-        at = int(rows[int(np.argmax([-1.0 if value is None else value for value in sure]))])
+        at_ns = [moved.get(t_ns, t_ns) for t_ns in cue.t_ns[rows].tolist()]
+        sure = [_confidence(scores.get(t_ns, []), labels) for t_ns in at_ns]
+        worst = int(np.argmax([-1.0 if value is None else value for value in sure]))
+        at = int(rows[worst])
         true = int(cue.true_count[at])
         found.append(
             WorstFrame(
                 run=scored.judged.coverage.drive,
-                t_ns=int(cue.t_ns[at]),
+                t_ns=at_ns[worst],
                 cue=cue.cue,
                 count=int(cue.count[at]),
                 true_count=None if true < 0 else true,

@@ -16,7 +16,15 @@ from .tables.parquet import TableFolder
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = ["TableFolder", "approach_spans", "moment_ns", "run_between", "seconds_into", "span_ns"]
+__all__ = [
+    "TableFolder",
+    "approach_spans",
+    "frame_times",
+    "moment_ns",
+    "run_between",
+    "seconds_into",
+    "span_ns",
+]
 
 # Tables that define a run's time span; the first that has rows is used.
 TABLES: Final = ("frames", "pose")
@@ -36,6 +44,19 @@ def span_ns(run: TableFolder) -> tuple[int, int]:
             if len(times):
                 return int(pc.min(times).as_py()), int(pc.max(times).as_py())
     raise UnreadableRunError(f"{run.path}: neither a frame nor a pose in it; replay again")
+
+
+def frame_times(run: TableFolder) -> dict[int, int]:
+    """Return the time of each frame in the run's tables by its log time, which scores use.
+
+    Raises:
+        RunError: The table of frames is damaged.
+    """
+    is_there = run.file("frames.parquet").exists()
+    if not is_there or "log_t_ns" not in run.schema("frames").names:
+        return {}
+    table = run.table("frames", ["t_ns", "log_t_ns"])
+    return dict(zip(table["log_t_ns"].to_pylist(), table["t_ns"].to_pylist(), strict=True))
 
 
 def moment_ns(run: TableFolder, text: str) -> int:

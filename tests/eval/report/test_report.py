@@ -9,11 +9,14 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
+from crosscue.eval.report.frame_pictures import draw_pictures
 from crosscue.eval.report.opening import opening_of
 from crosscue.eval.report.page import write_report
 from crosscue.eval.report.scene_figures import (
@@ -166,3 +169,31 @@ def test_ticks_are_few_round_and_inside_the_range(low: float, width: float, max_
     assert (steps > 0.0).all()
     leading = steps / 10.0 ** np.floor(np.log10(steps) + 1e-4)
     assert (np.abs(leading[:, None] - [1.0, 2.0, 2.5, 5.0]).min(axis=1) < 1e-3).all()
+
+
+def test_tile_without_a_distance_says_never(tmp_path: Path) -> None:
+    one = _scored(tmp_path / "drive")
+    found = metrics_of([one], pooled_scores([one]))["approaches"]
+    none = found | {"full": found["full"] | {"right": 0}}
+
+    assert "<b>never</b>" in _report_text(tmp_path, one, approaches=none)
+
+
+def test_pictures_of_a_report_leave_out_unlikely_detections(tmp_path: Path) -> None:
+    run = _scored(tmp_path / "drive").run
+    path = run.file("detections.parquet")
+    table = pq.read_table(path)
+    drawn: dict[bool, dict[int, bytes]] = {}
+    weak = pa.array([0.2] * len(table), table.schema.field("score").type)
+    place = table.schema.get_field_index("score")
+    pq.write_table(table.set_column(place, table.schema.field("score"), weak), path)
+    for has_candidates in (True, False):
+        kept: dict[int, bytes] = drawn.setdefault(has_candidates, {})
+
+        def keep(t_ns: int, picture: bytes, _: bytes, kept: dict[int, bytes] = kept) -> None:
+            kept[t_ns] = picture
+
+        draw_pictures(run, [at(21)], keep, has_candidates=has_candidates)
+
+    assert drawn[True].keys() == drawn[False].keys() == {at(21)}
+    assert drawn[True] != drawn[False]

@@ -11,7 +11,9 @@ import pytest
 from rerun.chunk import RrdReader
 
 from crosscue.eval.recording import save_rrd
+from crosscue.eval.report.opening import opening_of
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.moments import moment_ns
 from crosscue.eval.runs.tables.log_time import ClockGap, gaps_of
 from support.gap_drive import Clock, replayed, write_drive
 
@@ -67,3 +69,16 @@ def test_lines_of_a_recording_break_at_gaps(paused: RunFolder, tmp_path: Path) -
     ]
     name = next(n for n in strips[0].schema.names if n.endswith("strips"))
     assert len(strips[0][name].to_pylist()[0]) == 2
+
+
+def test_moments_of_a_drive_whose_clock_was_set_have_pictures_and_open(tmp_path: Path) -> None:
+    run = replayed(tmp_path, write_drive(tmp_path, Clock(set_at_s=3.0, by_s=-3600.0)))
+
+    opening = opening_of(run, 0.9)
+
+    assert opening.moments
+    assert all(one.picture for one in opening.moments), opening.missing
+    frames = set(run.table("frames")["t_ns"].to_pylist())
+    for one in opening.moments:
+        assert one.t_ns in frames
+        assert moment_ns(run, f"{one.at_s:.3f}") == pytest.approx(one.t_ns, abs=1e6)
