@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 COMMANDS: Final = {
     "info": "eval.logs.summary:info",
     "check": "eval.check:check",
+    "fetch": "datasets.real.recordings:fetch",
     "convert": "eval.logs.convert:convert",
     "seal": "eval.logs.seals:seal",
     "vehicle init": "eval.vehicle.draft:draft_vehicle",

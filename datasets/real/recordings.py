@@ -1,17 +1,18 @@
-"""Fetch published recordings, with a hash for each file, into a cache.
+"""Fetch published recordings, with a hash for each file, into a folder or a cache.
 
 Each recording has a folder here: ``recording.toml`` specifies the URLs of its files;
 ``vehicle.toml`` and ``truth.json`` are part of crosscue. ``$CROSSCUE_DRIVES`` names the folder for
-fetched recordings (default: the user's cache). ``$CROSSCUE_DRIVE_MIRROR`` names a server that
-replaces the publisher, with files ``MIRROR/NAME/FILE``. ``$CROSSCUE_DATA`` names a folder whose
-``sequences`` are searched.
+recordings of the demo (default: the user's cache). ``$CROSSCUE_DRIVE_MIRROR`` names a server that
+replaces the publisher, with files ``MIRROR/NAME/FILE``. ``$CROSSCUE_DATA`` names a folder that is
+searched first.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Final, Literal
 
@@ -21,12 +22,16 @@ from crosscue.detectors.catalog.card import Hash
 from crosscue.detectors.catalog.fetch import DATA
 from crosscue.detectors.catalog.places import user_cache
 from crosscue.detectors.settings import Settings
-from crosscue.replay.errors import LogError, VehicleError
+from crosscue.replay.errors import LogError, OutputError, UsageError, VehicleError
 from crosscue.replay.files.transfer import Progress, download, is_there, take
 from crosscue.replay.files.tree_text import toml_tree
 from crosscue.replay.limits import MIB
+from crosscue.replay.progress import Progress as ShownProgress
+from crosscue.replay.progress import emit
 from crosscue.replay.vehicle.section import tuples
 from crosscue.replay.vehicle.validation_errors import explain
+from crosscue.results import Result
+from crosscue.verb import Option
 
 FOLDER: Final = Path(__file__).parent
 VARIABLE: Final = "CROSSCUE_DRIVES"
@@ -41,6 +46,8 @@ class RecordedFile(Settings):
     """Path of the file inside the recording."""
     size_bytes: Annotated[int, Field(gt=0, le=64 * MIB)]
     sha256: Hash
+    url: Annotated[str, Field(pattern="^https?://")] | None = None
+    """URL of the file; None if it is in the recording's folder."""
 
 
 class Recording(Settings):
@@ -87,8 +94,12 @@ def recording(name: str) -> Recording:
     """Return the recording with this name.
 
     Raises:
+        UsageError: No recording has this name.
         VehicleError: Its ``recording.toml`` is damaged.
     """
+    known = sorted(path.parent.name for path in FOLDER.glob("*/recording.toml"))
+    if name not in known:
+        raise UsageError(f"recording {name}: unknown; expected one of: {', '.join(known)}")
     path = FOLDER / name / "recording.toml"
     text = path.read_text(encoding="utf-8")
     try:
@@ -110,14 +121,16 @@ def fetch_recording(
     given: Path | None = None,
     on_progress: Progress = lambda name, done, total: None,
     environment: Mapping[str, str] = os.environ,
+    place: Path | None = None,
 ) -> Path:
-    """Fetch a recording into the cache, and check every file; existing files are kept.
+    """Fetch a recording, and check every file; existing files are kept.
 
     Args:
         known: The recording.
         given: Folder that contains it; the network is then not used.
         on_progress: Called with a file, the bytes of the recording fetched so far, and their total.
         environment: Environment with the variables named above.
+        place: Folder for it; the cache if None.
 
     Returns:
         The folder of the recording, to be opened as a log.
@@ -128,13 +141,13 @@ def fetch_recording(
         CrosscueError: A file cannot be fetched, or is not the published one.
         OutputError: The cache cannot be written.
     """
-    place, total, done = recording_folder(known, environment), known.size_bytes, 0
+    place = place or recording_folder(known, environment)
+    total, done = known.size_bytes, 0
     source = _folder_in(known, given)
     at_hand = None
     if source is None and environment.get(DATA):
         at_hand = _folder_below(known, Path(environment[DATA]))
     mirror = environment.get(MIRROR)
-    url = f"{mirror.rstrip('/')}/{known.name}" if mirror else known.url
     owner = f"recording {known.name}"
     for file in known.files:
         target, before = place / file.name, done
@@ -145,8 +158,9 @@ def fetch_recording(
         elif at_hand is not None and is_there(file, at_hand / file.name):
             take(at_hand / file.name, file, target, owner)
         else:
+            folder = f"{mirror.rstrip('/')}/{known.name}" if mirror else known.url
             download(
-                f"{url}/{file.name}",
+                file.url if file.url and not mirror else f"{folder}/{file.name}",
                 file,
                 target,
                 owner,
@@ -156,6 +170,83 @@ def fetch_recording(
         done += file.size_bytes
         on_progress(file.name, done, total)
     return place
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class FetchedRecording(Result):
+    """A recording on this machine.
+
+    Attributes:
+        folder: Its folder, to be opened as a log.
+        about: Description of its content in one line.
+        licence: Its licence.
+        attribution: Attribution to show with it.
+    """
+
+    folder: Path
+    about: str
+    licence: str
+    attribution: str
+
+    def lines(self) -> Iterator[str]:
+        """Yield what it is, and a command to begin with."""
+        yield self.about
+        yield f"licence    {self.licence}; {self.attribution}"
+        yield f"recording  {self.folder}"
+        yield f"           begin with: crosscue info {self.folder}"
+
+
+def fetch(
+    name: str,
+    output: Path | str | None = None,
+    *,
+    source: Annotated[Path | str | None, Option("--data", metavar="FOLDER")] = None,
+) -> FetchedRecording:
+    """Download a public recording, with every file verified.
+
+    Files that are already there are kept, so an interrupted download is continued.
+
+    Examples:
+        crosscue fetch comma2k19
+        crosscue fetch pandaset_002 -o pandaset
+
+    Args:
+        name: Recording: comma2k19 (a minute of a Toyota's CAN, IMU and GNSS, with a DBC file) or
+            pandaset_002 (8 s of pictures with poses).
+        output: Folder for its files (default: NAME in the current folder).
+        source: Folder that contains it, to use instead of downloading it.
+
+    Raises:
+        UsageError: No recording has this name, or ``source`` contains another one.
+        OutputError: The folder contains other files, or cannot be written.
+        CrosscueError: A file cannot be fetched, or is not the published one.
+    """
+    known, place = recording(name), Path(output or name)
+    _refuse_others(place, known)
+    given = None if source is None else Path(source)
+    fetch_recording(
+        known,
+        given,
+        lambda file, done, of: emit(ShownProgress(file, done / 1e6, of / 1e6, "MB")),
+        place=place,
+    )
+    return FetchedRecording(place, known.about, known.licence, known.attribution)
+
+
+def _refuse_others(place: Path, known: Recording) -> None:
+    """Refuse a folder with files that are not those of the recording."""
+    if place.exists() and not place.is_dir():
+        raise OutputError(f"{place}: is a file; choose a new folder")
+    files = {place / file.name: file for file in known.files}
+    for found in sorted(place.rglob("*")):
+        whole = found.with_suffix("") if found.suffix == ".part" else found
+        if found.is_dir():
+            continue
+        if whole not in files or (found == whole and not is_there(files[whole], found)):
+            raise OutputError(
+                f"{place}: holds {found.relative_to(place)}, which is not of recording "
+                f"{known.name}; choose a new folder"
+            )
 
 
 def _after(before: int, total: int, on_progress: Progress) -> Progress:

@@ -144,6 +144,7 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("model init", "--picture"): ("{onnx} -o {there}/new.toml --picture {gone}", INPUT),
     ("check", "--picture"): ("{card} --picture {gone} -o {out}.jpg", INPUT),
     ("model fetch", "--from"): ("yolox-nano --from {gone}", SETTINGS),
+    ("fetch", "--data"): ("pandaset_002 --data {gone} -o {out}", INPUT),
     ("demo", "--data"): ("--real --data {gone} -o {out}", INPUT),
     ("study intersections", "--vehicle"): ("-o {out} --vehicle {gone}", SETTINGS),
     ("study range", "--settings"): ("-o {out} --settings {gone}", SETTINGS),
@@ -186,7 +187,7 @@ READS_DBC_FILES: Final[dict[str, str]] = {
 # Options whose file is created if it is missing.
 WRITTEN: Final = {"--output", "--junit", "--cache", "--figure", "--sheet"}
 # Arguments that are not files.
-NO_FILES: Final = {"LAYOUT", "SQL"}
+NO_FILES: Final = {"LAYOUT", "NAME", "SQL"}
 # Commands whose arguments accept any file, or no file.
 ANY_BYTES: Final = {"seal", "model fetch", "completion"}
 # Arguments whose file is created if it is missing or empty.

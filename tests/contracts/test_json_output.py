@@ -82,6 +82,7 @@ MADE: Final[dict[str, tuple[str, int]]] = {
 # Commands that are not run, and why.
 ELSEWHERE: Final[dict[str, str]] = {
     "demo": "simulates and replays for minutes",
+    "fetch": "downloads; tests/eval/drives/test_demo.py",
     "study intersections": "simulates and replays for minutes",
     "study layouts": "simulates and replays for minutes",
     "study range": "simulates for half a minute, and prints what study landmarks does",

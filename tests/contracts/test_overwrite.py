@@ -39,6 +39,7 @@ BY_NAME: Final = {
     "truth": "writes a truth file of a given name",
     "model": "writes a model card of a given name",
     "simulate": "replaces the drives of the same settings, file by file",
+    "fetch": "keeps what is there; a folder with anything else is refused",
     "demo": "writes a drive and a run, each as simulate and replay do",
     "study": "keeps finished parts, and replaces its pages file by file",
 }

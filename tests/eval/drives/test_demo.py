@@ -61,6 +61,43 @@ def test_file_of_wrong_checksum_is_not_kept(stand_in_drive: StandIn, name: str) 
     assert Path(name).name not in names
 
 
+def test_fetch_writes_the_recording_and_never_replaces_another_file(
+    stand_in_drive: StandIn, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place, name = tmp_path / "mine", PICTURE.removeprefix("drive/")
+    stand_in_drive.server.failing = 1
+
+    assert run(["fetch", "pandaset_002", "-o", str(place)]) == 1
+    capsys.readouterr()
+    assert run(["fetch", "pandaset_002", "-o", str(place)]) == 0
+    assert f"crosscue info {place}" in capsys.readouterr().out
+    files = {one.name for one in stand_in_drive.known.files}
+    assert {p.relative_to(place).as_posix() for p in place.rglob("*") if p.is_file()} == files
+    assert run(["info", str(place)]) == 0
+    for other in (place / name, place / "notes.txt"):
+        before = other.read_bytes() if other.exists() else b""
+        other.write_bytes(b"my own")
+        capsys.readouterr()
+        assert run(["fetch", "pandaset_002", "-o", str(place)]) == 1
+        assert f"holds {other.relative_to(place)}, which is not of" in capsys.readouterr().err
+        assert other.read_bytes() == b"my own"
+        other.write_bytes(before)
+
+
+def test_known_recordings_are_listed_in_the_help_and_complete() -> None:
+    """The minute of the tutorial has its DBC file from another publisher, the only such file."""
+    text = " ".join((recordings.fetch.__doc__ or "").split())
+    for path in recordings.FOLDER.glob("*/recording.toml"):
+        known = recordings.recording(path.parent.name)
+        assert known.name == path.parent.name
+        assert f"{known.name} (" in text
+        assert len({one.name for one in known.files}) == len(known.files)
+    minute = recordings.recording("comma2k19")
+    assert [one.name for one in minute.files if one.url] == ["toyota_2017.dbc"]
+    with pytest.raises(crosscue.UsageError, match="unknown; expected one of: comma2k19, pandaset"):
+        recordings.recording("comma")
+
+
 def test_stored_truth_equals_output_of_annotation_script(tmp_path: Path) -> None:
     sequence = shared("sequences", "pandaset_002")
 
