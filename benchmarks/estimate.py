@@ -19,7 +19,7 @@ from statistics import median
 import numpy as np
 
 from crosscue.datasets.simulated.drive import DriveSettings, sense, true_motion, vehicle_text
-from crosscue.datasets.simulated.sensor_blocks import BUS, GYRO, MAGNETOMETER, sensor_blocks
+from crosscue.datasets.simulated.log_files import BUS, GYRO, MAGNETOMETER, sensor_blocks
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, DetectorChoice, Found, Frame, View
 from crosscue.eval.pipeline.detect import detect_drive

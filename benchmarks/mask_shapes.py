@@ -23,7 +23,7 @@ from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.cues.observed import nose_of
 from crosscue.detectors.networks.mask_rcnn.detector import build
 from crosscue.detectors.training.annotations import LabelledPicture, LabelledSet, read_training_coco
-from crosscue.detectors.training.scores import detections_on
+from crosscue.detectors.training.measure import detections_on
 from crosscue.replay.columns import Floats
 
 CLASSES: Final = ("car", "stop sign", "traffic light")

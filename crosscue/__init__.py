@@ -54,9 +54,9 @@ crosscue.detectors.signs.templates: draw_sign
 crosscue.errors: AccountError AnnotationError CanDatabaseError EmptyResultError
   LogFormatError LogTooLargeError MissingTopicError OutputError PluginWarning RunError SchemaError
   StudyFileError UnknownFormatError UnreadableRunError VehicleError WorkerError
-crosscue.eval.batch.batch_status: BatchStatus
+crosscue.eval.batch.status: BatchStatus
 crosscue.eval.batch.drive_list: DriveList
-crosscue.eval.batch.merged_runs: MergedRuns
+crosscue.eval.batch.merge: MergedRuns
 crosscue.eval.catalog.compare: Comparison
 crosscue.eval.catalog.decoded_logs: Decoded
 crosscue.eval.catalog.history: History

@@ -4,7 +4,7 @@ from crosscue import errors as errors
 from crosscue.datasets.simulate import simulate_approach as simulate_approach
 from crosscue.datasets.simulate import simulate_approaches as simulate_approaches
 from crosscue.datasets.simulate import simulate_drive as simulate_drive
-from crosscue.datasets.truth.carried import write_truth as write_truth
+from crosscue.datasets.truth.truth import write_truth as write_truth
 from crosscue.detectors.base import Detections as Detections
 from crosscue.detectors.base import Detector as Detector
 from crosscue.detectors.base import Frame as Frame
@@ -15,8 +15,8 @@ from crosscue.detectors.catalog.known_models import fetch_model as fetch_model
 from crosscue.detectors.catalog.known_models import model as model
 from crosscue.detectors.catalog.known_models import models as models
 from crosscue.detectors.plugins import plugins as plugins
-from crosscue.eval.batch.batch_status import batch_status as batch_status
-from crosscue.eval.batch.merged_runs import merge as merge
+from crosscue.eval.batch.merge import merge as merge
+from crosscue.eval.batch.status import batch_status as batch_status
 from crosscue.eval.catalog.decoded_logs import decode as decode
 from crosscue.eval.catalog.query.catalog import catalog as catalog
 from crosscue.eval.check import check as check

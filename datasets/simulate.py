@@ -187,7 +187,7 @@ def simulate_approaches(
 
 
 def _drawn(sheet: Path, wanted: Sequence[SceneSettings], *, overwrite: bool) -> ContactSheet:
-    from crosscue.datasets.scenes.export.contact_sheet import contact_sheet, sheet_jpeg
+    from crosscue.datasets.scenes.single_frames import contact_sheet, sheet_jpeg
 
     if sheet.exists() and not overwrite:
         raise OutputError(f"{sheet}: exists; give another name or --overwrite")

@@ -8,13 +8,12 @@ from typing import Final
 import numpy as np
 
 from crosscue.datasets.geodesy import ecef_to_enu_matrix, ecef_to_geodetic
-from crosscue.datasets.truth.mounting import mounting_in_car
 from crosscue.datasets.truth.truth import Origin, Truth, save
-from crosscue.datasets.truth.tum import Trajectory, write_tum
+from crosscue.datasets.truth.tum import Trajectory, mounting_in_car, write_tum
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogFormatError
 
-from .npy import read_column
+from .comma2k19 import read_column
 
 POSE_FILE: Final = "pose.tum"
 

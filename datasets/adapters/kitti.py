@@ -40,9 +40,8 @@ from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import TimedFiles, list_files, pair_with_times
 from crosscue.replay.seal.touched import Touched, open_noted
 
-from .kitti_labels import read_kitti_labels
+from .kitti_files import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse_oxts, read_kitti_labels
 from .kitti_odometry import BOX, SETUP, projection
-from .kitti_oxts import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse_oxts
 
 POSE_FILE: Final = "pose.tum"
 # Default period of frames, if positions and speeds do not determine it.

@@ -22,9 +22,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from crosscue.datasets.truth.mounting import mounting_in_car
 from crosscue.datasets.truth.truth import Mounting, Truth, save
-from crosscue.datasets.truth.tum import Trajectory, write_tum
+from crosscue.datasets.truth.tum import Trajectory, mounting_in_car, write_tum
 from crosscue.replay.columns import Floats, Int64s, Table, Topic
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.bounded import read_at_most

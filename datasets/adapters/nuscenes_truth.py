@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from crosscue.datasets.truth.objects import Objects
+from crosscue.datasets.truth.coco import Objects
 from crosscue.datasets.truth.truth import Mounting, Truth, save
 from crosscue.datasets.truth.tum import Trajectory, write_tum
 from crosscue.replay.columns import Floats

@@ -1,23 +1,276 @@
-"""Table of the formats of labelling tools, and detection of a file's format."""
+"""Read and write the formats of labelling tools: COCO, CVAT, YOLO, FiftyOne and Label Studio.
+
+YOLO is that of Ultralytics: ``data.yaml``, ``labels/NAME.txt``, ``images``. Subsets in separate
+folders (``labels/train``), as exported by FiftyOne and CVAT, can also be read, and so can Darknet's
+``obj_train_data``, CVAT's "YOLO 1.1". Label Studio has ``tasks.json`` with predictions, and
+the labelling interface to paste into a project.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
+from xml.sax.saxutils import quoteattr
 
-from crosscue.datasets.truth.annotations import Annotations, Sizes
+from crosscue.datasets.truth.annotations import (
+    Annotation,
+    Annotations,
+    Picture,
+    Sizes,
+    labelled_size,
+)
+from crosscue.datasets.truth.box_labels import read_box_labels
 from crosscue.datasets.truth.coco import read_coco, write_coco
 from crosscue.datasets.truth.cvat import read_cvat, write_cvat
 from crosscue.replay.errors import AnnotationError, UsageError
 from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.whole_file import write_text
 
-from .fiftyone import FILE as FIFTYONE
-from .fiftyone import read_fiftyone, write_fiftyone
-from .label_studio import read_label_studio, write_label_studio
-from .yolo import read_yolo, write_yolo
+YOLO_FILE = "data.yaml"
+LABELS = "labels"
+DARKNET = "obj_*_data"
+
+
+def write_yolo(folder: Path, labels: Annotations) -> Path:
+    """Write labels; a picture without boxes has an empty file, which means that it is labelled.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    numbers = {name: number for number, name in enumerate(labels.labels)}
+    for picture in labels.pictures:
+        wide, high = picture.size_px
+        lines = []
+        for thing in picture.things:
+            if thing.box_px is not None:
+                x0, y0, x1, y1 = thing.box_px
+                box = (x0 + x1) / 2 / wide, (y0 + y1) / 2 / high, (x1 - x0) / wide, (y1 - y0) / high
+                lines.append(" ".join([str(numbers[thing.label]), *map(repr, map(float, box))]))
+        place = folder / LABELS / f"{Path(picture.name).stem}.txt"
+        write_text(place, "".join(f"{line}\n" for line in lines))
+    # JSON strings are valid YAML. Without a path, Ultralytics searches the folder of the file.
+    names = [f"  {number}: {strict_json(name).strip()}" for name, number in numbers.items()]
+    text = ["train: images", "val: images", "names:", *names]
+    write_text(folder / YOLO_FILE, "\n".join(text) + "\n")
+    return folder / YOLO_FILE
+
+
+def read_yolo(path: Path, sizes: Sizes) -> Annotations:
+    """Read the folder, its ``labels``, or its ``data.yaml``.
+
+    Raises:
+        AnnotationError: A file cannot be read, or the size of a picture is unknown.
+    """
+    folder = path.parent if path.is_file() else path
+    parts = [read_box_labels(place, "yolo") for place in _label_folders(folder)]
+    pictures = []
+    for one in (picture for part in parts for picture in part.pictures):
+        stem = Path(one.name).stem
+        size = labelled_size(stem, sizes, path)
+        things = []
+        for box in one.boxes:
+            x0, y0, x1, y1 = box.box
+            in_px = (x0 * size[0], y0 * size[1], x1 * size[0], y1 * size[1])
+            things.append(Annotation(box.label, in_px, place=one.name))
+        pictures.append(Picture(stem, size, None, None, tuple(things)))
+    classes = dict.fromkeys(name for part in parts for name in part.classes)
+    return Annotations(str(path), tuple(classes), tuple(pictures))
+
+
+def _label_folders(folder: Path) -> list[Path]:
+    """Return the folders of label files: those in ``labels`` or Darknet's folders, else here."""
+    inside = [one for one in (folder / LABELS, *folder.glob(DARKNET)) if one.is_dir()]
+    found = {file.parent for one in inside for file in one.rglob("*.txt")}
+    return sorted(found) or inside or [folder]
+
+
+FIFTYONE_FILE = "labels.json"
+
+
+def write_fiftyone(folder: Path, labels: Annotations) -> Path:
+    """Write labels: boxes as x, y, width and height in fractions of the picture.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    found = {}
+    for picture in labels.pictures:
+        wide, high = picture.size_px
+        things = []
+        for thing in picture.things:
+            if thing.box_px is None:
+                continue
+            x0, y0, x1, y1 = thing.box_px
+            box = [x0 / wide, y0 / high, (x1 - x0) / wide, (y1 - y0) / high]
+            one: dict[str, Any] = {
+                "label": labels.labels.index(thing.label),
+                "bounding_box": box,
+            }
+            things.append(one if thing.score is None else one | {"confidence": thing.score})
+        found[Path(picture.name).stem] = things
+    tree = {"classes": list(labels.labels), "labels": found}
+    write_text(folder / FIFTYONE_FILE, strict_json(tree) + "\n")
+    return folder / FIFTYONE_FILE
+
+
+def read_fiftyone(path: Path, sizes: Sizes) -> Annotations:
+    """Read ``labels.json``, or the folder that contains it.
+
+    Raises:
+        AnnotationError: The file cannot be read, or the size of a picture is unknown.
+    """
+    file = path / FIFTYONE_FILE if path.is_dir() else path
+    try:
+        tree = json_tree(file.read_bytes())
+    except (OSError, ValueError) as error:
+        raise AnnotationError(f"{file}: not readable as JSON ({error})") from None
+    by_picture = tree.get("labels") if isinstance(tree, dict) else None
+    classes = (tree.get("classes") or []) if isinstance(tree, dict) else []
+    if not isinstance(by_picture, dict) or not isinstance(classes, list):
+        raise AnnotationError(f"{file}: expected classes and labels, as FiftyOne exports them")
+    pictures = []
+    for name, rows in by_picture.items():
+        stem = Path(name).stem if name.lower().endswith((".jpg", ".png", ".jpeg")) else name
+        stem = stem.rpartition("/")[2]
+        size = labelled_size(stem, sizes, file)
+        things = [_fiftyone_thing(row, classes, size, f"{file}: {name}") for row in rows or ()]
+        pictures.append(Picture(stem, size, None, None, tuple(things)))
+    used = {thing.label for one in pictures for thing in one.things}
+    names = dict.fromkeys([*map(str, classes), *sorted(used)])
+    return Annotations(str(file), tuple(names), tuple(pictures))
+
+
+def _fiftyone_thing(row: Any, classes: list[Any], size: tuple[int, int], where: str) -> Annotation:
+    try:
+        label, (x, y, w, h) = row["label"], (float(side) for side in row["bounding_box"])
+        # FiftyOne writes class numbers if there is a list of classes, else class names.
+        name = str(classes[label]) if isinstance(label, int) else str(label)
+        score = row.get("confidence")
+        box = (x * size[0], y * size[1], (x + w) * size[0], (y + h) * size[1])
+        return Annotation(name, box, score=None if score is None else float(score), place=where)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError):
+        raise AnnotationError(
+            f"{where}: expected label and bounding_box (x, y, width, height as fractions)"
+        ) from None
+
+
+TASKS_FILE = "tasks.json"
+CONFIG = "interface.xml"
+LOCAL = "/data/local-files/?d="
+UNLABELLED = "tasks without an annotation"
+
+
+def write_label_studio(folder: Path, labels: Annotations) -> Path:
+    """Write tasks with boxes as predictions, and the labelling interface to paste into a project.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    tasks = []
+    for picture in labels.pictures:
+        wide, high = picture.size_px
+        results = []
+        for number, thing in enumerate(picture.things):
+            if thing.box_px is not None:
+                x0, y0, x1, y1 = thing.box_px
+                results.append(
+                    {
+                        "id": f"{picture.t_ns}-{number}",
+                        "from_name": "label",
+                        "to_name": "image",
+                        "type": "rectanglelabels",
+                        "original_width": wide,
+                        "original_height": high,
+                        "image_rotation": 0,
+                        "value": {
+                            "x": 100.0 * x0 / wide,
+                            "y": 100.0 * y0 / high,
+                            "width": 100.0 * (x1 - x0) / wide,
+                            "height": 100.0 * (y1 - y0) / high,
+                            "rotation": 0,
+                            "rectanglelabels": [thing.label],
+                        },
+                    }
+                    | ({} if thing.score is None else {"score": thing.score})
+                )
+        size = {"width": wide, "height": high, "t_ns": picture.t_ns}
+        data = {"image": f"{LOCAL}images/{picture.name}", **size}
+        predictions = [{"model_version": "crosscue", "result": results}]
+        tasks.append({"data": data, "predictions": predictions})
+    write_text(folder / TASKS_FILE, strict_json(tasks) + "\n")
+    names = "".join(f"<Label value={quoteattr(name)}/>" for name in labels.labels)
+    boxes = f'<RectangleLabels name="label" toName="image">{names}</RectangleLabels>'
+    write_text(folder / CONFIG, f'<View><Image name="image" value="$image"/>\n{boxes}\n</View>\n')
+    return folder / TASKS_FILE
+
+
+def read_label_studio(path: Path) -> Annotations:
+    """Read a JSON export of Label Studio; unconfirmed predictions are not labels.
+
+    Raises:
+        AnnotationError: The file cannot be read.
+    """
+    file = path / TASKS_FILE if path.is_dir() else path
+    try:
+        tasks = json_tree(file.read_bytes())
+    except (OSError, ValueError) as error:
+        raise AnnotationError(f"{file}: not readable as JSON ({error})") from None
+    if not isinstance(tasks, list) or not all(isinstance(task, dict) for task in tasks):
+        raise AnnotationError(f"{file}: expected a list of tasks, as Label Studio exports JSON")
+    pictures: list[Picture] = []
+    ignored: dict[str, int] = {}
+    for number, task in enumerate(tasks):
+        picture = _studio_picture(task, f"{file}: task {task.get('id', number)}", ignored)
+        if picture is not None:
+            pictures.append(picture)
+    used = dict.fromkeys(thing.label for one in pictures for thing in one.things)
+    return Annotations(str(file), tuple(sorted(used)), tuple(pictures), ignored)
+
+
+def _studio_picture(task: Mapping[str, Any], where: str, ignored: dict[str, int]) -> Picture | None:
+    done = task.get("annotations")
+    kept = [
+        one
+        for one in (done if isinstance(done, list) else [])
+        if isinstance(one, dict) and not one.get("was_cancelled")
+    ]
+    if not kept:
+        ignored[UNLABELLED] = ignored.get(UNLABELLED, 0) + 1
+        return None
+    try:
+        data, results = task["data"], kept[-1]["result"]
+        name = str(data["image"]).replace("\\", "/").rpartition("/")[2].rpartition("=")[2]
+        t_ns = data.get("t_ns")
+        sizes = [(row["original_width"], row["original_height"]) for row in _rectangles(results)]
+        size = sizes[0] if sizes else (data.get("width", 0), data.get("height", 0))
+        wide, high = int(size[0]), int(size[1])
+        things = tuple(_studio_thing(row, (wide, high), where) for row in _rectangles(results))
+    except (KeyError, TypeError, ValueError, IndexError):
+        raise AnnotationError(
+            f"{where}: expected data.image and rectangles with original_width, x, y, width, height"
+        ) from None
+    for row in results:
+        if row not in list(_rectangles(results)):
+            kind = str(row.get("type", "something"))
+            ignored[kind] = ignored.get(kind, 0) + 1
+    return Picture(name, (wide, high), int(t_ns) if t_ns is not None else None, None, things)
+
+
+def _rectangles(results: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    for row in results:
+        if row.get("type") == "rectanglelabels" and not row["value"].get("rotation"):
+            yield row
+
+
+def _studio_thing(row: Mapping[str, Any], size: tuple[int, int], where: str) -> Annotation:
+    value = row["value"]
+    x, y, w, h = (float(value[name]) / 100.0 for name in ("x", "y", "width", "height"))
+    box = (x * size[0], y * size[1], (x + w) * size[0], (y + h) * size[1])
+    return Annotation(str(value["rectanglelabels"][0]), box, place=where)
+
 
 MAX_BYTES: Final = 512 << 20
 
@@ -71,7 +324,7 @@ def read_tool_labels(path: Path, sizes: Sizes, kind: ToolFormat | None = None) -
 def _recognised(path: Path) -> ToolFormat:
     suffix = path.suffix.lower()
     if path.is_dir():
-        return "fiftyone" if (path / FIFTYONE).is_file() else "yolo"
+        return "fiftyone" if (path / FIFTYONE_FILE).is_file() else "yolo"
     if suffix in (".xml", ".yaml"):
         return "cvat" if suffix == ".xml" else "yolo"
     if suffix != ".json":

@@ -13,9 +13,9 @@ from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
-from crosscue.datasets.scenes.export.coco import DriveAnnotations
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.rendering.render import PictureSettings, RenderedFrame, Renderer
+from crosscue.datasets.scenes.scene_truth import DriveAnnotations
 from crosscue.datasets.scenes.settings import SceneSettings, world_of
 from crosscue.datasets.simulated.drive import (
     FILES_OF_DRIVE,
@@ -26,7 +26,7 @@ from crosscue.datasets.simulated.drive import (
     sense,
     with_simulated_noise,
 )
-from crosscue.datasets.simulated.sensor_blocks import sensor_blocks
+from crosscue.datasets.simulated.log_files import sensor_blocks
 from crosscue.datasets.truth.truth import Approach, Features, Mounting, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.replay.columns import Block, ImageCoding, Images, Int64s, Messages, Topic
@@ -41,10 +41,10 @@ from crosscue.replay.write.convert import LogWriter
 from crosscue.results import Result
 
 from .car_file import scene_vehicle_text
-from .conditions import Conditions
-from .cues import CueRuns, present
 from .layout import Layout
 from .mobileye import Device
+from .motion import Conditions
+from .scene_truth import CueRuns, present
 from .world import World
 
 # File that identifies the drive of a folder.

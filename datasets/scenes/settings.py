@@ -9,8 +9,8 @@ from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.rendering.render import DEFAULTS, PictureSettings
 from crosscue.replay.errors import UsageError
 
-from .conditions import Conditions, conditions_of
 from .layout import Layout, layout_named
+from .motion import Conditions, conditions_of
 from .world import World, build_world
 
 CAMERA: Final = SceneCamera()

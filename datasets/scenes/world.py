@@ -18,7 +18,6 @@ from crosscue.datasets.scenes.rendering.ground import (
     unpainted,
     with_levels,
 )
-from crosscue.datasets.scenes.rendering.lighting import Daylight, daylight
 from crosscue.datasets.scenes.rendering.mesh import Floats, Mesh, merge_meshes
 from crosscue.datasets.scenes.rendering.scenery import (
     Shadows,
@@ -35,11 +34,11 @@ from crosscue.datasets.scenes.rendering.scenery import (
     wire,
 )
 from crosscue.datasets.scenes.rendering.textures import Atlas, make_atlas
+from crosscue.datasets.scenes.rendering.weather import Daylight, daylight
 
 from .cars import Look, any_look, car
-from .conditions import Conditions
 from .layout import NEAR_KERB_M, Layout
-from .motion import ApproachMotion, approach, lane_y_m
+from .motion import ApproachMotion, Conditions, approach, lane_y_m
 
 Category = Literal[
     "car", "stop_sign", "traffic_light", "one_way_left", "one_way_right", "do_not_enter"

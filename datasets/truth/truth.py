@@ -7,6 +7,8 @@ section is optional.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Protocol, cast
@@ -18,9 +20,11 @@ from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.formats import data_sets
-from crosscue.replay.limits import MIB
+from crosscue.replay.limits import DEFAULT_LIMITS, MIB, LimitsGiven
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.validation_errors import explain
+from crosscue.results import Result, json_key
 
 VERSION: Final = 1
 FILE: Final = "truth.json"
@@ -297,3 +301,41 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def truth_schema() -> dict[str, Any]:
     """Return the JSON Schema of the file, for other tools."""
     return Truth.model_json_schema()
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class WrittenTruth(Result):
+    """A truth file that was written.
+
+    Attributes:
+        path: The file.
+    """
+
+    path: Path = field(metadata=json_key("truth"))
+
+    def lines(self) -> Iterator[str]:
+        """Yield the path."""
+        yield str(self.path)
+
+
+def write_truth(
+    log: Path | str, output: Path | str, *, limits: LimitsGiven = DEFAULT_LIMITS
+) -> WrittenTruth:
+    """Write the truth that a data set contains.
+
+    The result is truth.json and a TUM trajectory.
+
+    Examples:
+        crosscue truth comma2k19/Example_1/ROUTE/40 -o truth/
+
+    Args:
+        log: Folder of a data set.
+        output: Folder for the truth file and its trajectory.
+        limits: Limits for reading the logs.
+
+    Raises:
+        EmptyResultError: The log's format contains no truth.
+        OutputError: The files cannot be written.
+    """
+    with open_log(log, limits) as opened:
+        return WrittenTruth(write_carried(opened.format, Path(log), Path(output)))

@@ -28,12 +28,10 @@ from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
 
 from .annotations import LabelledSet
-from .loop import Schedule, Training
-from .measure import fitted, judged, rates_by_score, raw_detections
+from .loop import Schedule, Training, decides_bits, reproducible
+from .measure import average_precisions, fitted, judged, rates_by_score, raw_detections
 from .operating_point import Verdicts
-from .reproducible import decides_bits, reproducible
 from .samples import Sampler, SampleSettings
-from .scores import average_precisions
 
 COMPACT: Final = "compact"
 Recipe: TypeAlias = dict[str, str | int | float]

@@ -1,4 +1,4 @@
-"""Processing of drives on a Ray cluster, an engine like ``processes.Processes``.
+"""Choice of the engine of a batch, and the one that processes drives on a Ray cluster.
 
 Every node needs this version of crosscue, and sees logs and run folders under the same paths (a
 shared file system, or logs on an object store). A drive is one task that declares its cores and
@@ -10,19 +10,119 @@ that its lock is removed first and the number of attempts is correct.
 from __future__ import annotations
 
 import os
+import signal
+import socket
 import sys
+import threading
 from collections import deque
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from crosscue.eval.runs.folder import LOCK
+from crosscue.replay.errors import CrosscueError, UsageError, one_line
 from crosscue.replay.processes import GRACE_S
 
-from .jobs import Events, Job, JobOutcome, R, attempt, reported_error, worker_crashed
-from .processes import THREAD_VARIABLES, TICK_S
-from .ray_cluster import GIB, LOCAL, check_fits, connect_ray
+from .jobs import Engine, Events, Job, JobOutcome, R, attempt, reported_error, worker_crashed
+from .processes import THREAD_VARIABLES, TICK_S, Processes
+
+GIB: Final = 1 << 30
+LOCAL: Final = "local"
+WAIT_S: Final = 5.0
+# Size of a local cluster's object store; results are small.
+STORE_BYTES: Final = 96 << 20
+
+
+@contextmanager
+def connect_ray(address: str, workers: int | None = None) -> Iterator[Any]:
+    """Yield the module ``ray``, connected; disconnect at the end unless it was connected before.
+
+    Args:
+        address: An address of Ray's clients (``auto``, ``10.0.0.1:6379``), or ``local``.
+        workers: Cores of a local cluster; None uses all cores.
+
+    Raises:
+        UsageError: Ray is not installed.
+        CrosscueError: The cluster cannot be reached or started.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray
+    except ImportError:
+        raise UsageError("--ray: Ray is not installed; pip install ray") from None
+    is_ours = not ray.is_initialized()
+    if is_ours:
+        _connect(ray, address, workers)
+    try:
+        yield ray
+    finally:
+        if is_ours:
+            ray.shutdown()
+
+
+def check_fits(ray: Any, address: str, cores: int, memory_bytes: int) -> None:
+    """Refuse requirements that no node meets, because Ray would wait for such a node indefinitely.
+
+    Raises:
+        CrosscueError: No node is large enough; states the needs of a drive and the largest nodes.
+    """
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    has = [(int(one.get("CPU", 0)), int(one.get("memory", 0))) for one in nodes]
+    if not any(its_cores >= cores and its_bytes >= memory_bytes for its_cores, its_bytes in has):
+        max_cores = max((one for one, _ in has), default=0)
+        max_bytes = max((one for _, one in has), default=0)
+        raise CrosscueError(
+            f"--ray {address}: a drive declares {cores} cores and {memory_bytes / GIB:.3g} GiB; no "
+            f"node has both: the largest have {max_cores} cores and {max_bytes / GIB:.3g} GiB; "
+            "declare less with --cores-per-drive and --memory-per-drive"
+        )
+
+
+def _check_reachable(address: str) -> None:
+    """Refuse an address that accepts no connection, because Ray itself retries for minutes.
+
+    Raises:
+        CrosscueError: The address accepts no connection.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not (host and port.isdecimal()):
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), WAIT_S).close()
+    except (OSError, OverflowError) as error:
+        raise CrosscueError(
+            f"--ray {address}: no connection ({one_line(error)}); start a cluster with ray start, "
+            f"or use {LOCAL}"
+        ) from None
+
+
+def _connect(ray: Any, address: str, workers: int | None) -> None:
+    is_main = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGTERM) if is_main else None
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "error"}
+    if address == LOCAL:
+        options |= {
+            "num_cpus": workers,
+            "include_dashboard": False,
+            "object_store_memory": STORE_BYTES,
+            "_node_ip_address": "127.0.0.1",
+        }
+    _check_reachable(address)
+    try:
+        ray.init(address=address, **options)
+    except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+        raise CrosscueError(
+            f"--ray {address}: no cluster ({one_line(error)}); start one with ray start, or use "
+            f"{LOCAL}"
+        ) from None
+    finally:
+        if is_main:
+            # Ray installs its own handler, which would hide SIGTERM from the command.
+            signal.signal(signal.SIGTERM, before)
+    # Ray reports dead workers on stdout, which is reserved for results; we report them ourselves.
+    ray._private.worker._worker_logs_enabled = False
+
 
 # Memory of a drive with a camera and a neural network, on one core.
 MEMORY_BYTES: Final = 2 * GIB
@@ -124,3 +224,37 @@ def _cancel(ray: Any, references: Sequence[Any]) -> None:
     for reference in late:
         with suppress(Exception):
             ray.cancel(reference, force=True)
+
+
+def engine_of(
+    workers: int | None,
+    ray: str | None,
+    cores: int | None = None,
+    memory_gib: float | None = None,
+) -> Engine:
+    """Return the engine that the options of a command select.
+
+    Args:
+        workers: Number of drives processed in parallel.
+        ray: Address of a Ray cluster; None selects local processes.
+        cores: Cores of each drive on the cluster; default 1.
+        memory_gib: Memory of each drive on the cluster; default 2.
+
+    Raises:
+        UsageError: A number is too small, or cores or memory are set without a cluster.
+    """
+    if ray is None and (cores is not None or memory_gib is not None):
+        raise UsageError(
+            "cores_per_drive, memory_per_drive_gib: need a cluster; name its address with ray"
+        )
+    if (cores is not None and cores < 1) or (memory_gib is not None and not memory_gib > 0.0):
+        raise UsageError(
+            f"cores_per_drive, memory_per_drive_gib: {cores} and {memory_gib}; expected 1 core or "
+            "more and GiB above 0"
+        )
+    if workers is not None and workers < 1:
+        raise UsageError(f"workers: {workers}, expected 1 or more")
+    if ray is not None:
+        memory_bytes = MEMORY_BYTES if memory_gib is None else int(memory_gib * (1 << 30))
+        return OnRay(ray, workers, cores=cores or 1, memory_bytes=memory_bytes)
+    return Processes(workers or 1)

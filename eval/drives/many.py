@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from crosscue.eval.batch.drive_list import DriveInput, DriveList, drives_of
-from crosscue.eval.batch.engine import engine_of
 from crosscue.eval.batch.jobs import (
     Job,
     JobOutcome,
@@ -18,6 +17,7 @@ from crosscue.eval.batch.jobs import (
     run_many,
 )
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
+from crosscue.eval.batch.ray_jobs import engine_of
 from crosscue.eval.logs.log import UnopenedLog
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.run import Run

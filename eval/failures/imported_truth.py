@@ -25,8 +25,7 @@ from crosscue.datasets.truth.annotations import (
     match_frames,
 )
 from crosscue.datasets.truth.box_labels import Meanings
-from crosscue.datasets.truth.coco import WRITTEN, write_coco
-from crosscue.datasets.truth.objects import OBJECTS_FILE
+from crosscue.datasets.truth.coco import OBJECTS_FILE, WRITTEN, write_coco
 from crosscue.datasets.truth.truth import Truth
 from crosscue.eval.failures.labels import INDEX
 from crosscue.eval.fit.log_images import log_pictures

@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.datasets.geodesy import geodetic_to_enu
-from crosscue.datasets.truth.carried import WrittenTruth
-from crosscue.datasets.truth.truth import Mounting, Origin, Truth, save
+from crosscue.datasets.truth.truth import Mounting, Origin, Truth, WrittenTruth, save
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.localization.compass import course_at

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Annotated
 
 from crosscue.datasets.scenes.drive import SOURCE
-from crosscue.datasets.scenes.export.coco import DriveAnnotations
-from crosscue.datasets.scenes.export.training_frames import frames, merge_annotations
+from crosscue.datasets.scenes.scene_truth import DriveAnnotations
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
+from crosscue.datasets.scenes.single_frames import frames, merge_annotations
 from crosscue.eval.training.inputs import check_place, training_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.progress import Progress, emit

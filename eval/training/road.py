@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
-from crosscue.datasets.scenes.export.road_frames import RoadFrames, concatenate_frames, rendered
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
+from crosscue.datasets.scenes.single_frames import RoadFrames, concatenate_frames, rendered
 from crosscue.eval.training.inputs import Device, check_place, layouts_of, training_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.made_of import made_of
@@ -155,7 +155,7 @@ def train_road(
 
     from crosscue.detectors.networks.devices import chosen_device
     from crosscue.detectors.networks.road.checkpoint import RoadFacts, load_road, save_road
-    from crosscue.detectors.training.reproducible import decides_bits, reproducible
+    from crosscue.detectors.training.loop import decides_bits, reproducible
     from crosscue.detectors.training.road import RoadSchedule, RoadTraining
 
     if settings.threads:
@@ -200,7 +200,7 @@ def _measure(network: str, settings: RoadTrainingSettings) -> TrainedRoad:
     _check(settings)
     if (settings.data is None) == (not settings.test_layouts):
         raise UsageError("measure: expected --test-layouts with layouts, or --data with pictures")
-    from crosscue.datasets.adapters.road_folder import load_folder
+    from crosscue.datasets.scenes.single_frames import load_folder
     from crosscue.detectors.networks.devices import chosen_device
     from crosscue.detectors.networks.road.checkpoint import load_road
     from crosscue.detectors.networks.road.network import embedded_road
@@ -284,7 +284,7 @@ def _frames(settings: RoadTrainingSettings) -> tuple[RoadFrames, RoadFrames | No
     """Return the frames to train on, and the held-out frames."""
     size = settings.size_px
     if settings.data is not None:
-        from crosscue.datasets.adapters.road_folder import load_folder
+        from crosscue.datasets.scenes.single_frames import load_folder
 
         whole = load_folder(Path(settings.data), size)
         kept = [i for i in range(len(whole)) if i % HELD_EVERY or len(whole) < HELD_EVERY]

@@ -45,23 +45,8 @@ from crosscue.localization.pose_filter import (
 from crosscue.replay.compiled import kept
 
 from . import settings as settings_of
-from .parameters import Parameters, parameters_of
 from .random_stream import RandomStream, below, normal, stream_of, uniform
-from .route import (
-    ARC_FIELDS,
-    BACK,
-    MAX_ARCS,
-    STRAIGHT,
-    UNDECIDED,
-    Route,
-    advance_turn,
-    enter,
-    entry_m,
-    lane_of,
-    next_arc,
-    remaining_m,
-    wanted_mps,
-)
+from .settings import Parameters, parameters_of
 from .streets import (
     COSINES,
     HEADINGS_RAD,
@@ -76,7 +61,25 @@ from .streets import (
     node_position,
     step_of,
 )
-from .vehicle import Reading, TownVehicle, measure_step, move
+from .vehicle import (
+    ARC_FIELDS,
+    BACK,
+    MAX_ARCS,
+    STRAIGHT,
+    UNDECIDED,
+    Reading,
+    Route,
+    TownVehicle,
+    advance_turn,
+    enter,
+    entry_m,
+    lane_of,
+    measure_step,
+    move,
+    next_arc,
+    remaining_m,
+    wanted_mps,
+)
 
 Keys = NDArray[np.uint64]
 Ints = NDArray[np.int64]

@@ -14,8 +14,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .parameters import Parameters
 from .random_stream import RandomStream, below, uniform
+from .settings import Parameters
 
 HEADINGS_RAD: Final = (0.0, math.pi / 2.0, math.pi, -math.pi / 2.0)
 COSINES: Final = tuple(math.cos(heading) for heading in HEADINGS_RAD)

@@ -13,7 +13,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 import crosscue
-from crosscue.datasets.scenes.cues import SIMULATED
+from crosscue.datasets.scenes.scene_truth import SIMULATED
 from crosscue.detectors.base import Detections, Found, Frame
 from crosscue.detectors.cues.rules import rule_of
 from crosscue.replay.vehicle.cue_spec import CueSpec

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from crosscue.eval import cli
-from crosscue.eval.vehicle.mounting import estimate_mounting
+from crosscue.eval.vehicle.draft import estimate_mounting
 from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.replay.columns import Images, Int64s
 from crosscue.replay.logs.opening import open_log
@@ -73,7 +73,7 @@ LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
 }
 # Reasons why other files have no command in the table above.
 HOW_OTHERS_DO: Final = {
-    "datasets/adapters/road_folder.py": "files that the user names",
+    "datasets/scenes/single_frames.py": "files that the user names",
     "detectors/catalog/cards.py": "files that the user names",
     "detectors/images.py": "the functions themselves",
     "detectors/overlay.py": "for eval/report/frame_pictures.py",
@@ -83,7 +83,7 @@ HOW_OTHERS_DO: Final = {
     "eval/pipeline/visual.py": "frames with detections, thus decoded before",
     "eval/report/worst_boxes.py": "frames with detections, thus decoded before",
     "eval/studies/intersections/contact_sheet.py": "frames with detections, thus decoded before",
-    "eval/vehicle/mounting.py": "a function of its own below, because it needs intrinsics",
+    "eval/vehicle/draft.py": "a function of its own below, because it needs intrinsics",
     "localization/landmarks/images.py": "for the commands of landmarks",
 }
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from crosscue.datasets.adapters.comma2k19 import STREAMS
+from crosscue.datasets.adapters.comma2k19 import STREAMS, read_column
 from crosscue.datasets.adapters.comma2k19_truth import write_comma_truth
-from crosscue.datasets.adapters.npy import read_column
 from crosscue.eval import cli
 from crosscue.replay.base import Selection
 from crosscue.replay.columns import Table

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from crosscue.datasets.adapters.kitti import TOPICS, open_kitti, write_kitti_truth
-from crosscue.datasets.adapters.kitti_oxts import COLUMNS, Packets, parse_oxts
+from crosscue.datasets.adapters.kitti_files import COLUMNS, Packets, parse_oxts
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.truth import read_truth as load_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from crosscue.datasets.truth.mounting import turned_by
-from crosscue.datasets.truth.tum import Trajectory, planar
+from crosscue.datasets.truth.tum import Trajectory, planar, turned_by
 
 
 def _body(kappa_per_m: NDArray[np.float64], speed_mps: float, ahead_m: float) -> Trajectory:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from crosscue.datasets.adapters.road_folder import load_folder
+from crosscue.datasets.scenes.single_frames import load_folder
 from crosscue.detectors.networks.road.checkpoint import RoadFacts, load_road, save_road
 from crosscue.detectors.networks.road.detector import build
 from crosscue.detectors.networks.road.network import RoadNetwork

@@ -19,10 +19,9 @@ from crosscue.detectors.networks.mask_rcnn.checkpoint import load_checkpoint
 from crosscue.detectors.networks.mask_rcnn.network import build_network
 from crosscue.detectors.training.annotations import LabelledSet, mask_of, read_training_coco
 from crosscue.detectors.training.loop import Schedule, Training
-from crosscue.detectors.training.measure import fitted
+from crosscue.detectors.training.measure import average_precisions, fitted
 from crosscue.detectors.training.operating_point import Verdicts
 from crosscue.detectors.training.samples import Sampler, SampleSettings
-from crosscue.detectors.training.scores import average_precisions
 from crosscue.eval.cli import run
 from crosscue.replay.errors import CrosscueError, SchemaError
 from support.mask_rcnn import CPU, plan_of, write_bars

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from crosscue.datasets.scenes import drive
-from crosscue.datasets.scenes.conditions import conditions_of
 from crosscue.datasets.scenes.layout import layout_named
+from crosscue.datasets.scenes.motion import conditions_of
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.rendering.ground import Ground
 from crosscue.datasets.scenes.rendering.mesh import Mesh

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.datasets.scenes.export.road_truth import ground_seen, road_seen
+from crosscue.datasets.scenes.rendering.camera import ground_seen, road_seen
 from crosscue.datasets.scenes.world import SceneObject, World
 
 from .camera import CameraView, SceneCamera, view_at

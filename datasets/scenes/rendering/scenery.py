@@ -9,8 +9,7 @@ import numpy as np
 from numpy.random import Generator
 
 from .mesh import Floats, Mesh, Rgb, box, disc, merge_meshes, quad, triangles, tube
-from .signs import WIDTH_M
-from .textures import FRONT_M, Atlas
+from .textures import FRONT_M, WIDTH_M, Atlas
 
 STEEL: Rgb = (0.52, 0.53, 0.54)
 WOOD: Rgb = (0.34, 0.27, 0.21)

@@ -1,10 +1,171 @@
-"""Draw rain in front of the camera: streaks in the air and drops on the windscreen."""
+"""Daylight (brightness of surfaces, the sky, haze), and rain in front of the camera."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
+
+from crosscue.datasets.scenes.motion import Conditions
+
+from .mesh import Floats, Mesh
+from .textures import smooth_noise
+
+SKY_HIGH, SKY_WIDE = 128, 1024
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Daylight:
+    """Light of one run.
+
+    Attributes:
+        to_sun: Unit vector towards the sun, local frame.
+        sun: Colour of direct light; zero without direct light.
+        ambient: Colour of the sky's light.
+        haze: Colour of distant objects, 0 to 255.
+        haze_per_m: 1 over the distance at which half of the light is haze.
+        sky: Colours of the sky, shape (SKY_HIGH, SKY_WIDE, 3), rows by the sine of elevation,
+            columns by direction.
+        flare: Strength of the glare of the sun.
+        contrast: Factor of contrast.
+        noise: Noise of the sensor in grey values.
+        shine: Reflectivity of the road.
+        lamps_on: True if cars have their lamps on.
+    """
+
+    to_sun: Floats
+    sun: Floats
+    ambient: Floats
+    haze: Floats
+    haze_per_m: float
+    sky: NDArray[np.uint8]
+    flare: float
+    contrast: float
+    noise: float
+    shine: float
+    lamps_on: bool
+
+    def on(self, mesh: Mesh) -> NDArray[np.float32]:
+        """Return light times albedo of each triangle, from the brighter side, (T, 3)."""
+        normal = mesh.normals()
+        # Both sides of a billboard are equal; solids show the side with counter-clockwise corners.
+        direct = np.maximum(normal @ self.to_sun, 0.0)
+        from_sky = 0.72 + 0.28 * normal[:, 2]
+        light = direct[:, None] * self.sun + from_sky[:, None] * self.ambient
+        light = np.where(mesh.glow[:, None] > 0.0, 1.0, light)
+        return (mesh.albedo * light).astype(np.float32)
+
+    @property
+    def on_ground(self) -> Floats:
+        """Return the light on the ground in the sun."""
+        lit: Floats = self.ambient + self.sun * max(self.to_sun[2], 0.0)
+        return lit
+
+    @property
+    def in_shadow(self) -> float:
+        """Return the fraction of the ground's light that remains in shadow."""
+        return float((self.ambient.sum()) / self.on_ground.sum())
+
+
+def daylight(conditions: Conditions, rng: Generator) -> Daylight:
+    """Return the light of a run."""
+    high_deg, sun, ambient, haze, zenith, flare, noise, clouds = {
+        "noon": (
+            52.0,
+            (0.72, 0.69, 0.62),
+            (0.50, 0.54, 0.60),
+            (206, 216, 226),
+            (96, 142, 206),
+            0.0,
+            2.0,
+            0.45,
+        ),
+        "overcast": (
+            50.0,
+            (0.05, 0.05, 0.05),
+            (0.80, 0.82, 0.84),
+            (208, 212, 216),
+            (186, 192, 200),
+            0.0,
+            2.6,
+            0.9,
+        ),
+        "dusk": (
+            4.0,
+            (0.03, 0.02, 0.02),
+            (0.36, 0.36, 0.43),
+            (150, 130, 132),
+            (66, 80, 124),
+            0.0,
+            5.5,
+            0.5,
+        ),
+        "low_sun": (
+            9.0,
+            (1.05, 0.80, 0.50),
+            (0.42, 0.43, 0.48),
+            (240, 222, 188),
+            (140, 166, 206),
+            1.0,
+            2.4,
+            0.35,
+        ),
+    }[conditions.light]
+    elevation = np.deg2rad(high_deg)
+    turn = conditions.sun_turn_rad
+    to_sun = np.array(
+        [np.cos(elevation) * np.cos(turn), np.cos(elevation) * np.sin(turn), np.sin(elevation)]
+    )
+    wet = conditions.rain
+    dim = 1.0 - 0.28 * wet
+    return Daylight(
+        to_sun,
+        np.array(sun) * dim,
+        np.array(ambient) * dim,
+        np.array(haze) * (1.0 - 0.15 * wet),
+        1.0 / (900.0 - 690.0 * wet),
+        _sky(
+            np.array(haze) * (1 - 0.15 * wet),
+            np.array(zenith) * (1 - 0.1 * wet),
+            to_sun,
+            clouds + 0.3 * wet,
+            flare,
+            rng,
+        ),
+        flare * float(rng.uniform(0.75, 1.25)),
+        1.0 - 0.16 * wet - 0.12 * flare,
+        noise + 1.5 * wet,
+        0.55 * wet,
+        conditions.light == "dusk" or wet > 0.3,
+    )
+
+
+def _sky(
+    horizon: Floats, zenith: Floats, to_sun: Floats, clouds: float, flare: float, rng: Generator
+) -> NDArray[np.uint8]:
+    up = np.linspace(0.0, 1.0, SKY_HIGH)[:, None]
+    azimuth = (np.arange(SKY_WIDE) + 0.5) / SKY_WIDE * 2 * np.pi - np.pi
+    blend = (up**0.55)[..., None]
+    sky = horizon * (1 - blend) + zenith * blend
+    sky = np.repeat(sky, SKY_WIDE, axis=1)
+    field = np.zeros((SKY_HIGH, SKY_WIDE))
+    for cells, weight in ((8, 0.5), (16, 0.28), (64, 0.22)):
+        field += weight * smooth_noise(rng, 1024, cells)[:SKY_HIGH]
+    cover = np.clip((field - (0.68 - 0.34 * clouds)) * 4.0, 0.0, 1.0)[..., None]
+    cover = cover * np.clip(0.25 + 2.0 * up[..., None], 0, 1)
+    white = np.maximum(horizon, zenith) * 0.55 + 0.45 * min(255.0, float(horizon.max()) * 1.12)
+    shade = (0.86 + 0.22 * field)[..., None]
+    sky = sky * (1 - cover) + np.minimum(white * shade, 255.0) * cover
+    if flare > 0.0:
+        flat = np.sqrt(np.maximum(1 - up**2, 0))
+        ahead = flat * (np.cos(azimuth) * to_sun[0] + np.sin(azimuth) * to_sun[1]) + up * to_sun[2]
+        away = 1.0 - ahead
+        glow = (np.exp(-away / 0.05) * 90 + np.exp(-away / 0.0006) * 255)[..., None]
+        sky = sky + glow * np.array([1.0, 0.93, 0.75])
+    shown: NDArray[np.uint8] = np.clip(sky, 0, 255).astype(np.uint8)
+    return shown
 
 
 def streaks(rgb: NDArray[np.uint8], rain: float, speed_mps: float, rng: Generator) -> None:

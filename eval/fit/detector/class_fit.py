@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.catalog.class_scores import ClassScores, Isotonic, Platt
-from crosscue.detectors.training.platt import fit_isotonic, fit_platt
+from crosscue.detectors.training.operating_point import fit_isotonic, fit_platt
 from crosscue.eval.scoring.boxes.reliability import class_calibration
 from crosscue.eval.scoring.intervals import Interval, wilson
 

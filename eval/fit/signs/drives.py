@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from crosscue.datasets.truth.objects import OBJECTS_FILE
+from crosscue.datasets.truth.coco import OBJECTS_FILE
 from crosscue.detectors.images import encoded, lose
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
 from crosscue.eval.fit.signs.labels import Boxes, SignPicture, coco_boxes, read_text

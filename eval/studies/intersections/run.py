@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 from crosscue.detectors.registry import check, chosen
-from crosscue.eval.batch.engine import engine_of
 from crosscue.eval.batch.jobs import JobOutcome, exit_status_of
+from crosscue.eval.batch.ray_jobs import engine_of
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.studies.result import StoredResult

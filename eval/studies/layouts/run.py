@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated, Final
 
 from crosscue.datasets.scenes.faulty_labels import DETECTORS, LABEL_IMAGES
-from crosscue.eval.batch.engine import engine_of
 from crosscue.eval.batch.jobs import JobOutcome, exit_status_of
+from crosscue.eval.batch.ray_jobs import engine_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.studies.result import StoredResult
 from crosscue.eval.studies.simulated_drives import SPARSE_AND_EMBEDDED, run_drives

@@ -20,10 +20,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from crosscue.eval.batch.ray_cluster import connect_ray
+from crosscue.eval.batch.ray_jobs import connect_ray
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.parquet import TableSink
-from crosscue.localization.town import parameters
 from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import DriveResult, Keys, drive_many, drive_one
 from crosscue.localization.town.random_stream import key_of
@@ -197,8 +196,7 @@ def _chunk_schema() -> pa.Schema:
 
 @cache
 def _code() -> bytes:
-    settings = (Path(str(one.__file__)).read_bytes() for one in (parameters, drive_settings))
-    return fingerprint(drive_one).encode() + b"".join(settings)
+    return fingerprint(drive_one).encode() + Path(str(drive_settings.__file__)).read_bytes()
 
 
 def _read(kept: RunFolder, chunk: DriveBatch) -> dict[str, Floats] | None:

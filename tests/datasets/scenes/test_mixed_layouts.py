@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from crosscue.datasets.scenes.conditions import conditions_of
 from crosscue.datasets.scenes.layout import (
     CURVE_SLOPE,
     KINDS,
     mixed_layout,
 )
-from crosscue.datasets.scenes.motion import lane_y_m
+from crosscue.datasets.scenes.motion import conditions_of, lane_y_m
 from crosscue.datasets.scenes.world import build_world
 
 FEATURES = ("intersection", "left", "right", "straight")

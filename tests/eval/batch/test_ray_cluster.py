@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 
 from crosscue.eval.batch.jobs import exit_status_of, in_turn, run_many
-from crosscue.eval.batch.ray_cluster import LOCAL, connect_ray
-from crosscue.eval.batch.ray_jobs import OnRay
+from crosscue.eval.batch.ray_jobs import LOCAL, OnRay, connect_ray
 from crosscue.eval.studies.town import work
 from crosscue.eval.studies.town.settings import LandmarkStudy
 from crosscue.eval.studies.town.work import assemble, chunks_of, run

@@ -14,7 +14,7 @@ import crosscue
 from crosscue.datasets.truth.box_labels import read_box_labels
 from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.class_scores import Platt
-from crosscue.detectors.training.platt import fit_isotonic, fit_platt
+from crosscue.detectors.training.operating_point import fit_isotonic, fit_platt
 from crosscue.eval.fit.detector.threshold import (
     TRIED,
     bounded_threshold,

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import streets_of
-from crosscue.localization.town.parameters import parameters_of
 from crosscue.localization.town.random_stream import RandomStream, stream_of
-from crosscue.localization.town.settings import City, TownDrive
+from crosscue.localization.town.settings import City, TownDrive, parameters_of
 from crosscue.localization.town.streets import (
     Streets,
     draw_goal,

@@ -1,1 +1,0 @@
-"""Export simulated scenes as COCO files, road masks and contact sheets."""
