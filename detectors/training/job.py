@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from crosscue.detectors.networks.devices import chosen_device
 from crosscue.detectors.networks.mask_rcnn.checkpoint import (
@@ -21,17 +24,22 @@ from crosscue.detectors.networks.mask_rcnn.checkpoint import (
 )
 from crosscue.detectors.networks.mask_rcnn.coco import COCO_NETWORKS
 from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, checkpoint_named
-from crosscue.detectors.networks.mask_rcnn.network import NetworkPlan, build_network
+from crosscue.detectors.networks.mask_rcnn.network import (
+    NetworkPlan,
+    build_network,
+    forward_training,
+    freeze_masks,
+)
 from crosscue.replay.errors import OutputError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
 
 from .annotations import LabelledSet
-from .loop import Schedule, Training, decides_bits, reproducible
+from .loop import Learner, Schedule, decides_bits, reproducible
 from .measure import average_precisions, fitted, judged, rates_by_score, raw_detections
 from .operating_point import Verdicts
-from .samples import Sampler, SampleSettings
+from .samples import Sample, Sampler, SampleSettings
 
 COMPACT: Final = "compact"
 Recipe: TypeAlias = dict[str, str | int | float]
@@ -93,6 +101,85 @@ class CurvePoint:
     loss: float
     seconds: float
     ap: dict[str, float | None] = field(default_factory=dict)
+
+
+class Training(Learner):
+    """A Mask R-CNN in training; ``steps`` trains, ``save`` and ``resume`` keep its state."""
+
+    def __init__(
+        self,
+        make: Callable[[], Any],
+        schedule: Schedule,
+        device: torch.device,
+        *,
+        learns_masks: bool = True,
+    ) -> None:
+        """Build the network and its average.
+
+        Args:
+            make: Builds the network with its initial weights.
+            schedule: Number of steps and learning rates.
+            device: Device of the training.
+            learns_masks: False to freeze the mask head.
+        """
+        torch.manual_seed(schedule.seed)
+        network = make().to(device).to(memory_format=torch.channels_last).train()
+        freeze_masks(network, is_frozen=not learns_masks)
+        averaged = make().to(device).to(memory_format=torch.channels_last).eval()
+        averaged.load_state_dict(network.state_dict())
+        averaged.requires_grad_(False)
+        super().__init__(network, _groups(network, schedule.decay), schedule, device, averaged)
+
+    def steps(self, sampler: Sampler) -> Iterator[tuple[int, float]]:
+        """Train, and yield number and loss of each step.
+
+        Raises:
+            LogError: A picture cannot be read.
+            CrosscueError: The losses are no longer finite.
+        """
+        schedule = self.schedule
+        first, last = self.done * schedule.batch, schedule.steps * schedule.batch
+        with ThreadPoolExecutor(1, "samples") as pool:
+            # The next batch is prepared during the current step.
+            waiting = [
+                pool.submit(sampler, k) for k in range(first, min(first + schedule.batch, last))
+            ]
+            while self.done < schedule.steps:
+                batch = [future.result() for future in waiting]
+                first += schedule.batch
+                waiting = [
+                    pool.submit(sampler, k) for k in range(first, min(first + schedule.batch, last))
+                ]
+                loss = self.learn(partial(self._loss, batch))
+                yield self.done, loss
+
+    def _loss(self, batch: list[Sample]) -> Tensor:
+        pictures = torch.from_numpy(np.stack([sample.pixels for sample in batch]))
+        pictures = pictures.to(self.device, memory_format=torch.channels_last)
+        targets = [_target(sample, self.device) for sample in batch]
+        with torch.autocast(
+            self.device.type, enabled=self.device.type == "cuda", dtype=torch.bfloat16
+        ):
+            return forward_training(self.network, pictures, targets)
+
+
+def _groups(network: Any, decay: float) -> list[dict[str, Any]]:
+    """Group parameters: weights with decay, biases and normalisations without."""
+    learns = [p for p in network.parameters() if p.requires_grad]
+    return [
+        {"params": [p for p in learns if p.ndim > 1], "weight_decay": decay},
+        {"params": [p for p in learns if p.ndim <= 1], "weight_decay": 0.0},
+    ]
+
+
+def _target(sample: Sample, device: torch.device) -> dict[str, Tensor]:
+    columns = {
+        "boxes": sample.boxes_px,
+        "labels": sample.labels,
+        "masks": sample.masks,
+        "has_mask": sample.has_mask,
+    }
+    return {name: torch.from_numpy(column).to(device) for name, column in columns.items()}
 
 
 def run_job(

@@ -1,7 +1,12 @@
-"""The training loop; an interrupted training resumes with the same result.
+"""The training loop of all networks; an interrupted training resumes with the same result.
 
-It uses AdamW with a warm-up and a cosine schedule. The result is a running average of the weights
-(Loshchilov and Hutter 2019; Polyak and Juditsky 1992).
+It uses AdamW with a warm-up and a cosine schedule. The result of a Mask R-CNN is a running average
+of the weights (Loshchilov and Hutter 2019; Polyak and Juditsky 1992).
+
+A training is reproducible bit for bit, for one seed on one machine. On a CPU, every operation used
+has a deterministic implementation, which torch is set to use; sums depend on the number of threads.
+On a GPU, some operations have none, such as the gradient of RoI Align, which adds in any order. The
+checkpoint records all that affects the bits, so that a difference between two can be explained.
 """
 
 from __future__ import annotations
@@ -10,26 +15,21 @@ import json
 import math
 import os
 import platform
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from crosscue.detectors.networks.mask_rcnn.network import forward_training, freeze_masks
 from crosscue.detectors.weights_file import serialised
 from crosscue.replay.errors import CrosscueError, SchemaError, one_line
 from crosscue.replay.files.made_of import NOTHING, refuse_another
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.files.whole_file import write_bytes
 from crosscue.replay.versions import installed
-
-from .samples import Sample, Sampler
 
 LIBRARIES: Final = ("torch", "torchvision", "numpy", "opencv-python-headless")
 CUBLAS_VARIABLE: Final = "CUBLAS_WORKSPACE_CONFIG"
@@ -118,80 +118,50 @@ class Schedule:
         return self.rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(fraction, 1.0))))
 
 
-class Training:
-    """A network in training; ``steps`` trains, ``save`` and ``resume`` store and restore its state.
+class Learner:
+    """A network in training: its optimizer, its average, and its state on disk.
 
     Attributes:
         network: The network in training.
-        averaged: Running average of the network, in evaluation mode.
+        averaged: Running average of the network, in evaluation mode; None without one.
         done: Number of steps done.
     """
 
     def __init__(
         self,
-        make: Callable[[], Any],
+        network: Any,
+        groups: Sequence[dict[str, Any]],
         schedule: Schedule,
         device: torch.device,
-        *,
-        learns_masks: bool = True,
+        averaged: Any = None,
     ) -> None:
-        """Build the network and its average.
+        """Begin with given weights.
 
         Args:
-            make: Builds the network with its initial weights.
+            network: The network, on its device.
+            groups: Its parameters, as the optimizer takes them.
             schedule: Number of steps and learning rates.
             device: Device of the training.
-            learns_masks: False to freeze the mask head.
+            averaged: A copy of the network for its average.
         """
-        torch.manual_seed(schedule.seed)
+        self.network, self.averaged = network, averaged
         self.schedule, self.device = schedule, device
-        self.network = make().to(device).to(memory_format=torch.channels_last).train()
-        freeze_masks(self.network, is_frozen=not learns_masks)
-        self.averaged = make().to(device).to(memory_format=torch.channels_last).eval()
-        self.averaged.load_state_dict(self.network.state_dict())
-        self.averaged.requires_grad_(False)
         self.done = 0
         self._bad = 0
-        self._optimizer = torch.optim.AdamW(
-            _groups(self.network, schedule.decay), schedule.rate, foreach=True
-        )
+        self._optimizer = torch.optim.AdamW(groups, schedule.rate, foreach=True)
 
-    def steps(self, sampler: Sampler) -> Iterator[tuple[int, float]]:
-        """Train, and yield number and loss of each step.
+    def learn(self, loss_of: Callable[[], Tensor]) -> float:
+        """Do one step, and return its loss.
 
         Raises:
-            LogError: A picture cannot be read.
             CrosscueError: The losses are no longer finite.
         """
-        schedule = self.schedule
-        first, last = self.done * schedule.batch, schedule.steps * schedule.batch
-        with ThreadPoolExecutor(1, "samples") as pool:
-            # The next batch is prepared during the current step.
-            waiting = [
-                pool.submit(sampler, k) for k in range(first, min(first + schedule.batch, last))
-            ]
-            while self.done < schedule.steps:
-                batch = [future.result() for future in waiting]
-                first += schedule.batch
-                waiting = [
-                    pool.submit(sampler, k) for k in range(first, min(first + schedule.batch, last))
-                ]
-                loss = self._learn(batch)
-                yield self.done, loss
-
-    def _learn(self, batch: list[Sample]) -> float:
         schedule = self.schedule
         # The losses sample regions at random, which must not depend on where training resumed.
         torch.manual_seed(schedule.seed * 1_000_003 + self.done)
         for group in self._optimizer.param_groups:
             group["lr"] = schedule.rate_at(self.done)
-        pictures = torch.from_numpy(np.stack([sample.pixels for sample in batch]))
-        pictures = pictures.to(self.device, memory_format=torch.channels_last)
-        targets = [_target(sample, self.device) for sample in batch]
-        with torch.autocast(
-            self.device.type, enabled=self.device.type == "cuda", dtype=torch.bfloat16
-        ):
-            loss = forward_training(self.network, pictures, targets)
+        loss = loss_of()
         value = float(loss.detach())
         self.done += 1
         if not math.isfinite(value):
@@ -203,7 +173,8 @@ class Training:
         nn.utils.clip_grad_norm_(self.network.parameters(), GRADIENT_LIMIT)
         self._optimizer.step()
         self._optimizer.zero_grad(set_to_none=True)
-        self._average()
+        if self.averaged is not None:
+            self._average(self.averaged)
         return value
 
     def _note_bad(self) -> None:
@@ -215,10 +186,10 @@ class Training:
             )
 
     @torch.no_grad()
-    def _average(self) -> None:
+    def _average(self, averaged: Any) -> None:
         keep = min(self.schedule.average, (1.0 + self.done) / (10.0 + self.done))
         for kept, now in zip(
-            self.averaged.state_dict().values(), self.network.state_dict().values(), strict=True
+            averaged.state_dict().values(), self.network.state_dict().values(), strict=True
         ):
             if kept.is_floating_point():
                 kept.lerp_(now, 1.0 - keep)
@@ -226,29 +197,28 @@ class Training:
                 kept.copy_(now)
 
     def save(
-        self, path: Path, said: Mapping[str, Any], made_of: Mapping[str, Any] = NOTHING
+        self, path: Path, said: Mapping[str, Any] = NOTHING, made_of: Mapping[str, Any] = NOTHING
     ) -> None:
         """Store everything needed to resume, with entries of the caller.
 
         Raises:
             OutputError: The file cannot be written.
         """
-        tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
-        tensors |= {f"averaged.{k}": v for k, v in self.averaged.state_dict().items()}
+        tensors = {
+            f"{group}.{name}": value
+            for group, network in self._networks().items()
+            for name, value in network.state_dict().items()
+        }
         for i, state in self._optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{i}.{k}": v for k, v in state.items()}
-        header = {
-            STATE_KEY: json.dumps(
-                {
-                    "done": self.done,
-                    "schedule": asdict(self.schedule),
-                    "said": said,
-                    "made_of": made_of,
-                }
-            )
-        }
+        kept = {"done": self.done, "schedule": asdict(self.schedule)}
+        header = {STATE_KEY: json.dumps(kept | {"said": said, "made_of": made_of})}
         plain = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
         write_bytes(path, serialised(plain, header))
+
+    def _networks(self) -> dict[str, Any]:
+        averaged = {} if self.averaged is None else {"averaged": self.averaged}
+        return {"network": self.network, **averaged}
 
     def resume(self, path: Path, made_of: Mapping[str, Any] = NOTHING) -> Mapping[str, Any]:
         """Restore the state of ``save``; return the caller's entries.
@@ -278,37 +248,19 @@ class Training:
         return said
 
     def _restore(self, tensors: Mapping[str, Tensor], path: Path) -> None:
-        groups: dict[str, dict[str, Tensor]] = {"network": {}, "averaged": {}, "optimizer": {}}
+        groups: dict[str, dict[str, Tensor]] = {}
         for name, value in tensors.items():
             group, _, rest = name.partition(".")
             groups.setdefault(group, {})[rest] = value
         state: dict[int, dict[str, Tensor]] = {}
         try:
-            for name, value in groups["optimizer"].items():
+            for name, value in groups.get("optimizer", {}).items():
                 number, _, what = name.partition(".")
                 state.setdefault(int(number), {})[what] = value
-            self.network.load_state_dict(groups["network"])
-            self.averaged.load_state_dict(groups["averaged"])
+            for group, network in self._networks().items():
+                network.load_state_dict(groups[group])
             whole = self._optimizer.state_dict()
             self._optimizer.load_state_dict({**whole, "state": state})
         except (RuntimeError, ValueError, KeyError) as error:
             why = one_line(error, 120)
             raise SchemaError(f"{path}: does not fit this network ({why}); start over") from None
-
-
-def _groups(network: Any, decay: float) -> list[dict[str, Any]]:
-    """Group parameters: weights with decay, biases and normalisations without."""
-    learns = [p for p in network.parameters() if p.requires_grad]
-    return [
-        {"params": [p for p in learns if p.ndim > 1], "weight_decay": decay},
-        {"params": [p for p in learns if p.ndim <= 1], "weight_decay": 0.0},
-    ]
-
-
-def _target(sample: Sample, device: torch.device) -> dict[str, Tensor]:
-    return {
-        "boxes": torch.from_numpy(sample.boxes_px).to(device),
-        "labels": torch.from_numpy(sample.labels).to(device),
-        "masks": torch.from_numpy(sample.masks).to(device),
-        "has_mask": torch.from_numpy(sample.has_mask).to(device),
-    }

@@ -1,18 +1,14 @@
 """Train road networks on pictures with the fraction of road in each pixel.
 
-It uses AdamW with a warm-up and a cosine schedule. Pixels near the road's edge have more weight,
-because most of the road is near and soon learnt. The state is stored as safetensors; an interrupted
-training resumes with the same result.
+Pixels near the road's edge have more weight, because most of the road is near and soon learnt.
 """
 
 from __future__ import annotations
 
-import json
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final
+from functools import partial
+from typing import Final
 
 import numpy as np
 import torch
@@ -20,68 +16,26 @@ from torch import Tensor
 from torch.nn import functional
 
 from crosscue.detectors.networks.road.network import RoadNetwork, logits_of
-from crosscue.detectors.weights_file import serialised
 from crosscue.replay.columns import Bytes
-from crosscue.replay.errors import SchemaError, UsageError, one_line
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.made_of import NOTHING, refuse_another
-from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.files.whole_file import write_bytes
-from crosscue.replay.limits import MIB
 
-STATE_KEY: Final = "crosscue_road_training"
-# Maximum size of a state file; the network and its moments need a few MB.
-MAX_BYTES: Final = 1024 * MIB
+from .loop import Learner, Schedule
+
 EDGE_WEIGHT: Final = 6.0
 EDGE_PX: Final = 9
-GRADIENT_LIMIT: Final = 5.0
+
+# Defaults of a road network's schedule.
+RoadSchedule: Final = partial(Schedule, batch=12, rate=4e-3, warm_up=60, decay=0.01)
 
 
-@dataclass(frozen=True, slots=True)
-class RoadSchedule:
-    """Number of steps, learning rates and related settings.
+class RoadTraining(Learner):
+    """A road network in training; ``steps`` trains, ``save`` and ``resume`` keep its state."""
 
-    Attributes:
-        steps: Total number of batches.
-        batch: Number of pictures per batch.
-        rate: Maximum learning rate.
-        warm_up: Number of steps until the maximum rate is reached.
-        decay: Weight decay.
-        seed: Seed of all random numbers.
-    """
-
-    steps: int = 1200
-    batch: int = 12
-    rate: float = 4e-3
-    warm_up: int = 60
-    decay: float = 0.01
-    seed: int = 0
-
-    def rate_at(self, step: int) -> float:
-        """The learning rate of a step."""
-        if step < self.warm_up:
-            return self.rate * (step + 1) / self.warm_up
-        fraction = (step - self.warm_up) / max(self.steps - self.warm_up, 1)
-        return self.rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * min(fraction, 1.0))))
-
-
-class RoadTraining:
-    """A network in training; ``steps`` trains, ``save`` and ``resume`` store and restore its state.
-
-    Attributes:
-        network: The network in training.
-        done: Number of steps done.
-    """
-
-    def __init__(self, schedule: RoadSchedule, device: torch.device) -> None:
+    def __init__(self, schedule: Schedule, device: torch.device) -> None:
         """Start with random weights."""
         torch.manual_seed(schedule.seed)
-        self.schedule, self.device = schedule, device
-        self.network = RoadNetwork().to(device).to(memory_format=torch.channels_last)
-        self.done = 0
-        self._optimizer = torch.optim.AdamW(
-            self.network.parameters(), schedule.rate, weight_decay=schedule.decay, foreach=True
-        )
+        network = RoadNetwork().to(device).to(memory_format=torch.channels_last)
+        groups = [{"params": [*network.parameters()], "weight_decay": schedule.decay}]
+        super().__init__(network, groups, schedule, device)
 
     def steps(self, pixels: Bytes, road: Bytes) -> Iterator[tuple[int, float]]:
         """Train, and yield number and loss of each step.
@@ -95,83 +49,16 @@ class RoadTraining:
             rng = np.random.default_rng([self.schedule.seed, 0xD0, self.done])
             picked = rng.integers(0, len(pixels), self.schedule.batch)
             pairs = [varied(pixels[i], road[i], rng) for i in picked]
-            loss = self._learn(np.stack([p for p, _ in pairs]), np.stack([r for _, r in pairs]))
+            some, wanted = (np.stack(column) for column in zip(*pairs, strict=True))
+            loss = self.learn(partial(self._loss, some, wanted))
             yield self.done, loss
 
-    def _learn(self, pixels: Bytes, road: Bytes) -> float:
-        for group in self._optimizer.param_groups:
-            group["lr"] = self.schedule.rate_at(self.done)
+    def _loss(self, pixels: Bytes, road: Bytes) -> Tensor:
         wanted = torch.from_numpy(road).to(self.device).float() / 255.0
         logits = logits_of(self.network, torch.from_numpy(pixels).to(self.device))
         losses = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
         weight = edge_weight(wanted)
-        loss = (losses * weight).sum() / weight.sum()
-        self._optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), GRADIENT_LIMIT)
-        self._optimizer.step()
-        self.done += 1
-        return float(loss.detach())
-
-    def save(self, path: Path, made_of: Mapping[str, Any] = NOTHING) -> None:
-        """Store everything that ``resume`` needs.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
-        tensors = {
-            f"network.{k}": v.detach().cpu().contiguous().clone()
-            for k, v in self.network.state_dict().items()
-        }
-        for number, slot in self._optimizer.state_dict()["state"].items():
-            for name, value in slot.items():
-                tensors[f"optimizer.{number}.{name}"] = value.detach().cpu().contiguous().clone()
-        header = {
-            STATE_KEY: json.dumps(
-                {"done": self.done, "seed": self.schedule.seed, "made_of": made_of}
-            )
-        }
-        write_bytes(path, serialised(tensors, header))
-
-    def resume(self, path: Path, made_of: Mapping[str, Any] = NOTHING) -> None:
-        """Restore the state of ``save``.
-
-        Raises:
-            SchemaError: The file is not a valid state.
-            UsageError: The file is of another training or another seed.
-        """
-        from safetensors import SafetensorError
-        from safetensors.torch import load
-
-        try:
-            content = read_at_most(path, MAX_BYTES)
-            if content is None:
-                raise ValueError(f"over {MAX_BYTES} bytes")
-            tensors = load(content)
-            size = int.from_bytes(content[:8], "little")
-            state = json_tree(json_tree(content[8 : 8 + size])["__metadata__"][STATE_KEY])
-            done, seed = int(state["done"]), int(state["seed"])
-            refuse_another(path, "--resume", state.get("made_of"), made_of)
-            self._fill(tensors)
-        except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
-            why = one_line(error, 120)
-            raise SchemaError(f"{path}: cannot resume from it ({why}); start over") from None
-        if seed != self.schedule.seed:
-            raise UsageError(f"{path}: of seed {seed}, not {self.schedule.seed}; use --seed {seed}")
-        self.done = done
-
-    def _fill(self, tensors: dict[str, Tensor]) -> None:
-        own = {
-            k.removeprefix("network."): v for k, v in tensors.items() if k.startswith("network.")
-        }
-        self.network.load_state_dict(own)
-        kept = self._optimizer.state_dict()
-        state: dict[int, dict[str, Tensor]] = {}
-        for key, value in tensors.items():
-            if key.startswith("optimizer."):
-                _, number, name = key.split(".")
-                state.setdefault(int(number), {})[name] = value
-        self._optimizer.load_state_dict({**kept, "state": state})
+        return (losses * weight).sum() / weight.sum()
 
 
 def edge_weight(wanted: Tensor) -> Tensor:

@@ -217,7 +217,7 @@ def train_mask_rcnn(
         )
 
     from crosscue.detectors.training.job import run_job
-    from crosscue.eval.training.curve import draw_curve
+    from crosscue.detectors.training.summary import draw_curve
 
     facts = run_job(job, train, held_out, resume=resume, overwrite=overwrite, report=report)
     draw_curve(job.curve_path, path.with_suffix(".curve.png"))

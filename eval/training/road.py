@@ -162,7 +162,7 @@ def train_road(
         torch.set_num_threads(settings.threads)
     check_place(path)
     learn, held_out = _frames(settings)
-    schedule = RoadSchedule(settings.steps, settings.batch, seed=settings.seed)
+    schedule = RoadSchedule(settings.steps, batch=settings.batch, seed=settings.seed)
     device = chosen_device(settings.device, "train road")
     state = path.with_suffix(".state")
     with reproducible(device):
@@ -241,7 +241,7 @@ def _trained(
         loss = now
         emit(Progress("training", done, settings.steps, "steps"))
         if done % SAVED_EVERY == 0:
-            training.save(state, made)
+            training.save(state, made_of=made)
         if done == settings.stop_at:
             break
     return loss

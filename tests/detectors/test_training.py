@@ -18,7 +18,8 @@ from crosscue.detectors.base import Detections
 from crosscue.detectors.networks.mask_rcnn.checkpoint import load_checkpoint
 from crosscue.detectors.networks.mask_rcnn.network import build_network
 from crosscue.detectors.training.annotations import LabelledSet, mask_of, read_training_coco
-from crosscue.detectors.training.loop import Schedule, Training
+from crosscue.detectors.training.job import Training
+from crosscue.detectors.training.loop import Schedule
 from crosscue.detectors.training.measure import average_precisions, fitted
 from crosscue.detectors.training.operating_point import Verdicts
 from crosscue.detectors.training.samples import Sampler, SampleSettings
