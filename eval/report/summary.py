@@ -36,8 +36,11 @@ def scores_text(scores: PooledScores, why_no_pose: str = "") -> str:
         lines += [*_range(scores.range), ""]
     if scores.belief:
         lines += [*_belief(scores.belief), ""]
-    missing = scores.not_scored() | ({"pose": why_no_pose} if why_no_pose else {})
-    lines += [*_coverage(scores), *(_line("not scored", f"{k}: {v}") for k, v in missing.items())]
+    has_frames = any(one.frames for one in scores.drives)
+    missing = scores.not_scored() if has_frames else {}
+    missing |= {"pose": why_no_pose} if why_no_pose else {}
+    lines += _coverage(scores) if has_frames else [_line("drives", _without_pictures(scores))]
+    lines += [_line("not scored", f"{k}: {v}") for k, v in missing.items()]
     lines += _left_out(scores.cues)
     return "\n".join(part for line in lines for part in _wrapped(line))
 
@@ -90,6 +93,10 @@ def _coverage(scores: PooledScores) -> list[str]:
         why = "a clock was set back, and their log time comes twice"
         lines.append(_line("ambiguous", f"{twice} frames not scored: {why}"))
     return lines
+
+
+def _without_pictures(scores: PooledScores) -> str:
+    return f"{len(scores.drives)}, without pictures: no cue, belief or range to score"
 
 
 def _cues(cues: Mapping[str, CueScore]) -> list[str]:

@@ -8,11 +8,13 @@ import pytest
 
 from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, write_tum
+from crosscue.eval.drives.score import score_run
 from crosscue.eval.pipeline.replay import replay_drive
 from crosscue.eval.recording import save_rrd as save_recording
-from crosscue.eval.report.summary import pose_summary
+from crosscue.eval.report.summary import pose_summary, scores_text
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
+from crosscue.eval.scoring.runs import pooled_scores
 from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block
@@ -73,6 +75,14 @@ def test_perfect_run_has_no_error_and_full_accounting(tmp_path: Path) -> None:
     # The first row is at the end of the first interval, at 0.1 s.
     assert covered.before_estimate == 22
     assert covered.scored + covered.before_estimate + covered.after_estimate == covered.truth_poses
+
+
+def test_scores_of_a_drive_without_pictures_name_no_frames(tmp_path: Path) -> None:
+    run, truth, _ = _scored(tmp_path)
+
+    printed = scores_text(pooled_scores([score_run(run.path, truth, has_figures=False).scored.one]))
+
+    assert printed == "drives     1, without pictures: no cue, belief or range to score"
 
 
 def test_camera_truth_is_compared_at_camera(tmp_path: Path) -> None:
