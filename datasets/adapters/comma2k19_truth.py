@@ -8,14 +8,12 @@ from typing import Final
 import numpy as np
 
 from crosscue.datasets.geodesy import ecef_to_enu_matrix, ecef_to_geodetic
-from crosscue.datasets.truth.truth import Origin, Truth, save
-from crosscue.datasets.truth.tum import Trajectory, mounting_in_car, write_tum
+from crosscue.datasets.truth.truth import Origin
+from crosscue.datasets.truth.tum import Trajectory, mounting_in_car, write_track_truth
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogFormatError
 
 from .comma2k19 import read_column
-
-POSE_FILE: Final = "pose.tum"
 
 # Upper bound on times of recordings, in seconds since 1970 or since the start.
 LATEST_S: Final = 9e9
@@ -60,22 +58,16 @@ def write_comma_truth(path: Path, folder: Path) -> Path:
     track = Trajectory(t_ns, east_north_up, quat_wxyz)
     note = "comma2k19 global_pose: the camera in a local frame, x east, y north, z up"
     mounting, source = mounting_in_car(track)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_tum(folder / POSE_FILE, track, note)
-    return save(
-        Truth(
-            version=1,
-            log=path.name,
-            start_ns=int(t_ns[0]),
-            end_ns=int(t_ns[-1]) + 1,
-            pose=POSE_FILE,
-            pose_point="camera",
-            mounting=mounting,
-            mounting_source=source,
-            origin=Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude),
-            source="comma2k19: tightly coupled INS, GNSS and vision, smoothed offline",
-        ),
+    return write_track_truth(
         folder,
+        path.name,
+        track,
+        note,
+        pose_point="camera",
+        mounting=mounting,
+        mounting_source=source,
+        origin=Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude),
+        source="comma2k19: tightly coupled INS, GNSS and vision, smoothed offline",
     )
 
 

@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.datasets.geodesy import geodetic_to_enu
-from crosscue.datasets.truth.truth import Origin, Truth, save
-from crosscue.datasets.truth.tum import Trajectory, write_tum
+from crosscue.datasets.truth.truth import Origin
+from crosscue.datasets.truth.tum import Trajectory, write_track_truth
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block, Int64s, Table, Topic
 from crosscue.replay.errors import LogFormatError
@@ -42,8 +42,8 @@ from crosscue.replay.seal.touched import Touched, open_noted
 
 from .kitti_files import COLUMNS, IMU, INS_SPEED, LINE_BYTES, Packets, parse_oxts, read_kitti_labels
 from .kitti_odometry import BOX, SETUP, projection
+from .published import camera_of, note_whole
 
-POSE_FILE: Final = "pose.tum"
 # Default period of frames, if positions and speeds do not determine it.
 TRACKING_PERIOD_NS: Final = 100_000_000
 PERIOD_STEP_S: Final = 1e-4
@@ -197,16 +197,13 @@ def write_kitti_truth(path: Path, folder: Path) -> Path:
     xyz_m = geodetic_to_enu(
         packets["lat"], packets["lon"], packets["alt"], (latitude, longitude, altitude)
     )
-    folder.mkdir(parents=True, exist_ok=True)
     note = "KITTI OXTS: the GNSS/INS box in a local frame, x east, y north, z up"
-    write_tum(folder / POSE_FILE, Trajectory(packets.t_ns, xyz_m, packets.attitude_wxyz()), note)
     objects, lost = _objects(path, oxts, folder)
-    truth = Truth(
-        version=1,
-        log=path.resolve().name,
-        start_ns=int(packets.t_ns[0]),
-        end_ns=int(packets.t_ns[-1]) + 1,
-        pose=POSE_FILE,
+    return write_track_truth(
+        folder,
+        path.resolve().name,
+        Trajectory(packets.t_ns, xyz_m, packets.attitude_wxyz()),
+        note,
         pose_point="imu",
         mounting=BOX,
         mounting_source=SETUP,
@@ -218,7 +215,6 @@ def write_kitti_truth(path: Path, folder: Path) -> Path:
         ),
         objects=objects,
     )
-    return save(truth, folder)
 
 
 def _objects(path: Path, oxts: Oxts | None, folder: Path) -> tuple[str | None, int]:
@@ -238,8 +234,7 @@ def _open_raw(path: Path, limits: Limits) -> KittiDrive:
     for folder in sorted(path.glob("image_[0-9][0-9]")):
         files = _timed(folder, list_pictures, folder.name, unreadable, limits, touched)
         if files is not None:
-            topic = Topic(folder.name, "crosscue/Images", "columns", declared=files.declared)
-            cameras.append(PictureFiles(topic, files, touched))
+            cameras.append(camera_of(folder.name, files, touched))
     lost: list[Unreadable] = []
     packets = _timed(path / "oxts", _packet_files, "oxts", lost, limits, touched)
     unreadable += [(name, *loss[1:]) for loss in lost for name in TOPICS]
@@ -279,7 +274,7 @@ def _timed(
             unreadable.append((topic, "rows without times", len(paths), why))
         return None
     try:
-        touched.add(time_file, 0, time_file.stat().st_size)
+        note_whole(touched, time_file)
         times = read_time_file(time_file, limits)
         if paths:
             return pair_with_times(paths, times)
@@ -307,12 +302,11 @@ def _open_tracking(path: Path, limits: Limits) -> KittiDrive:
     for folder in sorted(path.glob(f"image_[0-9][0-9]/{name}")):
         paths = list_pictures(folder)
         if paths:
-            topic = Topic(folder.parent.name, "crosscue/Images", "columns")
             t_ns = np.array(
                 [_frame_ns(path.stem, oxts.period_ns) for path in paths], dtype=np.int64
             )
             files = TimedFiles(tuple(paths), t_ns, _no_times(), None, ())
-            cameras.append(PictureFiles(topic, files, touched))
+            cameras.append(camera_of(folder.parent.name, files, touched))
     why = "as published" if period_s is None else "with which speeds match distances"
     notice = (
         f"{name}: the tracking set has no times; they are computed from frame numbers, "

@@ -22,9 +22,9 @@ import numpy as np
 from crosscue.datasets.truth.coco import Objects
 from crosscue.replay.columns import Floats, Int64s, Table
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.image_header import size_in_header
-from crosscue.replay.limits import MIB
+
+from .published import lines_of
 
 COLUMNS: Final = (
     "lat", "lon", "alt", "roll", "pitch", "yaw",
@@ -122,7 +122,6 @@ def parse_oxts(line: str | bytes) -> tuple[float, ...] | str:
     return numbers
 
 
-MAX_FILE_BYTES: Final = 64 * MIB
 HEADER_BYTES: Final = 4096
 # COCO's names by class of the data set; a cyclist's box contains person and bicycle.
 LABELS: Final = {
@@ -159,13 +158,10 @@ def read_kitti_labels(file: Path, pictures: Path, period_ns: int) -> SequenceLab
     Raises:
         LogFormatError: The file cannot be read, or no picture is available for the size.
     """
-    content = read_at_most(file, MAX_FILE_BYTES)
-    if content is None:
-        raise LogFormatError(f"{file}: over {MAX_FILE_BYTES // MIB} MiB; not read")
     size_px = _size_px(pictures)
     by_frame: dict[int, list[tuple[str, int, list[float]]]] = {}
     lost = 0
-    for line in content.decode("utf-8", errors="replace").splitlines():
+    for line in lines_of(file):
         parts = line.split()
         try:
             frame, track, numbers = (

@@ -15,27 +15,24 @@ convention of REP-103: x ahead (their z), y left (their -x), z up (their -y).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from crosscue.datasets.truth.truth import Mounting, Truth, save
-from crosscue.datasets.truth.tum import Trajectory, mounting_in_car, write_tum
-from crosscue.replay.columns import Floats, Int64s, Table, Topic
+from crosscue.datasets.truth.truth import Mounting
+from crosscue.datasets.truth.tum import Trajectory, mounting_in_car, write_track_truth
+from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.limits import DEFAULT_LIMITS, MIB, Limits
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.held_rows import CameraDrive, HeldRows, Loss
-from crosscue.replay.readers.images.files import PictureFiles, list_pictures
+from crosscue.replay.readers.images.files import list_pictures
 from crosscue.replay.readers.time_file import read_time_file
-from crosscue.replay.readers.timed_files import TimedFiles
 from crosscue.replay.seal.touched import Touched
 
-POSE_FILE: Final = "pose.tum"
-MAX_FILE_BYTES: Final = 64 * MIB
+from .published import camera_of, lines_of, note_whole, numbered_files, odometry_of
+
 SETUP: Final = (
     "Geiger, Lenz, Stiller, Urtasun, Vision meets Robotics: The KITTI Dataset (IJRR 2013), figure "
     "of the sensors' places on the car"
@@ -63,18 +60,10 @@ class CameraTrajectory(NamedTuple):
     losses: tuple[Loss, ...]
     declared: int
 
-    def odometry(self) -> Table:
+    def odometry(self) -> HeldRows:
         """Return forward speed and yaw rate, from differences between neighbours."""
-        seconds = (self.t_ns - self.t_ns[0]) * 1e-9
         ahead = self.turn.apply((1.0, 0.0, 0.0))
-        velocity = np.gradient(self.xyz_m, seconds, axis=0)
-        heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
-        return Table(
-            {
-                "speed_x_mps": np.asarray((velocity * ahead).sum(axis=1), np.float64),
-                "yaw_rate_radps": np.gradient(heading, seconds),
-            }
-        )
+        return odometry_of(self.t_ns, self.xyz_m, ahead, self.declared, self.losses)
 
 
 class KittiOdometryDrive(CameraDrive):
@@ -104,7 +93,7 @@ def projection(file: Path, camera: str) -> tuple[float, float, float] | None:
     """
     if not file.is_file():
         return None
-    for line in _lines(file):
+    for line in lines_of(file):
         name, _, rest = line.partition(" ")
         if name.rstrip(":") in (f"P{camera}", f"P_rect_0{camera}"):
             numbers = _numbers(rest)
@@ -125,24 +114,20 @@ def open_kitti_odometry(path: Path, limits: Limits) -> KittiOdometryDrive:
     if not times_file.is_file():
         raise LogFormatError(f"{times_file}: missing; expected a KITTI odometry sequence")
     times = read_time_file(times_file, limits)
-    touched.add(times_file, 0, times_file.stat().st_size)
+    note_whole(touched, times_file)
     cameras = []
     for folder in sorted(path.glob("image_[0-9]")):
         paths = list_pictures(folder)
         if paths:
-            files = _timed(paths, times.t_ns)
-            topic = Topic(folder.name, "crosscue/Images", "columns", declared=files.declared)
-            cameras.append(PictureFiles(topic, files, touched))
+            cameras.append(camera_of(folder.name, numbered_files(paths, times.t_ns), touched))
     if not cameras:
         raise LogFormatError(f"{path}: no image_N with pictures; expected a KITTI sequence")
     unreadable: list[tuple[str, str, int | None, str]] = []
     odometry = None
     if (file := pose_file(path)) is not None:
-        touched.add(file, 0, file.stat().st_size)
+        note_whole(touched, file)
         try:
-            poses = read_kitti_poses(path, limits)
-            topic = Topic("odometry", "nav_msgs/msg/Odometry", "columns", declared=poses.declared)
-            odometry = HeldRows(topic, poses.t_ns, poses.odometry(), poses.losses)
+            odometry = read_kitti_poses(path, limits).odometry()
         except LogFormatError as error:
             unreadable.append(("odometry", "file cannot be read", None, str(error)))
     notices = ["velodyne: laser scans are not read"] if (path / "velodyne").is_dir() else []
@@ -176,7 +161,7 @@ def read_kitti_poses(path: Path, limits: Limits = DEFAULT_LIMITS) -> CameraTraje
             "publishes for sequences 00 to 10"
         )
     times = read_time_file(path / "times.txt", limits).t_ns
-    found = [_numbers(line) for line in _lines(file)]
+    found = [_numbers(line) for line in lines_of(file)]
     n = min(len(found), len(times))
     good = np.array([one is not None for one in found[:n]], np.bool_)
     bad = [f"line {i + 1}" for i, one in enumerate(found) if one is None]
@@ -201,17 +186,14 @@ def write_kitti_odometry_truth(path: Path, folder: Path) -> Path:
     """
     poses = read_kitti_poses(path)
     note = "KITTI odometry: the left grey camera; x ahead, y left, z up of the first picture"
-    folder.mkdir(parents=True, exist_ok=True)
     wxyz = poses.turn.as_quat()[:, [3, 0, 1, 2]]
     track = Trajectory(poses.t_ns, poses.xyz_m, wxyz)
-    write_tum(folder / POSE_FILE, track, note)
     mounting, mounting_source = mounting_in_car(track, SETUP, x_m=1.03, y_m=0.0, z_m=1.65)
-    truth = Truth(
-        version=1,
-        log=path.resolve().name,
-        start_ns=int(poses.t_ns[0]),
-        end_ns=int(poses.t_ns[-1]) + 1,
-        pose=POSE_FILE,
+    return write_track_truth(
+        folder,
+        path.resolve().name,
+        track,
+        note,
         pose_point="camera",
         mounting=mounting,
         mounting_source=mounting_source,
@@ -220,28 +202,6 @@ def write_kitti_odometry_truth(path: Path, folder: Path) -> Path:
             "other cameras sit beside it by -P[0, 3] / P[0, 0] of calib.txt, in metres to its right"
         ),
     )
-    return save(truth, folder)
-
-
-def _timed(paths: Sequence[Path], t_ns: Int64s) -> TimedFiles:
-    """Assign the time with index NNNNNN to picture ``NNNNNN``."""
-    numbered = [p.stem.isascii() and p.stem.isdecimal() and len(p.stem) < 10 for p in paths]
-    places = np.array(
-        [int(p.stem) if is_so else -1 for p, is_so in zip(paths, numbered, strict=True)], np.int64
-    )
-    is_timed = (places >= 0) & (places < len(t_ns))
-    found = np.full(len(paths), -1, np.int64)
-    found[is_timed] = t_ns[places[is_timed]]
-    is_missing = np.ones(len(t_ns), np.bool_)
-    is_missing[places[is_timed]] = False
-    return TimedFiles(tuple(paths), found, t_ns[is_missing], len(t_ns), ())
-
-
-def _lines(file: Path) -> list[str]:
-    content = read_at_most(file, MAX_FILE_BYTES)
-    if content is None:
-        raise LogFormatError(f"{file}: over {MAX_FILE_BYTES // MIB} MiB; not read")
-    return content.decode("utf-8", errors="replace").splitlines()
 
 
 def _numbers(text: str) -> Floats | None:

@@ -34,6 +34,7 @@ from crosscue.replay.readers.timed_files import TimedFiles
 from crosscue.replay.seal.touched import Touched
 
 from .nuscenes_tables import Row, RowsOf, checked, whole_table
+from .published import camera_of, note_whole, odometry_of
 
 # Wheel radius of the Renault Zoe, from nuscenes-devkit, can_bus_tutorial.ipynb ("Known Zoe wheel
 # radius in meters"). An unloaded 195/55 R16 tyre has 0.3105 m, 2 % more than this loaded tyre. An
@@ -243,28 +244,23 @@ def open_scene(path: Path, limits: Limits) -> NuscenesDrive:
     """
     tables = read_scene_tables(find_scene(path))
     scene, touched = tables.scene, Touched()
-    for file in tables.files:
-        touched.add(file, 0, file.stat().st_size)
+    note_whole(touched, *tables.files)
     cameras = [
-        PictureFiles(
-            Topic(channel, "crosscue/Images", "columns", declared=len(rows)),
-            _timed(scene.root, rows),
-            touched,
-        )
+        camera_of(channel, _timed(scene.root, rows), touched)
         for channel, rows in tables.pictures.items()
     ]
     unreadable = [*tables.losses]
     held = []
-    for message, (topic_name, type_name, to_table) in MESSAGES.items():
-        file = scene.root / "can_bus" / f"{scene.name}_{message}.json"
+    for name, message in MESSAGES.items():
+        file = scene.root / "can_bus" / f"{scene.name}_{name}.json"
         if not file.is_file():
             continue
-        touched.add(file, 0, file.stat().st_size)
-        rows = _held(file, topic_name, type_name, to_table)
+        note_whole(touched, file)
+        rows = _held(file, message)
         if isinstance(rows, HeldRows):
             held.append(rows)
         else:
-            unreadable.append((topic_name, *rows))
+            unreadable.append((message.topic, *rows))
     if not any(rows.topic.name == "can/wheel_speed" for rows in held) and cameras:
         held.append(_odometry(tables))
     if not cameras and not held:
@@ -345,17 +341,8 @@ def _odometry(tables: SceneTables) -> HeldRows:
     poses = ego_poses(tables)
     w, x, y, z = poses.wxyz.T
     heading = np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
-    seconds = (poses.t_ns - poses.t_ns[0]) * 1e-9
-    velocity = np.gradient(poses.xyz_m[:, :2], seconds, axis=0)
     ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    table = Table(
-        {
-            "speed_x_mps": np.asarray((velocity * ahead).sum(axis=1), np.float64),
-            "yaw_rate_radps": np.gradient(heading, seconds),
-        }
-    )
-    topic = Topic("odometry", "nav_msgs/msg/Odometry", "columns", declared=poses.declared)
-    return HeldRows(topic, poses.t_ns, table, poses.losses)
+    return odometry_of(poses.t_ns, poses.xyz_m[:, :2], ahead, poses.declared, poses.losses, heading)
 
 
 def numbers(value: Any, count: int) -> list[float] | None:
@@ -388,103 +375,78 @@ def _vectors(**sizes: int) -> _Columns:
 
 
 class _Message(NamedTuple):
-    """Conversion of the rows of a CAN message to columns."""
+    """Topic, type and columns of a CAN message."""
 
+    topic: str
+    type_name: str
     names: tuple[str, ...]
-    of: _Columns
+    columns_of: _Columns
 
 
-_MONITOR: Final = (
-    "available_distance",
-    "battery_level",
-    "brake",
-    "brake_switch",
-    "gear_position",
-    "left_signal",
-    "rear_left_rpm",
-    "rear_right_rpm",
-    "right_signal",
-    "steering",
-    "steering_speed",
-    "throttle",
-    "vehicle_speed",
-    "yaw_rate",
-)
-_MONITOR_NAMES: Final = (
-    "available_distance_km",
-    "battery_level",
-    "brake_bar",
-    "brake_switch",
-    "gear_position",
-    "left_signal",
-    "rear_left_rpm",
-    "rear_right_rpm",
-    "right_signal",
-    "steering_deg",
-    "steering_speed_degps",
-    "throttle",
-    "vehicle_speed_kmph",
-    "yaw_rate_degps",
-)
-_XYZ: Final = ("x", "y", "z")
-MESSAGES: Final[dict[str, tuple[str, str, _Message]]] = {
-    "zoe_veh_info": (
+def _axes(pattern: str) -> tuple[str, ...]:
+    return tuple(pattern.format(axis) for axis in "xyz")
+
+
+_QUATERNION: Final = ("q0", "q1", "q2", "q3")
+# Column by field of the message.
+_MONITOR: Final = {
+    "available_distance": "available_distance_km",
+    "battery_level": "battery_level",
+    "brake": "brake_bar",
+    "brake_switch": "brake_switch",
+    "gear_position": "gear_position",
+    "left_signal": "left_signal",
+    "rear_left_rpm": "rear_left_rpm",
+    "rear_right_rpm": "rear_right_rpm",
+    "right_signal": "right_signal",
+    "steering": "steering_deg",
+    "steering_speed": "steering_speed_degps",
+    "throttle": "throttle",
+    "vehicle_speed": "vehicle_speed_kmph",
+    "yaw_rate": "yaw_rate_degps",
+}
+_SENSORS: Final = {
+    "brake_sensor": "brake_sensor",
+    "steering_sensor": "steering_sensor_deg",
+    "throttle_sensor": "throttle_sensor",
+}
+MESSAGES: Final[dict[str, _Message]] = {
+    "zoe_veh_info": _Message(
         "can/wheel_speed",
         "crosscue/WheelSpeeds",
-        _Message(
-            ("front_left_mps", "front_right_mps", "rear_left_mps", "rear_right_mps"),
-            _plain(*(f"{w}_wheel_speed" for w in ("FL", "FR", "RL", "RR")), scale=RPM_TO_MPS),
-        ),
+        ("front_left_mps", "front_right_mps", "rear_left_mps", "rear_right_mps"),
+        _plain(*(f"{w}_wheel_speed" for w in ("FL", "FR", "RL", "RR")), scale=RPM_TO_MPS),
     ),
-    "steeranglefeedback": (
-        "can/steering",
-        "crosscue/Table",
-        _Message(("steering_rad",), _plain("value", scale=-1.0)),
+    "steeranglefeedback": _Message(
+        "can/steering", "crosscue/Table", ("steering_rad",), _plain("value", scale=-1.0)
     ),
-    "ms_imu": (
+    "ms_imu": _Message(
         "can/imu",
         "sensor_msgs/msg/Imu",
-        _Message(
-            (
-                *(f"accel_{a}_mps2" for a in _XYZ),
-                *(f"gyro_{a}_radps" for a in _XYZ),
-                *(f"q{i}" for i in range(4)),
-            ),
-            _vectors(linear_accel=3, rotation_rate=3, q=4),
-        ),
+        (*_axes("accel_{}_mps2"), *_axes("gyro_{}_radps"), *_QUATERNION),
+        _vectors(linear_accel=3, rotation_rate=3, q=4),
     ),
-    "pose": (
+    "pose": _Message(
         "can/pose",
         "crosscue/Table",
-        _Message(
-            (
-                *(f"{a}_m" for a in _XYZ),
-                *(f"q{i}" for i in range(4)),
-                *(f"velocity_{a}_mps" for a in _XYZ),
-                *(f"rotation_rate_{a}_radps" for a in _XYZ),
-            ),
-            _vectors(pos=3, orientation=4, vel=3, rotation_rate=3),
+        (
+            *_axes("{}_m"),
+            *_QUATERNION,
+            *_axes("velocity_{}_mps"),
+            *_axes("rotation_rate_{}_radps"),
         ),
+        _vectors(pos=3, orientation=4, vel=3, rotation_rate=3),
     ),
-    "vehicle_monitor": (
-        "can/vehicle_monitor",
-        "crosscue/Table",
-        _Message(_MONITOR_NAMES, _plain(*_MONITOR)),
+    "vehicle_monitor": _Message(
+        "can/vehicle_monitor", "crosscue/Table", tuple(_MONITOR.values()), _plain(*_MONITOR)
     ),
-    "zoesensors": (
-        "can/zoesensors",
-        "crosscue/Table",
-        _Message(
-            ("brake_sensor", "steering_sensor_deg", "throttle_sensor"),
-            _plain("brake_sensor", "steering_sensor", "throttle_sensor"),
-        ),
+    "zoesensors": _Message(
+        "can/zoesensors", "crosscue/Table", tuple(_SENSORS.values()), _plain(*_SENSORS)
     ),
 }
 
 
-def _held(
-    file: Path, topic_name: str, type_name: str, message: _Message
-) -> HeldRows | tuple[str, int | None, str]:
+def _held(file: Path, message: _Message) -> HeldRows | tuple[str, int | None, str]:
     """Return a message's rows in order of time, or the reason why they cannot be read."""
     rows = RowsOf(file)
     times: list[int] = []
@@ -492,10 +454,10 @@ def _held(
     bad, first = 0, ""
     for row in rows:
         try:
-            found = message.of(row)
+            found = message.columns_of(row)
             t_ns = int(row["utime"]) * 1000
             if not all(map(math.isfinite, found)):
-                raise ValueError(topic_name)
+                raise ValueError(message.topic)
         except (KeyError, TypeError, ValueError, OverflowError):
             bad += 1
             first = first or f"row {len(times) + bad}"
@@ -512,7 +474,7 @@ def _held(
     order = np.argsort(np.array(times, np.int64), kind="stable")
     table = np.array(values, np.float64)[order]
     return HeldRows(
-        Topic(topic_name, type_name, "columns", declared=len(times) + lost),
+        Topic(message.topic, message.type_name, "columns", declared=len(times) + lost),
         np.array(times, np.int64)[order],
         Table({name: table[:, i] for i, name in enumerate(message.names)}),
         tuple(losses),

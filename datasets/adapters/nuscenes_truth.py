@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from crosscue.datasets.truth.coco import Objects
-from crosscue.datasets.truth.truth import Mounting, Truth, save
-from crosscue.datasets.truth.tum import Trajectory, write_tum
+from crosscue.datasets.truth.truth import Mounting
+from crosscue.datasets.truth.tum import Trajectory, write_track_truth
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogFormatError
 
@@ -32,7 +32,6 @@ from .nuscenes import (
 )
 from .nuscenes_tables import Row, RowsOf, checked, whole_table
 
-POSE_FILE: Final = "pose.tum"
 # COCO's names by prefix of a category; other categories keep their names.
 LABELS: Final = (
     ("vehicle.car", "car"),
@@ -69,16 +68,13 @@ def write_nuscenes_truth(path: Path, folder: Path) -> Path:
     tables = read_scene_tables(find_scene(path))
     poses = ego_poses(tables)
     folder.mkdir(parents=True, exist_ok=True)
-    note = "nuScenes: the ego frame, the middle of the rear axle, in its map's axes"
-    write_tum(folder / POSE_FILE, Trajectory(poses.t_ns, poses.xyz_m, poses.wxyz), note)
     objects, lost = _objects(tables)
     what = "nuScenes (Motional; CC BY-NC-SA 4.0)"
-    truth = Truth(
-        version=1,
-        log=tables.scene.name,
-        start_ns=int(poses.t_ns[0]),
-        end_ns=int(poses.t_ns[-1]) + 1,
-        pose=POSE_FILE,
+    return write_track_truth(
+        folder,
+        tables.scene.name,
+        Trajectory(poses.t_ns, poses.xyz_m, poses.wxyz),
+        "nuScenes: the ego frame, the middle of the rear axle, in its map's axes",
         pose_point="rear_axle",
         mounting=Mounting(),
         mounting_source="nuScenes: the ego frame's origin is the middle of the rear axle",
@@ -88,7 +84,6 @@ def write_nuscenes_truth(path: Path, folder: Path) -> Path:
         ),
         objects=objects.save(folder, f"{what}: cuboids as seen by {FRONT}"),
     )
-    return save(truth, folder)
 
 
 def _objects(tables: SceneTables) -> tuple[Objects, int]:

@@ -12,28 +12,23 @@ camera's poses, which are as accurate as the poses and not wheel speeds); ``gnss
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from crosscue.datasets.truth.truth import Truth, save
-from crosscue.datasets.truth.tum import Trajectory, mounting_in_car, write_tum
+from crosscue.datasets.truth.tum import Trajectory, mounting_in_car, write_track_truth
 from crosscue.replay.columns import Floats, Int64s, Table, Topic
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.limits import MIB, Limits
+from crosscue.replay.limits import Limits
 from crosscue.replay.readers.held_rows import CameraDrive, HeldRows
-from crosscue.replay.readers.images.files import PictureFiles, list_pictures
-from crosscue.replay.readers.timed_files import TimedFiles
+from crosscue.replay.readers.images.files import list_pictures
 from crosscue.replay.seal.touched import Touched
 
-POSE_FILE: Final = "pose.tum"
-MAX_FILE_BYTES: Final = 64 * MIB
+from .published import camera_of, json_of, note_whole, numbered_files, odometry_of
+
 FRONT: Final = "front_camera"
 _GNSS: Final = {
     "lat": "latitude_deg",
@@ -62,25 +57,9 @@ class PandasetPoses:
     left: Floats
     declared: int
 
-    def speed_mps(self) -> Floats:
-        """Return the forward speed at each pose, shape (N,), from central differences.
-
-        A rigid vehicle has the same forward speed everywhere along its axis, so this is the speed
-        of the rear axle. Differences are one-sided at both ends.
-        """
-        seconds = (self.t_ns - self.t_ns[0]) * 1e-9
-        velocity = np.gradient(self.xyz_m, seconds, axis=0)
-        return np.asarray((velocity * self.forward).sum(axis=1), np.float64)
-
-    def heading_rad(self) -> Floats:
-        """Return the heading from x, counter-clockwise, continuous, shape (N,)."""
-        return np.unwrap(np.arctan2(self.forward[:, 1], self.forward[:, 0]))
-
-    def odometry(self) -> Table:
-        """Return speed and yaw rate."""
-        seconds = (self.t_ns - self.t_ns[0]) * 1e-9
-        yaw_rate = np.gradient(self.heading_rad(), seconds)
-        return Table({"speed_x_mps": self.speed_mps(), "yaw_rate_radps": yaw_rate})
+    def odometry(self) -> HeldRows:
+        """Return forward speed and yaw rate of the vehicle."""
+        return odometry_of(self.t_ns, self.xyz_m, self.forward, self.declared)
 
 
 class PandasetDrive(CameraDrive):
@@ -97,7 +76,7 @@ class PandasetDrive(CameraDrive):
         file = self.path / "camera" / camera / "intrinsics.json"
         if not file.is_file():
             return None
-        found = _json(file)
+        found = json_of(file)
         try:
             focal, x, y = (float(found[name]) for name in ("fx", "cx", "cy"))
         except (TypeError, KeyError, ValueError):
@@ -123,19 +102,18 @@ def open_pandaset(path: Path, limits: Limits) -> PandasetDrive:
     """
     unreadable: list[tuple[str, str, int | None, str]] = []
     cameras, touched = [], Touched()
-    for file in (one for pattern in READ_ON_OPENING for one in path.glob(pattern)):
-        touched.add(file, 0, file.stat().st_size)
+    for pattern in READ_ON_OPENING:
+        note_whole(touched, *path.glob(pattern))
     for folder in sorted((path / "camera").iterdir()):
         paths = list_pictures(folder) if folder.is_dir() else []
         if not paths:
             continue
         try:
-            files = _timed(paths, _times_ns(folder / "timestamps.json"))
+            files = numbered_files(paths, _times_ns(folder / "timestamps.json"))
         except LogFormatError as error:
             unreadable.append((folder.name, "times cannot be read", len(paths), str(error)))
             continue
-        topic = Topic(folder.name, "crosscue/Images", "columns", declared=files.declared)
-        cameras.append(PictureFiles(topic, files, touched))
+        cameras.append(camera_of(folder.name, files, touched))
     rows = []
     for name, read in (("odometry", _odometry), ("gnss", _gnss)):
         try:
@@ -166,7 +144,7 @@ def read_pandaset_poses(path: Path, camera: str = FRONT) -> PandasetPoses:
     """
     folder = path / "camera" / camera
     t_ns = _times_ns(folder / "timestamps.json")
-    poses = _json(folder / "poses.json")
+    poses = json_of(folder / "poses.json")
     try:
         xyz = np.array([[p["position"][a] for a in "xyz"] for p in poses], np.float64)
         wxyz = np.array([[p["heading"][a] for a in "wxyz"] for p in poses], np.float64)
@@ -195,37 +173,31 @@ def write_pandaset_truth(path: Path, folder: Path) -> Path:
     turn = Rotation.from_matrix(np.stack([poses.forward, poses.left, up], axis=2))
     wxyz = turn.as_quat()[:, [3, 0, 1, 2]]
     note = "PandaSet: the front camera in the sequence's local frame, z up"
-    folder.mkdir(parents=True, exist_ok=True)
     track = Trajectory(poses.t_ns, poses.xyz_m, wxyz)
-    write_tum(folder / POSE_FILE, track, note)
     mounting, mounting_source = mounting_in_car(track)
-    truth = Truth(
-        version=1,
-        log=path.resolve().name,
-        start_ns=int(poses.t_ns[0]),
-        end_ns=int(poses.t_ns[-1]) + 1,
-        pose=POSE_FILE,
+    return write_track_truth(
+        folder,
+        path.resolve().name,
+        track,
+        note,
         pose_point="camera",
         mounting=mounting,
         mounting_source=mounting_source,
         source="PandaSet (Scale AI, Hesai; CC BY 4.0): published poses of the front camera",
     )
-    return save(truth, folder)
 
 
 def _odometry(path: Path) -> HeldRows | None:
     if not (path / "camera" / FRONT / "poses.json").is_file():
         return None
-    poses = read_pandaset_poses(path)
-    topic = Topic("odometry", "nav_msgs/msg/Odometry", "columns", declared=poses.declared)
-    return HeldRows(topic, poses.t_ns, poses.odometry())
+    return read_pandaset_poses(path).odometry()
 
 
 def _gnss(path: Path) -> HeldRows | None:
     file = path / "meta" / "gps.json"
     if not file.is_file():
         return None
-    t_ns, rows = _times_ns(path / "meta" / "timestamps.json"), _json(file)
+    t_ns, rows = _times_ns(path / "meta" / "timestamps.json"), json_of(file)
     try:
         columns = {
             name: np.array([float(row[key]) for row in rows], np.float64)[: len(t_ns)]
@@ -240,19 +212,8 @@ def _gnss(path: Path) -> HeldRows | None:
     return HeldRows(topic, t_ns[:n], Table(columns))
 
 
-def _timed(paths: Sequence[Path], t_ns: Int64s) -> TimedFiles:
-    """Assign the time with index NN to picture ``NN``."""
-    places = np.array([int(p.stem) if p.stem.isdecimal() else -1 for p in paths], np.int64)
-    is_timed = (places >= 0) & (places < len(t_ns))
-    found = np.full(len(paths), -1, np.int64)
-    found[is_timed] = t_ns[places[is_timed]]
-    is_missing = np.ones(len(t_ns), np.bool_)
-    is_missing[places[is_timed]] = False
-    return TimedFiles(tuple(paths), found, t_ns[is_missing], len(t_ns), ())
-
-
 def _times_ns(path: Path) -> Int64s:
-    found = _json(path)
+    found = json_of(path)
     try:
         seconds = np.array([float(value) for value in found], np.float64)
     except (TypeError, ValueError):
@@ -261,15 +222,3 @@ def _times_ns(path: Path) -> Int64s:
         raise LogFormatError(f"{path}: a time is not a number of seconds since 1970")
     # Times are published in microseconds; further digits are rounding errors of floats.
     return np.rint(seconds * 1e6).astype(np.int64) * 1000
-
-
-def _json(path: Path) -> Any:
-    try:
-        content = read_at_most(path, MAX_FILE_BYTES)
-        if content is None:
-            raise LogFormatError(f"{path}: over {MAX_FILE_BYTES // MIB} MiB; not read")
-        return json_tree(content)
-    except OSError as error:
-        raise LogFormatError(f"{path}: {error.strerror}; restore the file") from None
-    except ValueError as error:
-        raise LogFormatError(f"{path}: not JSON: {error}") from None

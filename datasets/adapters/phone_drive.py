@@ -20,11 +20,12 @@ import numpy as np
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block, Floats, Int64s, Table, Topic
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import MIB, Limits
 from crosscue.replay.readers.held_rows import CameraDrive, HeldRows, Loss
 from crosscue.replay.seal.touched import Touched
+
+from .published import lines_of, note_whole
 
 MAX_FILE_BYTES: Final = 256 * MIB
 MILE_H_MPS: Final = 0.44704
@@ -153,7 +154,7 @@ def open_phone_drive(path: Path, limits: Limits) -> PhoneDrive:
         wanted = {name for one in streams.values() for name in one.fields}
         wanted |= {*FIX.fields} if kind == "phone" else set()
         lines = _read(files[0], wanted)
-        touched.add(files[0], 0, files[0].stat().st_size)
+        note_whole(touched, files[0])
         rows += [_held(name, one, lines) for name, one in streams.items()]
         if kind == "phone":
             rows.append(_fixes(lines))
@@ -161,11 +162,7 @@ def open_phone_drive(path: Path, limits: Limits) -> PhoneDrive:
 
 
 def _read(file: Path, wanted: set[str]) -> _Lines:
-    content = read_at_most(file, MAX_FILE_BYTES)
-    if content is None:
-        raise LogFormatError(f"{file}: over {MAX_FILE_BYTES // MIB} MiB; not read")
-    lines = content.decode("utf-8", errors="replace").splitlines()
-    reader = csv.reader(lines)
+    reader = csv.reader(lines_of(file, MAX_FILE_BYTES))
     header = next(reader, [])
     if missing := sorted(wanted - {*header}):
         raise LogFormatError(f"{file}: no column {missing[0]!r}; expected the published columns")

@@ -26,9 +26,9 @@ from crosscue.datasets.simulated.drive import (
     sense,
     with_simulated_noise,
 )
-from crosscue.datasets.simulated.log_files import sensor_blocks
-from crosscue.datasets.truth.truth import Approach, Features, Mounting, Truth, save
-from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.datasets.simulated.log_files import SOURCE, sensor_blocks, true_track
+from crosscue.datasets.truth.truth import Approach, Features, Mounting
+from crosscue.datasets.truth.tum import write_track_truth
 from crosscue.replay.columns import Block, ImageCoding, Images, Int64s, Messages, Topic
 from crosscue.replay.encode.outgoing import standard_type
 from crosscue.replay.encode.template import filled, template_of
@@ -53,7 +53,6 @@ CAR_BUS: Final = "/can/car"
 MOBILEYE_BUS: Final = "/can/mobileye"
 IMAGES: Final = "/camera/image/compressed"
 CALIBRATION: Final = "/camera/camera_info"
-SOURCE: Final = "simulated by crosscue, exact"
 # Start of drives with sparse pictures, as the distance before the intersection.
 FROM_M: Final = 62.0
 SPACING_M: Final = 5.0
@@ -312,10 +311,6 @@ class _Record:
     def write_truth(self, folder: Path) -> Path:
         """Write truth, objects, trajectory and ranges, and return the path of the truth file."""
         motion, layout = self._motion, self.layout
-        tenth = slice(None, None, 10)
-        turned = np.angle(np.exp(1j * motion.heading_rad[tenth]))
-        track = planar(motion.t_ns[tenth], motion.x_m[tenth], motion.y_m[tenth], turned)
-        write_tum(folder / "pose.tum", track, SOURCE)
         self.objects.save(folder / "objects.json", SOURCE)
         if layout.is_intersection:
             lines = ["t_ns,approach,start_m,end_m", *self._ranges, ""]
@@ -335,24 +330,21 @@ class _Record:
             conditions=self.conditions.tags(layout),
             length_m=layout.end_m,
         )
-        return save(
-            Truth(
-                version=1,
-                log="drive.mcap",
-                log_sha256=sha256_of(folder / "drive.mcap"),
-                start_ns=start_ns,
-                end_ns=int(motion.t_ns[-1]) + step,
-                place=layout.name,
-                pose="pose.tum",
-                mounting=Mounting(),
-                mounting_source=SOURCE,
-                source=SOURCE,
-                approaches=(approach,) if layout.is_intersection else (),
-                cues=self._cues.finished(),
-                objects="objects.json",
-                ranges="ranges.csv" if layout.is_intersection else None,
-            ),
+        return write_track_truth(
             folder,
+            "drive.mcap",
+            true_track(motion),
+            SOURCE,
+            log_sha256=sha256_of(folder / "drive.mcap"),
+            end_ns=int(motion.t_ns[-1]) + step,
+            place=layout.name,
+            mounting=Mounting(),
+            mounting_source=SOURCE,
+            source=SOURCE,
+            approaches=(approach,) if layout.is_intersection else (),
+            cues=self._cues.finished(),
+            objects="objects.json",
+            ranges="ranges.csv" if layout.is_intersection else None,
         )
 
 

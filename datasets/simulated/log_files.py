@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.datasets.truth.truth import Mounting, Truth, save
-from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.datasets.truth.truth import Mounting
+from crosscue.datasets.truth.tum import Trajectory, planar, write_track_truth
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
 from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table, Topic
@@ -135,27 +135,23 @@ def write_drive(folder: Path, settings: DriveSettings, *, overwrite: bool = Fals
     return DriveFiles(
         log,
         folder / "vehicle.toml",
-        _write_truth(folder, motion),
+        write_track_truth(
+            folder,
+            "drive.mcap",
+            true_track(motion),
+            SOURCE,
+            end_ns=int(motion.t_ns[-1]) + 1,
+            mounting=Mounting(),
+            mounting_source=SOURCE,
+            source=SOURCE,
+        ),
         float(motion.t_ns[-1] - motion.t_ns[0]) * 1e-9,
         float(np.hypot(np.diff(motion.x_m), np.diff(motion.y_m)).sum()),
     )
 
 
-def _write_truth(folder: Path, motion: TrueMotion) -> Path:
+def true_track(motion: TrueMotion) -> Trajectory:
+    """Return the true trajectory at 10 Hz."""
     tenth = slice(None, None, 10)
     turned = np.angle(np.exp(1j * motion.heading_rad[tenth]))
-    track = planar(motion.t_ns[tenth], motion.x_m[tenth], motion.y_m[tenth], turned)
-    write_tum(folder / "pose.tum", track, SOURCE)
-    return save(
-        Truth(
-            version=1,
-            log="drive.mcap",
-            start_ns=int(motion.t_ns[0]),
-            end_ns=int(motion.t_ns[-1]) + 1,
-            pose="pose.tum",
-            mounting=Mounting(),
-            mounting_source=SOURCE,
-            source=SOURCE,
-        ),
-        folder,
-    )
+    return planar(motion.t_ns[tenth], motion.x_m[tenth], motion.y_m[tenth], turned)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation
 from itertools import chain
 from pathlib import Path
-from typing import Final, NamedTuple, TextIO
+from typing import Any, Final, NamedTuple, TextIO
 
 import numpy as np
 
@@ -20,8 +20,9 @@ from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
-from .truth import Mounting
+from .truth import Mounting, Truth, save
 
+POSE_FILE: Final = "pose.tum"
 _COLUMNS: Final = 8
 _LINE_CHARACTERS: Final = 4096
 _NORM_OFF: Final = 1e-2
@@ -123,6 +124,31 @@ def write_tum(path: Path, trajectory: Trajectory, comment: str = "") -> None:
         for t_ns, row in zip(trajectory.t_ns.tolist(), numbers.tolist(), strict=True)
     )
     write_text(path, "\n".join(chain(heads, poses)) + "\n")
+
+
+def write_track_truth(folder: Path, log: str, track: Trajectory, comment: str, **more: Any) -> Path:
+    """Write a trajectory as ``pose.tum`` and the truth file that names it, and return its path.
+
+    Args:
+        folder: Folder for both files.
+        log: Name of the log.
+        track: The trajectory.
+        comment: Comment of the trajectory.
+        more: Further fields of ``Truth``; the times are by default those of the trajectory.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_tum(folder / POSE_FILE, track, comment)
+    fields: dict[str, Any] = {
+        "version": 1,
+        "log": log,
+        "start_ns": int(track.t_ns[0]),
+        "end_ns": int(track.t_ns[-1]) + 1,
+        "pose": POSE_FILE,
+    }
+    return save(Truth(**fields | more), folder)
 
 
 def seconds_text(t_ns: int) -> str:

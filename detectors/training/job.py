@@ -313,7 +313,7 @@ def _learned(
         training.save(
             job.state_path,
             {"points": [asdict(one) for one in points]},
-            job.made_of,
+            made_of=job.made_of,
         )
         write_text(job.curve_path, strict_json([asdict(one) for one in points]) + "\n")
         checking_s += time.monotonic() - checked

@@ -197,7 +197,11 @@ class Learner:
                 kept.copy_(now)
 
     def save(
-        self, path: Path, said: Mapping[str, Any] = NOTHING, made_of: Mapping[str, Any] = NOTHING
+        self,
+        path: Path,
+        said: Mapping[str, Any] = NOTHING,
+        *,
+        made_of: Mapping[str, Any] = NOTHING,
     ) -> None:
         """Store everything needed to resume, with entries of the caller.
 

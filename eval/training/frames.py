@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from crosscue.datasets.scenes.drive import SOURCE
 from crosscue.datasets.scenes.scene_truth import DriveAnnotations
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 from crosscue.datasets.scenes.single_frames import frames, merge_annotations
+from crosscue.datasets.simulated.log_files import SOURCE
 from crosscue.eval.training.inputs import check_place, training_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.progress import Progress, emit

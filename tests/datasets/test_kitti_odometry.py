@@ -25,7 +25,7 @@ from support.kitti_odometry_drive import (
 def test_left_turn_has_positive_yaw_rate_and_heading(tmp_path: Path) -> None:
     folder = kitti_odometry_drive(tmp_path)
 
-    odometry = read_kitti_poses(folder).odometry()
+    odometry = read_kitti_poses(folder).odometry().table
     truth = read_truth(write_kitti_odometry_truth(folder, tmp_path / "truth"))
 
     np.testing.assert_allclose(np.asarray(odometry["speed_x_mps"], float), SPEED_MPS, rtol=2e-3)

@@ -33,7 +33,7 @@ def rows(path: Path, selection: Selection | None = None) -> tuple[dict[str, int]
 
 
 def test_odometry_matches_simulated_motion(tmp_path: Path) -> None:
-    table = read_pandaset_poses(pandaset_drive(tmp_path / "002")).odometry()
+    table = read_pandaset_poses(pandaset_drive(tmp_path / "002")).odometry().table
 
     # A chord of 0.2 s at 0.2 rad/s is 0.007 % shorter than its arc.
     np.testing.assert_allclose(np.asarray(table["speed_x_mps"], float)[1:-1], SPEED_MPS, rtol=1e-4)
@@ -83,7 +83,7 @@ def test_real_sequence_is_read_with_known_speed_and_distance(tmp_path: Path) -> 
     path = shared("sequences", "pandaset_002")
 
     found, ledger = rows(path)
-    speed = read_pandaset_poses(path).odometry()["speed_x_mps"]
+    speed = read_pandaset_poses(path).odometry().table["speed_x_mps"]
 
     assert found == {"front_camera": 80, "odometry": 80, "gnss": 80}
     assert ledger.is_whole
