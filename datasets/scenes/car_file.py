@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
+from crosscue.datasets.simulated.drive import CAN, HEAD, MOTION
 
 from .mobileye import MOUNTING
 
@@ -26,6 +27,8 @@ def scene_vehicle_text(
     """Return the file's text for a camera and compass, with the heading at the start."""
     stop, light = STOP_SIGN_M, TRAFFIC_LIGHT_M
     return VEHICLE.format(
+        bus="/can/car",
+        dbc="simulated_car.dbc",
         mounting_yaw_rad=mounting_yaw_rad,
         declination_rad=declination_rad,
         heading_rad=round(heading_rad, 6),
@@ -40,49 +43,23 @@ def scene_vehicle_text(
     )
 
 
-VEHICLE: Final = """\
+VEHICLE: Final = f"""\
 # A car of crosscue's simulated intersections.
-version = 1
-name = "crosscue simulated car"
-
+{HEAD}
 [topics]
 camera = "/camera/image/compressed"
-
-[can]
-bus = "/can/car"
-dbc = ["simulated_car.dbc"]
-
-[can.wheel_speeds]
-front_left = "WHEEL_SPEEDS.FRONT_LEFT"
-front_right = "WHEEL_SPEEDS.FRONT_RIGHT"
-rear_left = "WHEEL_SPEEDS.REAR_LEFT"
-rear_right = "WHEEL_SPEEDS.REAR_RIGHT"
-
+{CAN}
 [mobileye]
 bus = "/can/mobileye"
 revision = "classic"
-x_m = {mobileye_x_m}
-
-[odometry]
-wheelbase_m = 2.7
-track_width_m = 1.55
-
-[compass]
-mounting_yaw_rad = {mounting_yaw_rad}
-declination_rad = {declination_rad}
-heading_sd_rad = 0.16
-interval_s = 8.0
-
-[start]
-heading_rad = {heading_rad}
-heading_sd_rad = 0.05
-
+x_m = {{mobileye_x_m}}
+{MOTION}
 [camera]
-x_m = {camera_x_m}
-z_m = {camera_z_m}
-pitch_rad = {pitch_rad}
-focal_px = {focal_px}
-center_px = {center_px}
+x_m = {{camera_x_m}}
+z_m = {{camera_z_m}}
+pitch_rad = {{pitch_rad}}
+focal_px = {{focal_px}}
+center_px = {{center_px}}
 
 # Chosen on layouts L700 to L731 so that none of their roads is missed near by and no other is seen.
 [regions]
@@ -92,11 +69,11 @@ right = [[0.55, 0.52], [0.74, 0.52], [0.74, 0.56], [0.58, 0.56]]
 
 [ranges.stop_sign]
 family = "pinhole-offset"
-parameters = {stop_sign}
+parameters = {{stop_sign}}
 residual_sd_m = 1.56
 
 [ranges.traffic_light]
 family = "pinhole-offset"
-parameters = {traffic_light}
+parameters = {{traffic_light}}
 residual_sd_m = 3.44
 """

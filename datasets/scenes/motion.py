@@ -9,7 +9,7 @@ import numpy as np
 from numpy.random import Generator
 
 from crosscue.datasets.scenes.rendering.mesh import Floats
-from crosscue.datasets.simulated.drive import RATE_HZ, START_NS, TrueMotion
+from crosscue.datasets.simulated.drive import RATE_HZ, TrueMotion, integrated
 
 from .layout import NEAR_KERB_M, PARKING_LANE_M, Layout
 
@@ -141,7 +141,8 @@ def approach(layout: Layout, conditions: Conditions, rng: Generator) -> Approach
     along, speed = _speeds(
         conditions.speed_mps, stop_at if stops else None, wait_s, len(curvature) - 2, slow_from
     )
-    motion = _integrated(along, speed, curvature, start_x, lane_y_m(layout))
+    bend = np.interp(along, np.arange(len(curvature)) * 0.1, curvature)
+    motion = integrated(bend, speed, start_x, lane_y_m(layout))
     t_s = np.arange(len(motion)) * STEP_S
     bumper = along + start_x + FRONT_M
     inside = (bumper > NEAR_KERB_M - 1.0) & (along + start_x < layout.far_kerb_m + 4.0)
@@ -212,16 +213,3 @@ def _speeds(
         along.append(at)
         speed.append(v)
     return np.array(along), np.array(speed)
-
-
-def _integrated(
-    along: Floats, speed: Floats, curvature: Floats, start_x: float, lane_y: float
-) -> TrueMotion:
-    bend = np.interp(along, np.arange(len(curvature)) * 0.1, curvature)
-    yaw_rate = bend * speed
-    heading = np.concatenate(([0.0], np.cumsum(yaw_rate * STEP_S)))[:-1]
-    middle = heading + yaw_rate * STEP_S / 2
-    x = start_x + np.concatenate(([0.0], np.cumsum(speed * STEP_S * np.cos(middle))))[:-1]
-    y = lane_y + np.concatenate(([0.0], np.cumsum(speed * STEP_S * np.sin(middle))))[:-1]
-    t_ns = START_NS + np.arange(len(x), dtype=np.int64) * (1_000_000_000 // RATE_HZ)
-    return TrueMotion(t_ns, x, y, heading, speed, yaw_rate)

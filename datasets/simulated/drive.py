@@ -106,12 +106,24 @@ def true_motion(settings: DriveSettings) -> TrueMotion:
         along.append(at_m)
         speeds.append(v)
     bend = np.interp(np.array(along), np.arange(len(curvature)), _smoothed(curvature))
-    speed_mps = np.array(speeds)
-    yaw_rate = bend * speed_mps
-    heading = np.concatenate(([0.3], 0.3 + np.cumsum(yaw_rate * step_s)))[:-1]
+    return integrated(bend, np.array(speeds), heading_rad=0.3)
+
+
+def integrated(
+    curvature: Floats,
+    speed_mps: Floats,
+    x_m: float = 0.0,
+    y_m: float = 0.0,
+    heading_rad: float = 0.0,
+) -> TrueMotion:
+    """Return the motion along a path, from curvature and speed at each step and the start."""
+    step_s = 1.0 / RATE_HZ
+    yaw_rate = curvature * speed_mps
+    turned = np.cumsum(yaw_rate * step_s)
+    heading = np.concatenate(([heading_rad], heading_rad + turned))[:-1]
     middle = heading + yaw_rate * step_s / 2
-    x = np.concatenate(([0.0], np.cumsum(speed_mps * step_s * np.cos(middle))))[:-1]
-    y = np.concatenate(([0.0], np.cumsum(speed_mps * step_s * np.sin(middle))))[:-1]
+    x = x_m + np.concatenate(([0.0], np.cumsum(speed_mps * step_s * np.cos(middle))))[:-1]
+    y = y_m + np.concatenate(([0.0], np.cumsum(speed_mps * step_s * np.sin(middle))))[:-1]
     t_ns = START_NS + np.arange(len(x), dtype=np.int64) * (1_000_000_000 // RATE_HZ)
     return TrueMotion(t_ns, x, y, heading, speed_mps, yaw_rate)
 
@@ -264,13 +276,14 @@ def dbc_path() -> Path:
     return Path(str(files("crosscue.datasets.simulated").joinpath("simulated_car.dbc")))
 
 
-VEHICLE: Final = """\
-# The simulated car of crosscue's demo.
+# Sections of the simulated cars' vehicle files that are equal in all of them.
+HEAD: Final = """\
 version = 1
 name = "crosscue simulated car"
-
+"""
+CAN: Final = """
 [can]
-bus = "/can"
+bus = "{bus}"
 dbc = ["{dbc}"]
 
 [can.wheel_speeds]
@@ -278,7 +291,8 @@ front_left = "WHEEL_SPEEDS.FRONT_LEFT"
 front_right = "WHEEL_SPEEDS.FRONT_RIGHT"
 rear_left = "WHEEL_SPEEDS.REAR_LEFT"
 rear_right = "WHEEL_SPEEDS.REAR_RIGHT"
-
+"""
+MOTION: Final = """
 [odometry]
 wheelbase_m = 2.7
 track_width_m = 1.55
@@ -290,15 +304,17 @@ heading_sd_rad = 0.16
 interval_s = 8.0
 
 [start]
-heading_rad = 0.3
+heading_rad = {heading_rad}
 heading_sd_rad = 0.05
 """
 
 
 def vehicle_text(settings: DriveSettings, dbc: str) -> str:
     """Return the text of the simulated car's vehicle file."""
-    return VEHICLE.format(
+    return f"# The simulated car of crosscue's demo.\n{HEAD}{CAN}{MOTION}".format(
+        bus="/can",
         dbc=dbc,
         mounting_yaw_rad=settings.mounting_yaw_rad,
         declination_rad=settings.declination_rad,
+        heading_rad=0.3,
     )

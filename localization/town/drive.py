@@ -161,6 +161,10 @@ class DriveResult(NamedTuple):
 
 
 FIELDS: Final = len(DriveResult._fields)
+# Columns of a row, in the order of ``DriveResult``.
+OUTCOME, TRAVELLED, SECONDS, STEPS, STRAIGHT_LINE, MANHATTAN, AREA, LANDMARKS = range(8)
+PASSED, DETECTED, REFUSED, DECISIONS, TURNS, GOALS, FIRST_GOAL, FIRST_AXIS = range(8, 16)
+AXIS, ERROR, NEES, GOAL_ERROR, FURTHEST, LONGEST_GAP = range(16, FIELDS)
 
 
 class LandmarkArray(NamedTuple):
@@ -183,23 +187,6 @@ class Targets(NamedTuple):
     goal: int
     landmarks: LandmarkArray
     places: RandomStream
-
-
-class DriveTotals(NamedTuple):
-    """Counts and distances of the result that accumulate during the drive."""
-
-    passed: int
-    detected: int
-    refused: int
-    decisions: int
-    turns: int
-    goals: int
-    first_goal_m: float
-    first_goal_axis_m: float
-    goal_error_m: float
-    furthest_m: float
-    longest_gap_m: float
-    last_fix_m: float
 
 
 class DriveRecord(NamedTuple):
@@ -229,9 +216,10 @@ def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Dri
         log: Output: steps and events, up to its capacity.
     """
     row[:] = np.nan
+    row[PASSED : GOALS + 1] = row[FURTHEST] = row[LONGEST_GAP] = 0.0
     streets = make_streets(stream_of(seed, CITY_STREAM), p)
     if not has_intersection(streets):
-        row[0] = NO_CITY
+        row[OUTCOME] = NO_CITY
         return
     start, way, targets = _start(p, streets, stream_of(seed, PLACE_STREAM))
     start_x, start_y = node_position(streets, start)
@@ -242,15 +230,11 @@ def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Dri
     vehicle = TownVehicle(x, y, HEADINGS_RAD[way], p.turn_mps, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     belief, noise = _first_belief(p, vehicle, stream_of(seed, SENSOR_STREAM))
     if len(row) > FIELDS:
-        row[FIELDS], row[FIELDS + 1], row[FIELDS + 2] = (
-            belief.x_m,
-            belief.y_m,
-            belief.heading_rad,
-        )
+        row[FIELDS], row[FIELDS + 1] = belief.x_m, belief.y_m
+        row[FIELDS + 2] = belief.heading_rad
     route = Route(way, start + step_of(way, len(streets.xs_m)), UNDECIDED, 0, 0, 0.0)
     arcs, memory = np.empty((MAX_ARCS, ARC_FIELDS)), empty_memory()
-    tally = DriveTotals(0, 0, 0, 0, 0, 0, math.nan, math.nan, math.nan, 0.0, 0.0, 0.0)
-    steps = 0
+    last_fix_m, steps = 0.0, 0
     while True:
         lane = lane_of(p, streets, route, arcs, vehicle)
         moved = move(p, vehicle, lane, wanted_mps(p, streets, route, vehicle))
@@ -265,8 +249,8 @@ def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Dri
         if axis_m > p.lost_above_m:
             break
         if _is_at_goal(p, streets, targets, belief, axis_m):
-            tally = _arrived(streets, targets, tally, vehicle, start, axis_m)
-            if tally.goals == p.goals:
+            _arrived(row, streets, targets, vehicle, start, axis_m)
+            if row[GOALS] == p.goals:
                 break
             targets = _next_targets(p, streets, targets, route.node)
             _note_targets(log, steps, streets, targets, p.landmark_per_goal)
@@ -279,24 +263,23 @@ def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Dri
         if route.turn == UNDECIDED and room_m <= p.decide_at_m:
             turn, memory = _decide(p, streets, route, targets, memory, belief, room_m, axis_m)
             route = Route(route.way, route.node, turn, route.arc, route.arcs, 0.0)
-            tally = _decided(tally, turn)
+            row[DECISIONS] += 1
+            row[TURNS] += int(turn != STRAIGHT)
         if route.turn != UNDECIDED and room_m <= entry_m(p, route.turn):
             landmark = _landmark_at(targets.landmarks, route.node)
             if landmark != NONE:
-                belief, tally, noise = _pass_landmark(
-                    p,
-                    streets,
-                    targets.landmarks,
-                    landmark,
-                    vehicle,
-                    belief,
-                    tally,
-                    noise,
-                    log,
-                    steps,
-                )
+                fix, noise = _landmark_fix(p, targets.landmarks, landmark, vehicle, belief, noise)
+                belief = fix.state
+                _note(log, steps, fix.kind, streets, route.node, fix.x_m, fix.y_m)
+                row[PASSED] += 1
+                row[REFUSED] += int(fix.kind == LANDMARK_REFUSED)
+                if fix.kind == LANDMARK_TAKEN:
+                    row[DETECTED] += 1
+                    gap_m = vehicle.travelled_m - last_fix_m
+                    row[LONGEST_GAP] = max(row[LONGEST_GAP], gap_m)
+                    last_fix_m = vehicle.travelled_m
             route = enter(p, streets, route, arcs)
-    _finish(p, row, vehicle, belief, tally, steps)
+    _finish(p, row, vehicle, belief, last_fix_m, steps)
 
 
 def drive_each(p: Parameters, seeds: Keys, rows: NDArray[np.float64], log: DriveRecord) -> None:
@@ -409,30 +392,20 @@ def _is_at_goal(
 
 
 def _arrived(
+    row: NDArray[np.float64],
     streets: Streets,
     targets: Targets,
-    tally: DriveTotals,
     vehicle: TownVehicle,
     start: int,
     axis_m: float,
-) -> DriveTotals:
+) -> None:
     x, y = node_position(streets, targets.goal)
     start_x, start_y = node_position(streets, start)
-    t, is_first = tally, tally.goals == 0
-    return DriveTotals(
-        t.passed,
-        t.detected,
-        t.refused,
-        t.decisions,
-        t.turns,
-        t.goals + 1,
-        vehicle.travelled_m if is_first else t.first_goal_m,
-        axis_m if is_first else t.first_goal_axis_m,
-        math.hypot(vehicle.x_m - x, vehicle.y_m - y),
-        max(t.furthest_m, math.hypot(x - start_x, y - start_y)),
-        t.longest_gap_m,
-        t.last_fix_m,
-    )
+    if row[GOALS] == 0:
+        row[FIRST_GOAL], row[FIRST_AXIS] = vehicle.travelled_m, axis_m
+    row[GOALS] += 1
+    row[GOAL_ERROR] = math.hypot(vehicle.x_m - x, vehicle.y_m - y)
+    row[FURTHEST] = max(row[FURTHEST], math.hypot(x - start_x, y - start_y))
 
 
 def _decide(
@@ -488,42 +461,27 @@ def _target(
         marks.is_visited[found] = True
 
 
-def _decided(tally: DriveTotals, turn: int) -> DriveTotals:
-    t = tally
-    return DriveTotals(
-        t.passed,
-        t.detected,
-        t.refused,
-        t.decisions + 1,
-        t.turns + int(turn != STRAIGHT),
-        t.goals,
-        t.first_goal_m,
-        t.first_goal_axis_m,
-        t.goal_error_m,
-        t.furthest_m,
-        t.longest_gap_m,
-        t.last_fix_m,
-    )
+class LandmarkFix(NamedTuple):
+    """Belief after passing a landmark, kind of the event, and the measured position, or NaN."""
+
+    state: State
+    kind: int
+    x_m: float
+    y_m: float
 
 
-def _pass_landmark(
+def _landmark_fix(
     p: Parameters,
-    streets: Streets,
     landmarks: LandmarkArray,
     landmark: int,
     vehicle: TownVehicle,
     belief: State,
-    tally: DriveTotals,
     noise: RandomStream,
-    log: DriveRecord,
-    steps: int,
-) -> tuple[State, DriveTotals, RandomStream]:
+) -> tuple[LandmarkFix, RandomStream]:
     """Draw whether a landmark is recognised; if so, it measures the vehicle's position."""
     number, noise = uniform(noise)
-    node = landmarks.nodes[landmark]
     if number >= p.detection_rate:
-        _note(log, steps, LANDMARK_MISSED, streets, node, math.nan, math.nan)
-        return belief, _passed(tally, vehicle, False, False), noise
+        return LandmarkFix(belief, LANDMARK_MISSED, math.nan, math.nan), noise
     x_error, noise = normal(noise)
     y_error, noise = normal(noise)
     x, y = vehicle.x_m + p.landmark_sd_m * x_error, vehicle.y_m + p.landmark_sd_m * y_error
@@ -531,36 +489,15 @@ def _pass_landmark(
     landmarks.is_visited[landmark] = True
     updated = update_position(belief, x, y, var, 0.0, var, p.landmark_gate_nis)
     kind = LANDMARK_TAKEN if updated.is_accepted else LANDMARK_REFUSED
-    _note(log, steps, kind, streets, node, x, y)
-    tally = _passed(tally, vehicle, updated.is_accepted, not updated.is_accepted)
-    return updated.state, tally, noise
-
-
-def _passed(
-    tally: DriveTotals, vehicle: TownVehicle, is_fused: bool, is_refused: bool
-) -> DriveTotals:
-    t, gap_m = tally, vehicle.travelled_m - tally.last_fix_m
-    return DriveTotals(
-        t.passed + 1,
-        t.detected + int(is_fused),
-        t.refused + int(is_refused),
-        t.decisions,
-        t.turns,
-        t.goals,
-        t.first_goal_m,
-        t.first_goal_axis_m,
-        t.goal_error_m,
-        t.furthest_m,
-        max(t.longest_gap_m, gap_m) if is_fused else t.longest_gap_m,
-        vehicle.travelled_m if is_fused else t.last_fix_m,
-    )
+    return LandmarkFix(updated.state, kind, x, y), noise
 
 
 def _describe_start(
     row: NDArray[np.float64], streets: Streets, targets: Targets, goal_dx: float, goal_dy: float
 ) -> None:
-    row[4], row[5] = math.hypot(goal_dx, goal_dy), abs(goal_dx) + abs(goal_dy)
-    row[6], row[7] = streets.area_km2, len(targets.landmarks.nodes)
+    row[STRAIGHT_LINE] = math.hypot(goal_dx, goal_dy)
+    row[MANHATTAN] = abs(goal_dx) + abs(goal_dy)
+    row[AREA], row[LANDMARKS] = streets.area_km2, len(targets.landmarks.nodes)
 
 
 def _finish(
@@ -568,22 +505,18 @@ def _finish(
     row: NDArray[np.float64],
     vehicle: TownVehicle,
     belief: State,
-    tally: DriveTotals,
+    last_fix_m: float,
     steps: int,
 ) -> None:
     """Write the rest of the drive's ``DriveResult``."""
     axis_m = major_axis_m(belief.xx, belief.xy, belief.yy)
-    outcome = REACHED if tally.goals == p.goals else GIVEN_UP
+    outcome = REACHED if row[GOALS] == p.goals else GIVEN_UP
     ex, ey = belief.x_m - vehicle.x_m, belief.y_m - vehicle.y_m
     eh = wrap(belief.heading_rad - vehicle.heading_rad)
-    row[0] = LOST if axis_m > p.lost_above_m else outcome
-    row[1], row[2], row[3] = vehicle.travelled_m, steps * p.step_s, steps
-    row[8], row[9], row[10] = tally.passed, tally.detected, tally.refused
-    row[11], row[12], row[13] = tally.decisions, tally.turns, tally.goals
-    row[14], row[15], row[16] = tally.first_goal_m, tally.first_goal_axis_m, axis_m
-    row[17], row[18] = math.hypot(ex, ey), pose_nees(ex, ey, eh, belief)
-    row[19], row[20] = tally.goal_error_m, tally.furthest_m
-    row[21] = max(tally.longest_gap_m, vehicle.travelled_m - tally.last_fix_m)
+    row[OUTCOME] = LOST if axis_m > p.lost_above_m else outcome
+    row[TRAVELLED], row[SECONDS], row[STEPS] = vehicle.travelled_m, steps * p.step_s, steps
+    row[AXIS], row[ERROR], row[NEES] = axis_m, math.hypot(ex, ey), pose_nees(ex, ey, eh, belief)
+    row[LONGEST_GAP] = max(row[LONGEST_GAP], vehicle.travelled_m - last_fix_m)
 
 
 def _keep(kept: NDArray[np.float64], vehicle: TownVehicle, reading: Reading, belief: State) -> None:

@@ -8,7 +8,7 @@ published result (9.3 km at 30 degrees).
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
@@ -181,55 +181,27 @@ class Parameters(NamedTuple):
 
 
 def parameters_of(settings: TownDrive) -> Parameters:
-    """Convert a drive's settings to numbers."""
-    city, car, sensors, nav = settings.city, settings.car, settings.sensors, settings.navigation
+    """Convert a drive's settings to numbers; those of equal names are used unchanged."""
+    city, sensors, nav = settings.city, settings.sensors, settings.navigation
     compass = sensors.compass_2sigma_deg
+    sections = (city, settings.car, sensors, nav, settings)
+    plain: dict[str, Any] = {
+        name: value for section in sections for name, value in section if name in Parameters._fields
+    }
     return Parameters(
-        min_km2=city.smallest_km2,
-        max_km2=city.largest_km2,
-        min_block_m=city.shortest_block_m,
-        max_block_m=city.longest_block_m,
-        dead_end_fraction=city.dead_end_fraction,
-        one_way_fraction=city.one_way_fraction,
-        min_goal_m=city.goal_at_least_m,
-        wheelbase_m=car.wheelbase_m,
-        track_width_m=car.track_width_m,
-        step_s=car.step_s,
-        cruise_mps=car.cruise_mps,
-        turn_mps=car.turn_mps,
-        accel_mps2=car.accel_mps2,
-        lane_offset_m=car.lane_offset_m,
-        left_radius_m=car.left_radius_m,
-        right_radius_m=car.right_radius_m,
-        decide_at_m=car.decide_at_m,
-        steering_p=car.steering_p,
-        steering_i=car.steering_i,
-        steering_d=car.steering_d,
-        speed_p=car.speed_p,
-        speed_i=car.speed_i,
-        speed_d=car.speed_d,
-        compass_sd_rad=-1.0 if compass is None else math.radians(compass) / 2.0,
-        compass_interval_m=sensors.compass_interval_m,
-        slip_per_sqrt_m=sensors.slip_per_sqrt_m,
-        encoder_step_m=sensors.encoder_step_m,
-        landmark_sd_m=sensors.landmark_sd_m,
-        landmark_gate_nis=sensors.landmark_gate_nis,
-        detection_rate=sensors.detection_rate,
-        start_position_sd_m=sensors.start_position_sd_m,
-        start_heading_sd_rad=math.radians(sensors.start_heading_sd_deg),
-        speed_sd_mps=sensors.speed_sd_mps,
-        accel_var_m2ps3=sensors.accel_var_m2ps3,
-        strategy=int(STRATEGIES[nav.strategy]),
-        penalty_rad=math.radians(nav.penalty_deg),
-        recognise_within_m=nav.recognise_within_m,
-        same_option_rad=math.radians(nav.same_option_deg),
-        after_m=nav.after_m,
-        arrive_within_m=nav.arrive_within_m,
-        hybrid_above_m=nav.hybrid_above_m,
-        lost_above_m=nav.lost_above_m,
-        landmarks_per_km2=settings.landmarks_per_km2,
-        landmark_per_goal=settings.landmark_per_goal,
-        goals=settings.goals,
-        max_travelled_m=settings.longest_m,
-        max_s=settings.longest_s,
+        **plain
+        | {
+            "min_km2": city.smallest_km2,
+            "max_km2": city.largest_km2,
+            "min_block_m": city.shortest_block_m,
+            "max_block_m": city.longest_block_m,
+            "min_goal_m": city.goal_at_least_m,
+            "compass_sd_rad": -1.0 if compass is None else math.radians(compass) / 2.0,
+            "start_heading_sd_rad": math.radians(sensors.start_heading_sd_deg),
+            "strategy": int(STRATEGIES[nav.strategy]),
+            "penalty_rad": math.radians(nav.penalty_deg),
+            "same_option_rad": math.radians(nav.same_option_deg),
+            "max_travelled_m": settings.longest_m,
+            "max_s": settings.longest_s,
+        }
     )
