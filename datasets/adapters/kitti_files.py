@@ -178,7 +178,7 @@ def read_kitti_labels(file: Path, pictures: Path, period_ns: int) -> SequenceLab
         by_frame.setdefault(frame, []).append((parts[2], track, numbers))
     objects = Objects()
     for frame in sorted(by_frame):
-        objects.add_picture(frame * period_ns, f"{frame:06d}.png", size_px)
+        objects.add_image(f"{frame:06d}.png", size_px, t_ns=frame * period_ns)
         for name, track, numbers in by_frame[frame]:
             x0, y0, x1, y1 = numbers[3:7]
             if name == "DontCare":

@@ -105,7 +105,7 @@ def _objects(tables: SceneTables) -> tuple[Objects, int]:
     tracks: dict[str, int] = {}
     for row, camera in _key_frames(tables):
         size_px = (int(row.get("width") or 1600), int(row.get("height") or 900))
-        objects.add_picture(int(row["timestamp"]) * 1000, str(row["filename"]), size_px)
+        objects.add_image(str(row["filename"]), size_px, t_ns=int(row["timestamp"]) * 1000)
         for one in of_sample.get(str(row["sample_token"]), ()):
             xyz, size = numbers(one.get("translation"), 3), numbers(one.get("size"), 3)
             wxyz = numbers(one.get("rotation"), 4)

@@ -21,10 +21,10 @@ from typing import Any, Final
 import numpy as np
 
 from crosscue.datasets.adapters.pandaset import FRONT, PandasetPoses, read_pandaset_poses
+from crosscue.datasets.truth.coco import CocoRows
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.tree_text import json_tree, strict_json
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.files.tree_text import json_tree
 
 CATEGORIES: Final = {"car": 1, "truck": 2, "person": 3}
 LABELS: Final = {
@@ -76,19 +76,9 @@ def write_labels(sequence: Path, output: Path) -> Path:
     rows: dict[str, Any] = {
         name: table[name].to_numpy(zero_copy_only=False) for name in (*_COLUMNS, "yaw_rad")
     }
-    images: list[dict[str, object]] = []
-    annotations: list[dict[str, object]] = []
-    width, height = SIZE_PX
+    labels = CocoRows()
     for frame, t_ns in enumerate(poses.t_ns.tolist()):
-        images.append(
-            {
-                "id": frame,
-                "file_name": f"{frame:02}.jpg",
-                "t_ns": t_ns,
-                "width": width,
-                "height": height,
-            }
-        )
+        labels.add_image(f"{frame:02}.jpg", SIZE_PX, id=frame, t_ns=t_ns)
         seen = [
             one
             for row in np.flatnonzero(rows["frame"] == frame)
@@ -100,26 +90,17 @@ def write_labels(sequence: Path, output: Path) -> Path:
             high = np.clip(one.corners_px.max(axis=0), 0.0, SIZE_PX)
             wide, high_px = (high - low).tolist()
             is_out = name is None or visible < MIN_VISIBLE or one.range_m > REACH_M
-            annotations.append(
-                {
-                    "id": len(annotations) + 1,
-                    "image_id": frame,
-                    "category_id": CATEGORIES[name or "truck"],
-                    "bbox": [round(v, 1) for v in (*low.tolist(), wide, high_px)],
-                    "area": round(wide * high_px, 1),
-                    "iscrowd": int(is_out),
-                    "visible": round(visible, 3),
-                    "range_m": round(one.range_m, 2),
-                }
+            labels.add_box(
+                CATEGORIES[name or "truck"],
+                (*low.tolist(), *high.tolist()),
+                bbox=[round(v, 1) for v in (*low.tolist(), wide, high_px)],
+                area=round(wide * high_px, 1),
+                iscrowd=int(is_out),
+                visible=round(visible, 3),
+                range_m=round(one.range_m, 2),
             )
-    tree = {
-        "info": {"description": "PandaSet 002 (Scale AI, Hesai; CC BY 4.0): projected boxes"},
-        "images": images,
-        "annotations": annotations,
-        "categories": [{"id": number, "name": name} for name, number in CATEGORIES.items()],
-    }
-    write_text(output, strict_json(tree) + "\n")
-    return output
+    source = "PandaSet 002 (Scale AI, Hesai; CC BY 4.0): projected boxes"
+    return labels.write(output, source, CATEGORIES)
 
 
 def _projected(

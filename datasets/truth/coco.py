@@ -14,7 +14,7 @@ from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import MIB
 
-from .annotations import Annotation, Annotations, Picture
+from .annotations import Annotation, Annotations, Picture, PictureTimes
 
 MAX_BYTES: Final = 512 * MIB
 MAX_SIDE: Final = 100_000
@@ -133,6 +133,50 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
+@dataclass(slots=True)
+class CocoRows:
+    """Rows of a COCO file: pictures, and the boxes in them."""
+
+    images: list[dict[str, Any]] = field(default_factory=list)
+    annotations: list[dict[str, Any]] = field(default_factory=list)
+
+    def add_image(self, file_name: str, size_px: tuple[int, int], **more: object) -> None:
+        """Add a picture, to which the boxes added afterwards belong; ``more`` are further keys."""
+        wide, high = size_px
+        row = {"id": len(self.images) + 1, "file_name": file_name, "width": wide, "height": high}
+        self.images.append(row | more)
+
+    def add_box(
+        self, category: int, box_px: tuple[float, float, float, float], **more: object
+    ) -> None:
+        """Add a box, x0, y0, x1, y1, to the last picture; ``more`` are further keys."""
+        x0, y0, x1, y1 = box_px
+        row = {
+            "id": len(self.annotations) + 1,
+            "image_id": self.images[-1]["id"],
+            "category_id": category,
+            "bbox": [x0, y0, x1 - x0, y1 - y0],
+            "area": (x1 - x0) * (y1 - y0),
+            "iscrowd": 0,
+        }
+        self.annotations.append(row | more)
+
+    def write(self, path: Path, source: str, numbers: Mapping[str, int]) -> Path:
+        """Write the file with categories of these numbers, and return its path.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        tree = {
+            "info": {"description": source},
+            "images": self.images,
+            "annotations": self.annotations,
+            "categories": [{"id": number, "name": name} for name, number in numbers.items()],
+        }
+        write_text(path, strict_json(tree) + "\n")
+        return path
+
+
 def write_coco(folder: Path, labels: Annotations) -> Path:
     """Write a COCO file with times of pictures and scores of boxes, and return its path.
 
@@ -140,64 +184,57 @@ def write_coco(folder: Path, labels: Annotations) -> Path:
         OutputError: The file cannot be written.
     """
     numbers = {name: number for number, name in enumerate(labels.labels, 1)}
-    images: list[dict[str, Any]] = []
-    things: list[dict[str, Any]] = []
-    for number, picture in enumerate(labels.pictures, 1):
-        wide, high = picture.size_px
-        images.append({"id": number, "file_name": picture.name, "width": wide, "height": high})
-        if picture.t_ns is not None:
-            images[-1]["t_ns"] = picture.t_ns
+    rows = CocoRows()
+    for picture in labels.pictures:
+        t_ns = {} if picture.t_ns is None else {"t_ns": picture.t_ns}
+        rows.add_image(picture.name, picture.size_px, **t_ns)
         for thing in picture.things:
-            if thing.box_px is None:
-                continue
-            x0, y0, x1, y1 = thing.box_px
-            box = {
-                "id": len(things) + 1,
-                "image_id": number,
-                "category_id": numbers[thing.label],
-                "bbox": [x0, y0, x1 - x0, y1 - y0],
-                "area": (x1 - x0) * (y1 - y0),
-                "iscrowd": int(thing.is_crowd),
-            }
-            things.append(box if thing.score is None else box | {"score": thing.score})
-    tree = {
-        "info": {"description": labels.where},
-        "images": images,
-        "annotations": things,
-        "categories": [{"id": number, "name": name} for name, number in numbers.items()],
+            if thing.box_px is not None:
+                score = {} if thing.score is None else {"score": thing.score}
+                is_crowd = int(thing.is_crowd)
+                rows.add_box(numbers[thing.label], thing.box_px, iscrowd=is_crowd, **score)
+    return rows.write(folder / WRITTEN, labels.where, numbers)
+
+
+def write_imported(
+    path: Path, annotations: Annotations, placed: PictureTimes, cues: Mapping[str, str | None]
+) -> Path:
+    """Write the labelled objects, with log times of pictures and names of cues.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    plain = {
+        label: label if (cue := cues[label]) is None else cue.replace("_", " ")
+        for label in annotations.labels
     }
-    write_text(folder / WRITTEN, strict_json(tree) + "\n")
-    return folder / WRITTEN
+    names = {name: number for number, name in enumerate(dict.fromkeys(plain.values()), start=1)}
+    rows = CocoRows()
+    for picture, t_ns in zip(annotations.pictures, placed.t_ns, strict=True):
+        rows.add_image(picture.name, picture.size_px, t_ns=t_ns)
+        for thing in picture.things:
+            if thing.box_px is not None:
+                found = {"visible": thing.visible, "track_id": thing.track}
+                found["segmentation"] = thing.segmentation
+                known = {name: value for name, value in found.items() if value is not None}
+                number = names[plain[thing.label]]
+                rows.add_box(number, thing.box_px, iscrowd=int(thing.is_crowd), **known)
+    return rows.write(path, f"imported from {annotations.where}", names)
 
 
 OBJECTS_FILE: Final = "objects.json"
 
 # COCO's category numbers; other labels are numbered from 200.
 COCO_IDS: Final = {
-    "person": 1,
-    "bicycle": 2,
-    "car": 3,
-    "motorcycle": 4,
-    "bus": 6,
-    "train": 7,
-    "truck": 8,
-}
+    "person": 1, "bicycle": 2, "car": 3, "motorcycle": 4, "bus": 6, "train": 7, "truck": 8,
+}  # fmt: skip
 
 
 @dataclass(slots=True)
-class Objects:
-    """Collection of boxes in pictures, in the order of pictures."""
+class Objects(CocoRows):
+    """Collection of boxes in a data set's pictures, in the order of pictures."""
 
-    images: list[dict[str, Any]] = field(default_factory=list)
-    annotations: list[dict[str, Any]] = field(default_factory=list)
     labels: dict[str, int] = field(default_factory=dict)
-
-    def add_picture(self, t_ns: int, file_name: str, size_px: tuple[int, int]) -> None:
-        """Add a picture, to which the boxes added afterwards belong."""
-        wide, high = size_px
-        number = len(self.images) + 1
-        row = {"id": number, "t_ns": t_ns, "file_name": file_name, "width": wide, "height": high}
-        self.images.append(row)
 
     def add(self, label: str, box_px: tuple[float, float, float, float], **more: object) -> None:
         """Add a box, x0, y0, x1, y1, to the last picture, clipped to the picture.
@@ -213,17 +250,11 @@ class Objects:
         if x1 - x0 < 1.0 or y1 - y0 < 1.0:
             return
         number = self.labels.setdefault(label, COCO_IDS.get(label, 200 + len(self.labels)))
-        self.annotations.append(
-            {
-                "id": len(self.annotations) + 1,
-                "image_id": image["id"],
-                "category_id": number,
-                "bbox": [round(x0, 2), round(y0, 2), round(x1 - x0, 2), round(y1 - y0, 2)],
-                "area": round((x1 - x0) * (y1 - y0), 1),
-                "iscrowd": 0,
-                **more,
-            }
-        )
+        rounded = {
+            "bbox": [round(x0, 2), round(y0, 2), round(x1 - x0, 2), round(y1 - y0, 2)],
+            "area": round((x1 - x0) * (y1 - y0), 1),
+        }
+        self.add_box(number, (x0, y0, x1, y1), **rounded | more)
 
     def save(self, folder: Path, source: str) -> str:
         """Write the file next to a truth file, and return its name.
@@ -231,11 +262,4 @@ class Objects:
         Raises:
             OutputError: It cannot be written.
         """
-        tree: Mapping[str, object] = {
-            "info": {"description": source},
-            "images": self.images,
-            "annotations": self.annotations,
-            "categories": [{"id": number, "name": name} for name, number in self.labels.items()],
-        }
-        write_text(folder / OBJECTS_FILE, strict_json(tree) + "\n")
-        return OBJECTS_FILE
+        return self.write(folder / OBJECTS_FILE, source, self.labels).name

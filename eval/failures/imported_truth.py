@@ -19,13 +19,12 @@ from crosscue.datasets.truth.annotations import (
     Picture,
     PictureTimes,
     check_boxes,
-    coco_tree,
     cue_truths,
     cues_by_label,
     match_frames,
 )
 from crosscue.datasets.truth.box_labels import Meanings
-from crosscue.datasets.truth.coco import OBJECTS_FILE, WRITTEN, write_coco
+from crosscue.datasets.truth.coco import OBJECTS_FILE, WRITTEN, write_coco, write_imported
 from crosscue.datasets.truth.truth import Truth
 from crosscue.eval.failures.labels import INDEX
 from crosscue.eval.fit.log_images import log_pictures
@@ -316,7 +315,7 @@ def _write(
         }
         truth = before.model_copy(update=kept)
     objects = output.parent / OBJECTS_FILE
-    write_text(objects, strict_json(coco_tree(annotations, placed, cues)) + "\n")
+    write_imported(objects, annotations, placed, cues)
     write_text(output, strict_json(truth.model_dump(mode="json")) + "\n")
     there: dict[str, int] = {}
     for one in truth.cues:
