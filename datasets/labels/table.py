@@ -23,7 +23,7 @@ from crosscue.datasets.truth.annotations import (
 )
 from crosscue.datasets.truth.box_labels import read_box_labels
 from crosscue.datasets.truth.coco import read_coco, write_coco
-from crosscue.datasets.truth.cvat import read_cvat, write_cvat
+from crosscue.datasets.truth.label_xml import read_cvat, write_cvat
 from crosscue.replay.errors import AnnotationError, UsageError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import json_tree, strict_json

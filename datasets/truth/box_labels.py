@@ -35,7 +35,7 @@ from crosscue.replay.limits import MIB
 from crosscue.verb import Option
 
 from .coco import read_coco
-from .voc import read_voc
+from .label_xml import read_voc
 
 LabelFormat: TypeAlias = Literal["coco", "yolo", "voc", "kitti", "pictures"]
 FORMATS: Final[tuple[LabelFormat, ...]] = ("coco", "yolo", "voc", "kitti", "pictures")

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from crosscue.datasets.truth.cvat import read_cvat
+from crosscue.datasets.truth.label_xml import read_cvat
 from crosscue.datasets.truth.truth import read_truth
 from crosscue.eval import cli
 from crosscue.replay.errors import SchemaError

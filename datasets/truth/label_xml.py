@@ -1,7 +1,8 @@
-"""Read and write CVAT's annotation files, XML 1.1: "CVAT for images" and "CVAT for video".
+"""Read labels in XML: CVAT's XML 1.1, for images and for video, and Pascal VOC; write CVAT's.
 
 The files are parsed with expat. A document type declaration is refused, so that there are no
-entities: nothing is fetched or expanded.
+entities: nothing is fetched or expanded. (defusedxml, which does the same, has had no release since
+2021.)
 """
 
 from __future__ import annotations
@@ -11,20 +12,21 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final, TypeAlias
 from xml.parsers import expat
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
 from crosscue.replay.errors import AnnotationError
+from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import MIB
 
 from .annotations import Annotation, Annotations, Picture
 
 MAX_BYTES: Final = 512 * MIB
-MAX_DEPTH: Final = 64
+MAX_VOC_BYTES: Final = 16 * MIB
 MAX_FRAMES: Final = 10_000_000
 MAX_SIDE: Final = 100_000
 WRITTEN: Final = "annotations.xml"
@@ -41,7 +43,12 @@ def read_cvat(path: Path) -> Annotations:
         AnnotationError: The file does not exist, has another format, or contains a document type
             declaration.
     """
-    reader = _Reader(str(path))
+    reader = _CvatReader(str(path))
+    _parse(path, reader, MAX_BYTES)
+    return reader.annotations()
+
+
+def _parse(path: Path, reader: _XmlReader, max_bytes: int) -> None:
     parser = expat.ParserCreate()
     parser.StartDoctypeDeclHandler = reader.refuse_doctype
     parser.StartElementHandler = reader.start
@@ -49,22 +56,56 @@ def read_cvat(path: Path) -> Annotations:
     parser.CharacterDataHandler = reader.text
     parser.buffer_text = True
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
-        with path.open("rb") as file:
-            parser.ParseFile(file)
+        content = read_at_most(path, max_bytes)
+        if content is None:
+            raise AnnotationError(f"{path}: over {max_bytes // MIB} MiB; expected {reader.kind}")
+        parser.Parse(content, True)
     except (OSError, expat.ExpatError) as error:
-        raise AnnotationError(f"{path}: not XML ({error}); expected CVAT's XML 1.1") from None
-    return reader.annotations()
+        raise AnnotationError(f"{path}: not XML ({error}); expected {reader.kind}") from None
 
 
 @dataclass(slots=True)
-class _Reader:
-    """Parser of a file, with the contents read so far."""
+class _XmlReader:
+    """Parser of a file; the path of the current element, and its text."""
 
     where: str
+    kind: ClassVar[str]
+    max_depth: ClassVar[int]
     _path: list[str] = field(default_factory=list)
     _words: list[str] = field(default_factory=list)
+
+    def refuse_doctype(self, *_: object) -> None:
+        raise AnnotationError(
+            f"{self.where}: has a document type declaration, which may define entities; remove it "
+            f"({self.kind} has none)"
+        )
+
+    def start(self, tag: str, found: Mapping[str, str]) -> None:
+        if len(self._path) >= self.max_depth:
+            raise AnnotationError(
+                f"{self.where}: nested over {self.max_depth} levels deep; expected {self.kind}"
+            )
+        self._path.append(tag)
+        self._words = []
+
+    def end(self, tag: str) -> None:
+        self._path.pop()
+        self._words = []
+
+    def text(self, words: str) -> None:
+        self._words.append(words)
+
+    @property
+    def _said(self) -> str:
+        return "".join(self._words).strip()
+
+
+@dataclass(slots=True)
+class _CvatReader(_XmlReader):
+    """Parser of CVAT's file, with the contents read so far."""
+
+    kind = "CVAT's XML 1.1"
+    max_depth = 64
     _meta: dict[str, str] = field(default_factory=dict)
     _labels: list[str] = field(default_factory=list)
     _pictures: list[Picture] = field(default_factory=list)
@@ -73,23 +114,12 @@ class _Reader:
     _track: tuple[int, str] | None = None
     _ignored: dict[str, int] = field(default_factory=dict)
 
-    def refuse_doctype(self, *_: object) -> None:
-        raise AnnotationError(
-            f"{self.where}: has a document type declaration, which may define entities; remove it "
-            "(CVAT does not write it)"
-        )
-
     def start(self, tag: str, found: Mapping[str, str]) -> None:
         if not self._path and tag != "annotations":
             raise AnnotationError(
                 f"{self.where}: <{tag}>: expected <annotations> of CVAT's XML 1.1"
             )
-        if len(self._path) >= MAX_DEPTH:
-            raise AnnotationError(
-                f"{self.where}: nested over {MAX_DEPTH} levels deep; expected CVAT's XML 1.1"
-            )
-        self._path.append(tag)
-        self._words = []
+        _XmlReader.start(self, tag, found)
         if tag == "image":
             self._things = []
             self._pictures.append(self._picture(found))
@@ -101,7 +131,7 @@ class _Reader:
             self._ignored[tag] = self._ignored.get(tag, 0) + 1
 
     def end(self, tag: str) -> None:
-        text = "".join(self._words).strip()
+        text = self._said
         if self._path[-3:] == ["labels", "label", "name"]:
             self._labels.append(text)
         elif "meta" in self._path:
@@ -114,11 +144,7 @@ class _Reader:
             )
         elif tag == "track":
             self._track = None
-        self._path.pop()
-        self._words = []
-
-    def text(self, words: str) -> None:
-        self._words.append(words)
+        _XmlReader.end(self, tag)
 
     def _picture(self, found: Mapping[str, str]) -> Picture:
         name = self._text(found, "name")
@@ -286,3 +312,75 @@ def _written(number: int, picture: Picture) -> list[str]:
             )
     head = f'<image id="{number}" name={quoteattr(picture.name)} width="{wide}" height="{high}">'
     return [head, *boxes, "</image>"]
+
+
+# Class; x0, y0, x1, y1 in pixels; True if it is marked difficult.
+VocBox: TypeAlias = tuple[str, tuple[float, float, float, float], bool]
+
+
+def read_voc(path: Path) -> tuple[str, tuple[int, int] | None, list[VocBox]]:
+    """Return file name, size and boxes of the picture.
+
+    Raises:
+        AnnotationError: The file does not exist, has another format, or contains a document type
+            declaration.
+    """
+    reader = _VocReader(str(path))
+    _parse(path, reader, MAX_VOC_BYTES)
+    if not reader.is_voc:
+        raise AnnotationError(f"{path}: no <annotation>; expected a Pascal VOC file")
+    name = reader.values.get("annotation/filename", "") or path.name
+    return name, reader.size(), reader.boxes
+
+
+@dataclass(slots=True)
+class _VocReader(_XmlReader):
+    """Parser of a Pascal VOC file; values by their path below the root."""
+
+    kind = "a Pascal VOC file"
+    max_depth = 16
+    is_voc: bool = False
+    values: dict[str, str] = field(default_factory=dict)
+    boxes: list[VocBox] = field(default_factory=list)
+    _object: dict[str, str] = field(default_factory=dict)
+
+    def start(self, tag: str, found: Mapping[str, str]) -> None:
+        _XmlReader.start(self, tag, found)
+        self.is_voc = self.is_voc or self._path == ["annotation"]
+        if self._path == ["annotation", "object"]:
+            self._object = {}
+
+    def end(self, tag: str) -> None:
+        place, text = "/".join(self._path), self._said
+        if place.startswith("annotation/object/"):
+            self._object.setdefault(place.removeprefix("annotation/object/"), text)
+        elif place == "annotation/object":
+            self.boxes.append(self._box())
+        else:
+            self.values.setdefault(place, text)
+        _XmlReader.end(self, tag)
+
+    def size(self) -> tuple[int, int] | None:
+        """Width and height, if the file specifies them."""
+        found = [self.values.get(f"annotation/size/{side}", "") for side in ("width", "height")]
+        if not all(one.isdecimal() and int(one) > 0 for one in found):
+            return None
+        return int(found[0]), int(found[1])
+
+    def _box(self) -> VocBox:
+        where = f"{self.where}: object {len(self.boxes) + 1}"
+        if not self._object.get("name"):
+            raise AnnotationError(f"{where}: no name; correct it")
+        try:
+            x0, y0, x1, y1 = (
+                float(self._object[f"bndbox/{side}"]) for side in ("xmin", "ymin", "xmax", "ymax")
+            )
+        except (KeyError, ValueError):
+            raise AnnotationError(
+                f"{where} ({self._object['name']}): expected bndbox with xmin, ymin, xmax and ymax"
+            ) from None
+        if not all(map(math.isfinite, (x0, y0, x1, y1))):
+            raise AnnotationError(f"{where} ({self._object['name']}): expected finite numbers")
+        # The first pixel is 1, and the last pixel belongs to the box.
+        box = (x0 - 1.0, y0 - 1.0, x1, y1)
+        return self._object["name"], box, self._object.get("difficult", "0") == "1"
