@@ -92,6 +92,12 @@ FORMATS: Final[dict[str, Format]] = {
         "crosscue.datasets.adapters.kitti_odometry:open_kitti_odometry",
         "KITTI odometry sequence",
     ),
+    "openpilot": Format(
+        (),
+        ("rlog", "rlog.bz2", "rlog.zst", "qlog", "qlog.bz2", "qlog.zst"),
+        "crosscue.datasets.adapters.openpilot:open_openpilot",
+        "openpilot segment",
+    ),
     "phone-drive": Format(
         (),
         ("*_phone.csv",),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final, NamedTuple, Protocol
 
 from crosscue.replay.base import EVERYTHING, Selection
-from crosscue.replay.columns import Block, Int64s, Table, Topic
+from crosscue.replay.columns import BLOCK_ROWS, Block, Int64s, Rows, Topic
 from crosscue.replay.files.closing import Closing
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
@@ -34,13 +34,13 @@ class HeldRows:
     Attributes:
         topic: The topic; its ``declared`` count includes dropped rows.
         t_ns: Shape (N,), int64: times.
-        table: N rows.
+        rows: N rows.
         losses: Losses found when the rows were read.
     """
 
     topic: Topic
     t_ns: Int64s
-    table: Table
+    rows: Rows
     losses: tuple[Loss, ...] = ()
 
     @property
@@ -56,8 +56,10 @@ class HeldRows:
         for loss in self.losses:
             ledger.drop(name, *loss)
         if len(self.t_ns) and (kept is None or kept.any()):
-            block = Block(name, self.t_ns, self.table)
-            yield block if kept is None else block.take(kept)
+            whole = Block(name, self.t_ns, self.rows)
+            block = whole if kept is None else whole.take(kept)
+            for first in range(0, len(block), BLOCK_ROWS):
+                yield block.take(slice(first, first + BLOCK_ROWS))
         if not selection.is_timed:
             ledger.settle(name, NO_PARTNER)
 

@@ -46,6 +46,7 @@ OTHERS: Final = {
     "--grid": "YOLOv7",
     "--include": "YOLOv5",
     "--serve-web": "Rerun",
+    "--torch-backend": "uv",
 }
 PACKAGES: Final = ("replay", "detectors", "fusion", "localization", "datasets", "eval")
 SHELL_PAGES: Final = sorted(

@@ -15,6 +15,7 @@ from support.can_files import Sent, asc, blf, candump, random_frames, trc
 from support.kitti_drive import raw_drive
 from support.kitti_odometry_drive import kitti_odometry_drive
 from support.nuscenes_drive import nuscenes_drive
+from support.openpilot_drive import openpilot_drive
 from support.pandaset_drive import pandaset_drive
 from support.phone_drive import phone_drive
 from support.pictures import picture_folder
@@ -89,6 +90,7 @@ EVERY_FORMAT: Final[dict[str, Callable[[Path], Path]]] = {
     "comma2k19": lambda folder: _comma2k19(folder / "segment"),
     "kitti-raw": lambda folder: raw_drive(folder / "drive"),
     "kitti-odometry": kitti_odometry_drive,
+    "openpilot": lambda folder: openpilot_drive(folder / "segment"),
     "phone-drive": lambda folder: phone_drive(folder / "drive"),
     "nuscenes": lambda folder: nuscenes_drive(folder / "root"),
     "pandaset": lambda folder: pandaset_drive(folder / "002"),

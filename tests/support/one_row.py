@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 import sqlite3
 import struct
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from typing import Final
 from support.can_files import blf, random_frames
 from support.every_format import EVERY_FORMAT
 from support.mcap_files import McapFile, channel, message, schema
+from support.openpilot_drive import START_NS, TURN, event
 from support.rosbag_files import TOPICS, rows_of, write_bag
 
 
@@ -114,6 +116,16 @@ def _speed_without_a_number(path: Path) -> None:
     file.write_text("\n".join(lines), encoding="utf-8")
 
 
+def _pointer_out_of_its_message(path: Path) -> None:
+    """Damage the pointer of one message, and leave its table of segments."""
+    log = path / "rlog.bz2"
+    coded = bytearray(bz2.decompress(log.read_bytes()))
+    at = coded.index(event(START_NS + 50_002_000, gyroscope=TURN))
+    # The root pointer is behind the table; the pointer behind two words of data follows it.
+    coded[at + 8 + 8 + 16 + 3] = 0x7F
+    log.write_bytes(bz2.compress(bytes(coded)))
+
+
 # For each format, a function that writes a log, and one that damages one row of it.
 ONE_ROW: Final[dict[str, tuple[Callable[[Path], Path], Callable[[Path], None]]]] = {
     "candump": (EVERY_FORMAT["candump"], _invalid_identifier),
@@ -126,6 +138,7 @@ ONE_ROW: Final[dict[str, tuple[Callable[[Path], Path], Callable[[Path], None]]]]
     "rosbag2": (EVERY_FORMAT["rosbag2"], _unknown_topic),
     "images": (EVERY_FORMAT["images"], _garbled_picture),
     "kitti-odometry": (EVERY_FORMAT["kitti-odometry"], _cut_png),
+    "openpilot": (EVERY_FORMAT["openpilot"], _pointer_out_of_its_message),
     "phone-drive": (EVERY_FORMAT["phone-drive"], _speed_without_a_number),
     "nuscenes": (EVERY_FORMAT["nuscenes"], _cut_png),
     "pandaset": (EVERY_FORMAT["pandaset"], _cut_jpeg),

@@ -43,6 +43,7 @@ DEMUXERS: Final = {
     ".mov": "mov",
     ".avi": "avi",
     ".mkv": "matroska",
+    ".ts": "mpegts",
     ".hevc": "hevc",
     ".h264": "h264",
 }
