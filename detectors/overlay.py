@@ -43,16 +43,13 @@ class Drawer:
     _every: int = field(default=1)
     _written: list[Path] = field(default_factory=list)
 
-    def __call__(
-        self, t_ns: int, picture: Encoded, found: Sequence[Found], counts: Mapping[str, int]
-    ) -> None:
+    def __call__(self, t_ns: int, picture: Encoded, found: Sequence[Found]) -> None:
         """Draw and write one frame if its turn has come.
 
         Args:
             t_ns: Log time of the frame.
             picture: Encoded; decoded only if it is to be written.
             found: Result of each detector.
-            counts: Number of objects of each cue.
 
         Raises:
             OutputError: A picture cannot be written.
@@ -67,7 +64,7 @@ class Drawer:
         import cv2
 
         pixels, _ = decode(picture)
-        _, encoded = cv2.imencode(".jpg", draw_detections(pixels, found, counts))
+        _, encoded = cv2.imencode(".jpg", _drawn(pixels, found, 1.0))
         path = self.folder / f"{t_ns}.jpg"
         write_bytes(path, encoded.tobytes())
         self._written.append(path)

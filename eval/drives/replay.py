@@ -167,9 +167,10 @@ def detect_drive(
 ) -> Run:
     """Run detectors on the camera images of a log.
 
-    Detections, road fractions and cues are written to a run folder. A detector is a built-in name,
-    a section [detectors.NAME] of the vehicle file, a module:factory, or a model card (.toml).
-    Results are cached by the content of each picture, so a second run is quick.
+    Detections and road are written to a run folder; crosscue estimate finds cues in them. A
+    detector is a built-in name, a section [detectors.NAME] of the vehicle file, a module:factory,
+    or a model card (.toml). Results are cached by the content of each picture, so a second run is
+    quick.
 
     Examples:
         crosscue detect drive.mcap --vehicle car.toml --detectors yolox.toml,signs -o runs/drive

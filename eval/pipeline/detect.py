@@ -1,10 +1,13 @@
-"""The detect stage: from a drive's camera to detections, road and cues in a run folder."""
+"""The detect stage: from a drive's camera to detections and road in a run folder.
+
+It is the only stage that opens pictures, and it stores what they show. Cues come from what it
+stores, in ``estimate``, so a rule or its settings can change without a picture.
+"""
 
 from __future__ import annotations
 
-import difflib
 import time
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crosscue.detectors.base import (
-    MIN_SCORE,
     Detections,
     DetectorChoice,
     Found,
@@ -23,14 +25,7 @@ from crosscue.detectors.base import (
     min_scores_of,
     reportable,
 )
-from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import (
-    DetectorRole,
-    FrameCues,
-    all_labels,
-    detector_role,
-    seen,
-)
+from crosscue.detectors.cues.observed import DetectorRole, detector_role
 from crosscue.detectors.cues.road import road_fractions
 from crosscue.detectors.cues.same_object import KEPT, label_meanings, same_objects
 from crosscue.detectors.overlay import Drawer
@@ -39,6 +34,7 @@ from crosscue.detectors.registry import is_plugin, knows_simulated_only, make
 from crosscue.detectors.result_cache import ResultCache
 from crosscue.detectors.runner import FrameCounts, FrameResult, Named, Runner
 from crosscue.eval.pipeline.outcome import DetectOutcome
+from crosscue.eval.pipeline.scene.looked_for import uncounted
 from crosscue.eval.runs.account import Account, account, detecting_of, reading_of
 from crosscue.eval.runs.folder import (
     RunFolder,
@@ -160,7 +156,7 @@ def detect_into(
     choices = detecting.choices
     camera = only_camera(logs, vehicle)
     named = [Named(choice.name, make(choice)) for choice in choices]
-    uncounted = _uncounted(named, choices, vehicle)
+    _refuse_uncounted(named, choices, vehicle)
     reading = _Reading(logs, camera, vehicle, selection, timeline)
     with ResultCache(detecting.cache) as results:
         runner = Runner(
@@ -179,11 +175,9 @@ def detect_into(
             vehicle,
             named,
             Drawer(run.file("pictures"), detecting.draw),
-            CuePass(vehicle),
             [choice.kind == "signs" for choice in choices],
             reading.timeline,
             reading.clock,
-            notices=uncounted,
             visual=VisualPass(vehicle)
             if uses_pictures(logs, vehicle, finds_road=_finds_road(named))
             else None,
@@ -205,7 +199,6 @@ def detect_into(
         reading.ledger,
         runner.counts,
         tables.objects,
-        tables.cue_frames,
         manifest.notices,
         seconds,
         made,
@@ -308,12 +301,12 @@ def _manifest(
     made: Account,
 ) -> DetectManifest:
     """Return the manifest of the detect stage."""
-    extractor, vehicle = reading.extractor, reading.vehicle
+    extractor = reading.extractor
     return DetectManifest(
         versions=versions_and_commit(),
         logs=log_rows(reading.logs, tables.run),
         selection=selection_record(reading.selection),
-        settings=vehicle,
+        settings=reading.vehicle,
         camera=reading.topic.name,
         camera_log=reading.number,
         time=time_segments(reading.timeline),
@@ -323,14 +316,10 @@ def _manifest(
         counts=DetectCounts(
             frames=counts.frames,
             objects=tables.objects,
-            cues=tables.cue_frames,
         ),
         notices=(
             *gaps_text(reading.timeline.segments),
             *_simulated_only(choices, reading.logs),
-            *_without_thresholds(tables.detectors, vehicle),
-            *_without_masks(tables.boxes_only, vehicle),
-            *tables.notices,
             *tables.size_notices(),
         ),
     )
@@ -369,6 +358,7 @@ def _detector_rows(
             settings=dict(choice.settings),
             min_scores=min_scores_of(one.detector),
             calibrated=calibrated_labels(one.detector),
+            is_calibrated=is_calibrated(one.detector),
             with_mask=tuple(sorted(tables.masked.get(one.name, ()))),
             boxes_only=tuple(sorted(tables.boxes_only.get(one.name, ()))),
         )
@@ -389,108 +379,45 @@ def _simulated_only(choices: Sequence[DetectorChoice], logs: Sequence[Log]) -> l
     ]
 
 
-def _uncounted(
+def _refuse_uncounted(
     named: Sequence[Named], choices: Sequence[DetectorChoice], vehicle: Vehicle
-) -> list[str]:
-    """Return notices about plug-ins whose labels no cue counts; a network is refused.
+) -> None:
+    """Refuse a network whose labels no cue counts: its card is likely wrong, or lacks ``[labels]``.
 
-    A network's card is then likely wrong, or lacks ``[labels]``. A plug-in states its labels
-    itself, and its cue is often written after it.
+    A plug-in states its labels itself, and its cue is often written after it.
 
     Raises:
         VehicleError: No cue counts any label of a network.
     """
-    if vehicle.counts_any_label:
-        return []
-    counted = {label for labels in vehicle.cue_labels().values() for label in labels}
-    notices = []
     for one, choice in zip(named, choices, strict=True):
         labels = reportable(one.detector)
-        if not labels or not counted.isdisjoint(labels):
-            continue
-        shown = f"({', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''})"
-        near = difflib.get_close_matches(labels[0].replace("_", " "), counted, n=1, cutoff=0.75)
-        shown += f"; did you mean {near[0]!r}?" if near else ""
-        own = f'[cues.own.NAME] labels = ["{labels[0]}"]'
-        if not is_plugin(choice):
+        why = None if is_plugin(choice) else uncounted(labels, vehicle)
+        if labels and why is not None:
+            shown, own = why
             raise VehicleError(
                 f"{one.name}: no cue counts any of its {len(labels)} labels {shown}; state what "
                 "its classes mean under [labels] in its card, or count them in the vehicle file: "
                 f"{own}"
             )
-        notices.append(
-            f"{one.name}: no cue counts its labels {shown}: detections.parquet has its boxes, and "
-            f"the belief does not use them; to count them, state in the vehicle file: {own}"
-        )
-    return notices
-
-
-def _without_thresholds(named: Sequence[Named], vehicle: Vehicle) -> list[str]:
-    """Return notices about labels without a threshold, fitted or set in the vehicle file."""
-    cues, cars = vehicle.cues, vehicle.cars
-    by_score = [(cars.labels, cars.score)]
-    if cues.kind != "tracks":
-        by_score.append((cues.stop_sign_labels, cues.stop_sign_score))
-        by_score.append((cues.traffic_light_labels, cues.traffic_light_score))
-    open_labels = {label for labels, score in by_score if score is None for label in labels}
-    notices = []
-    for one in named:
-        missing = open_labels.intersection(reportable(one.detector) or ())
-        missing -= min_scores_of(one.detector).keys()
-        if missing:
-            notices.append(
-                f"{one.name}: no threshold fitted for {', '.join(sorted(missing))}: they count "
-                f"above {MIN_SCORE:.2f}; crosscue fit detector fits one to labelled images"
-            )
-    return notices
-
-
-def _without_masks(boxes_only: Mapping[str, Set[str]], vehicle: Vehicle) -> list[str]:
-    """Return notices about rules that used boxes where the dissertation uses masks, by detector.
-
-    Args:
-        boxes_only: Labels that a detector reported only without masks, by detector.
-        vehicle: Settings with the labels of the cues.
-    """
-    cues, cars = vehicle.cues, vehicle.cars
-    heights = {*cues.stop_sign_labels, *cues.traffic_light_labels}
-    affected = {
-        name: [
-            *(["heights of signs and lights are those of boxes"] if labels & heights else []),
-            *(
-                [
-                    "cross traffic is judged by boxes (eq. 15 uses masks), and its cars do not "
-                    "count as parked, since only a mask shows where one faces (eq. 16)"
-                ]
-                if labels & {*cars.labels}
-                else []
-            ),
-        ]
-        for name, labels in boxes_only.items()
-    }
-    return [f"{name}: no masks: {'; '.join(rules)}" for name, rules in affected.items() if rules]
 
 
 @dataclass(slots=True)
 class _Tables:
-    """The three tables of a run, written frame by frame."""
+    """The tables of the stage, written frame by frame."""
 
     run: RunFolder
     camera: str
     vehicle: Vehicle
     detectors: Sequence[Named]
     drawer: Drawer
-    cues: CuePass
     is_for_signs: Sequence[bool]
     timeline: Timeline
     clock: LogClock
-    notices: list[str]
     visual: VisualPass | None = None
     objects: dict[str, int] = field(default_factory=dict)
     masked: dict[str, set[str]] = field(default_factory=dict)
     """Labels of objects reported with a mask, by detector."""
     _boxed: dict[str, set[str]] = field(default_factory=dict)
-    cue_frames: dict[str, int] = field(default_factory=dict)
     _sinks: dict[str, LabelledSink] = field(default_factory=dict)
     _open: ExitStack = field(default_factory=ExitStack)
     roles: dict[str, DetectorRole] = field(default_factory=dict)
@@ -498,9 +425,6 @@ class _Tables:
     _sizes: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
     _frame: int = -1
     _meanings: dict[str, str] = field(default_factory=dict)
-    _min_scores: list[dict[str, float]] = field(default_factory=list)
-    _labels: frozenset[str] | None = None
-    """Labels that the detectors of boxes can report; known from the first frame."""
 
     @property
     def boxes_only(self) -> dict[str, set[str]]:
@@ -542,15 +466,7 @@ class _Tables:
         if self._frame == 0:
             self.vehicle.camera.check_size(result.size_px)
             self._meanings = label_meanings(self.vehicle)
-            self._min_scores = [min_scores_of(one.detector) for one in self.detectors]
-            self._labels = all_labels(
-                reportable(named.detector)
-                for named, found in zip(self.detectors, result.found, strict=True)
-                if isinstance(found, Detections)
-            )
-        once, again = self._without_duplicates(result.found)
-        sorted_by_role = seen(result.t_ns, once, self.is_for_signs, self._labels)
-        cues = self.cues(sorted_by_role)
+        again = self._duplicates(result.found)
         self._held["frames"].append(
             {
                 "frame": self._frame,
@@ -566,12 +482,9 @@ class _Tables:
             self.roles[named.name] = detector_role(found, for_signs)
             if isinstance(found, Detections):
                 self._held["detections"] += self._detection_rows(named.name, found, again[number])
-        road = sorted_by_role.road
-        if isinstance(road, RoadMask):
-            fractions = cues.road
-            if fractions is None or self.vehicle.regions.kind != "picture":
-                # The mask is stored, because the ground that it shows is examined later.
-                fractions = road_fractions(road, self.vehicle.regions)
+        road = next((one for one in result.found if isinstance(one, RoadMask)), None)
+        if road is not None:
+            fractions = road_fractions(road, self.vehicle.regions)
             self._held["road"].append(
                 {
                     "frame": self._frame,
@@ -585,43 +498,26 @@ class _Tables:
                     "mask_height_px": road.mask_size_px[1],
                 }
             )
-        self._add_cues(result.t_ns, cues)
         if self.visual is not None and (moved := self.visual(result)) is not None:
             self._held[VISUAL].append(moved)
-        self.drawer(result.t_ns, result.picture, result.found, cues.counts)
+        self.drawer(result.t_ns, result.picture, result.found)
         for name, rows in self._held.items():
             if len(rows) > 8192:
                 self._write(name)
 
-    def _add_cues(self, t_ns: int, cues: FrameCues) -> None:
-        for cue, count in cues.counts.items():
-            row: dict[str, object] = {
-                "t_ns": t_ns,
-                "approach": None,
-                "cue": cue,
-                "count": count,
-            }
-            self._held["cues"].append(row)
-            self.cue_frames[cue] = self.cue_frames.get(cue, 0) + (count > 0)
+    def _duplicates(self, found: Sequence[Found]) -> dict[int, Int64s]:
+        """Return by detector who keeps each of its detections.
 
-    def _without_duplicates(self, found: Sequence[Found]) -> tuple[list[Found], dict[int, Int64s]]:
-        """Return results without duplicates, and by detector who keeps each of its detections.
-
-        The latter is the index of the other detector, or ``KEPT`` for a detector's own.
+        That is the index of the other detector, or ``KEPT`` for a detector's own.
         """
         numbers = [k for k, one in enumerate(found) if isinstance(one, Detections)]
         boxes = [one for one in found if isinstance(one, Detections)]
         calibrated = [is_calibrated(self.detectors[k].detector) for k in numbers]
         same = same_objects(boxes, self._meanings, calibrated)
-        again = dict(zip(numbers, same, strict=True))
-        once = [
-            one.taken(again[k] == KEPT).with_min_scores(self._min_scores[k])
-            if isinstance(one, Detections)
-            else one
-            for k, one in enumerate(found)
-        ]
-        names = {k: np.where(one == KEPT, KEPT, np.take(numbers, one)) for k, one in again.items()}
-        return once, names
+        return {
+            k: np.where(one == KEPT, KEPT, np.take(numbers, one))
+            for k, one in zip(numbers, same, strict=True)
+        }
 
     def _detection_rows(
         self, name: str, found: Detections, again: Int64s
@@ -724,14 +620,6 @@ def detect_schemas() -> dict[str, pa.Schema]:
                 ("mask", pa.binary()),
                 ("mask_width_px", pa.int32()),
                 ("mask_height_px", pa.int32()),
-            ]
-        ),
-        "cues": pa.schema(
-            [
-                ("t_ns", pa.int64()),
-                ("approach", pa.int64()),
-                ("cue", text),
-                ("count", pa.int64()),
             ]
         ),
     }

@@ -13,6 +13,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
+from crosscue.eval.pipeline.scene.looked_for import detector_notices
 from crosscue.eval.pipeline.scene.outcome import SceneOutcome
 from crosscue.eval.pipeline.scene.stage import (
     estimate_scene,
@@ -206,7 +207,7 @@ def _notices(reading: _Reading, stage: PoseStage, silent: Mapping[Signal, str]) 
         *silent.values(),
         *_no_mobileye(reading.found, reading.planned),
         *_no_scene(reading.found, reading),
-        *_of_detecting(reading.found),
+        *_of_detecting(reading.found, reading.vehicle),
         *stage.notices,
         *stage.doubts(),
         *chain.from_iterable(
@@ -262,11 +263,12 @@ def _landmarks_used(landmarks: LandmarkDatabase, run: RunFolder) -> LandmarksUse
     )
 
 
-def _of_detecting(found: DetectManifest | None) -> list[str]:
-    """Return the notices of the detect stage except gaps, which are reported for the run."""
+def _of_detecting(found: DetectManifest | None, vehicle: Vehicle) -> list[str]:
+    """Return the notices of the detect stage except gaps, and those on what it stored."""
     if found is None:
         return []
-    return [one for one in found.notices if one not in found.time.notices]
+    notices = [one for one in found.notices if one not in found.time.notices]
+    return list(dict.fromkeys([*notices, *detector_notices(found, vehicle)]))
 
 
 def _driven_s(timeline: Timeline, tally: PoseTally) -> float:

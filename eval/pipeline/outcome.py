@@ -29,7 +29,6 @@ class DetectOutcome(Result):
         ledger: Ledger of the camera's log.
         counts: Number of frames, and for each detector of frames run and read from the cache.
         objects: Number of detections by detector and label.
-        cues: Number of frames in which each cue was positive.
         notices: Notices for the user.
         seconds: Wall time.
         account: Account of every row and frame.
@@ -40,7 +39,6 @@ class DetectOutcome(Result):
     ledger: Ledger = field(metadata=HIDDEN)
     counts: FrameCounts = field(metadata=HIDDEN)
     objects: dict[str, int]
-    cues: dict[str, int]
     notices: tuple[str, ...]
     seconds: float
     account: Account
@@ -59,7 +57,7 @@ class DetectOutcome(Result):
         return 0 if self.account.is_whole and not self.has_gaps else 3
 
     def lines(self) -> Iterator[str]:
-        """Yield counts of frames, objects and cues, and the account."""
+        """Yield counts of frames and objects, and the account."""
         counts, ledger = self.counts, self.ledger
         yield f"run      {self.run.path}"
         yield f"log      {ledger.log}"
@@ -67,7 +65,6 @@ class DetectOutcome(Result):
         for name, ran in counts.ran.items():
             yield f"  {name}: ran on {ran:,}, {counts.from_cache[name]:,} from the cache"
         yield from (f"found    {what}: {count:,}" for what, count in sorted(self.objects.items()))
-        yield from (f"cue      {cue}: in {count:,} frames" for cue, count in self.cues.items())
         yield from (*account_lines(self.account), *details_of([ledger]))
         yield from (f"note     {sentence}" for sentence in (*ledger.notices, *self.notices))
 

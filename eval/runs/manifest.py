@@ -133,6 +133,8 @@ class DetectorRow(Record):
     """Score above which a detection is a cue, by label, where the detector states it."""
     calibrated: tuple[str, ...] = ()
     """Labels whose scores a fitted calibration has turned into probabilities."""
+    is_calibrated: bool = False
+    """True if the detector declares all its scores to be probabilities."""
     with_mask: tuple[str, ...] = ()
     """Labels of detections with a mask."""
     boxes_only: tuple[str, ...] = ()
@@ -145,13 +147,13 @@ class DetectorRow(Record):
 
 
 class DetectCounts(Record):
-    """Numbers of frames, detections and cues."""
+    """Numbers of frames and detections."""
 
     frames: int
     objects: dict[str, int]
     """Number of detections by detector and label."""
-    cues: dict[str, int]
-    """Number of frames in which each cue was positive."""
+    cues: dict[str, int] = Field(default_factory=dict, exclude=True)
+    """Counts of earlier runs, whose detect stage counted cues; no longer written."""
 
 
 class EstimateCounts(Record):

@@ -102,7 +102,7 @@ def test_invalid_network_is_refused_in_one_line(
 def test_python_detector_with_uncounted_label_runs_with_notice(log: Path, tmp_path: Path) -> None:
     detectors, vehicle = [f"{__name__}:Everything.build"], crosscue.Vehicle(version=1)
 
-    run = crosscue.detect_drive(log, tmp_path / "out", vehicle, detectors)
+    run = crosscue.replay_drive(log, tmp_path / "out", vehicle, detectors)
 
     assert set(run.detections["label"].to_pylist()) == {"whatever"}
     assert "no cue counts its labels (whatever)" in str(run)

@@ -25,7 +25,7 @@ def test_pictures_are_evenly_spaced_over_the_drive(frames: int, max_count: int) 
         drawer = Drawer(Path(name) / "pictures", max_count)
         for t_ns in range(frames):
             picture = Encoded("jpeg", memoryview(coded.tobytes()))
-            drawer(t_ns, picture, (), {})
+            drawer(t_ns, picture, ())
         drawn = sorted(int(path.stem) for path in Path(name).glob("pictures/*"))
 
     assert len(drawn) <= max_count

@@ -68,7 +68,7 @@ def detected(camera: str, detectors: dict[str, str], **changes: Any) -> DetectMa
             )
             for name, role in detectors.items()
         ),
-        "counts": DetectCounts(frames=0, objects={}, cues={}),
+        "counts": DetectCounts(frames=0, objects={}),
     }
     return DetectManifest(**{**content, **changes})
 

@@ -1,14 +1,20 @@
-"""Cues that a run did not evaluate, and why; they differ from cues that were never positive."""
+"""What a run's detectors cannot show its cues, and cues that were not evaluated, with the reasons.
+
+Such a cue differs from one that was never positive.
+"""
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Collection, Mapping, Sequence, Set
 from types import MappingProxyType
 from typing import Final
 
+from crosscue.detectors.base import MIN_SCORE
 from crosscue.detectors.cues.observed import DetectorRole, all_labels
-from crosscue.eval.runs.manifest import DetectorRow
+from crosscue.eval.runs.manifest import DetectManifest, DetectorRow
 from crosscue.replay.vehicle.cue_table import CUES
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 NO_LABEL: Final = "no detector can report their labels"
 NO_OBJECTS: Final = "no detector of objects"
@@ -76,3 +82,79 @@ def not_looked_for(
         return NEVER if has_any else NO_OBJECTS
 
     return {cue: why(cue) for cue in cue_labels if cue not in looked}
+
+
+def detector_notices(detected: DetectManifest, vehicle: Vehicle) -> list[str]:
+    """Return notices about detectors whose results the cues of ``vehicle`` cannot fully use."""
+    return [
+        *(text for one in detected.detectors for text in _without_threshold(one, vehicle)),
+        *(text for one in detected.detectors for text in _without_masks(one, vehicle)),
+        *(text for one in detected.detectors for text in _without_cue(one, vehicle)),
+        *_not_examined(detected, vehicle),
+    ]
+
+
+def uncounted(labels: Sequence[str] | None, vehicle: Vehicle) -> tuple[str, str] | None:
+    """Return the labels, and the setting that counts one, if no cue counts any; else None."""
+    counted = {label for wanted in vehicle.cue_labels().values() for label in wanted}
+    if vehicle.counts_any_label or not labels or not counted.isdisjoint(labels):
+        return None
+    shown = f"({', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''})"
+    near = difflib.get_close_matches(labels[0].replace("_", " "), counted, n=1, cutoff=0.75)
+    shown += f"; did you mean {near[0]!r}?" if near else ""
+    return shown, f'[cues.own.NAME] labels = ["{labels[0]}"]'
+
+
+def _without_cue(one: DetectorRow, vehicle: Vehicle) -> list[str]:
+    why = uncounted(one.labels, vehicle)
+    if why is None:
+        return []
+    return [
+        f"{one.name}: no cue counts its labels {why[0]}: detections.parquet has its boxes, and "
+        f"the belief does not use them; to count them, state in the vehicle file: {why[1]}"
+    ]
+
+
+def _without_threshold(one: DetectorRow, vehicle: Vehicle) -> list[str]:
+    """Return a notice about labels without a threshold, fitted or set in the vehicle file."""
+    cues, cars = vehicle.cues, vehicle.cars
+    by_score = [(cars.labels, cars.score)]
+    if cues.kind != "tracks":
+        by_score.append((cues.stop_sign_labels, cues.stop_sign_score))
+        by_score.append((cues.traffic_light_labels, cues.traffic_light_score))
+    missing = {label for labels, score in by_score if score is None for label in labels}
+    missing &= {*(one.labels or ())} - one.min_scores.keys()
+    if not missing:
+        return []
+    return [
+        f"{one.name}: no threshold fitted for {', '.join(sorted(missing))}: they count "
+        f"above {MIN_SCORE:.2f}; crosscue fit detector fits one to labelled images"
+    ]
+
+
+def _without_masks(one: DetectorRow, vehicle: Vehicle) -> list[str]:
+    """Return a notice about rules that use boxes where the dissertation uses masks."""
+    cues, labels = vehicle.cues, {*one.boxes_only}
+    rules = []
+    if labels & {*cues.stop_sign_labels, *cues.traffic_light_labels}:
+        rules.append("heights of signs and lights are those of boxes")
+    if labels & {*vehicle.cars.labels}:
+        rules.append(
+            "cross traffic is judged by boxes (eq. 15 uses masks), and its cars do not "
+            "count as parked, since only a mask shows where one faces (eq. 16)"
+        )
+    return [f"{one.name}: no masks: {'; '.join(rules)}"] if rules else []
+
+
+def _not_examined(detected: DetectManifest, vehicle: Vehicle) -> list[str]:
+    """Return a notice about lights and signs whose pixels ``detect`` did not examine."""
+    now, then = vehicle.cues, detected.settings.cues
+    labels = {*now.traffic_light_labels} - {*then.traffic_light_labels}
+    labels |= {*now.stop_sign_labels} - {*then.stop_sign_labels}
+    labels &= {label for one in detected.detectors for label in one.labels or labels}
+    if not labels:
+        return []
+    return [
+        f"{', '.join(sorted(labels))}: not examined as lights or stop signs when the pictures were "
+        "read, so lit lenses and second looks are missing; crosscue replay examines them"
+    ]

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from crosscue.detectors.base import is_repeated
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections, Place
+from crosscue.detectors.cues.same_object import label_meanings
 from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.eval.pipeline.progress import report_time
@@ -94,7 +95,14 @@ def estimate_scene(
     restarts = Restarts(vehicle, timeline)
     regions = vehicle.regions
     fresh_regions = regions.kind != "picture" or detected.settings.regions != regions
-    for frame in stored_frames(run, detected.detectors, with_road_masks=fresh_regions):
+    meanings = label_meanings(vehicle)
+    frames = stored_frames(
+        run,
+        detected.detectors,
+        with_road_masks=fresh_regions,
+        meanings=None if meanings == label_meanings(detected.settings) else meanings,
+    )
+    for frame in frames:
         vehicle.camera.check_size(frame.size_px)
         fresh_ns = restarts.before(frame.seen.t_ns)
         if fresh_ns is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -17,6 +17,7 @@ from crosscue.detectors.cues.observed import (
     RoadFractions,
     all_labels,
 )
+from crosscue.detectors.cues.same_object import KEPT, same_objects
 from crosscue.eval.runs.manifest import DetectorRow
 
 from .parquet import TableFolder
@@ -93,12 +94,17 @@ FOUND: Final = (
     "same_as",
     "look",
 )
+SAME_AS: Final = FOUND.index("same_as")
 SHARES: Final = ("fraction_left", "fraction_straight", "fraction_right")
 MASK: Final = ("mask", "mask_width_px", "mask_height_px")
 
 
 def stored_frames(
-    run: TableFolder, detectors: Sequence[DetectorRow], *, with_road_masks: bool = False
+    run: TableFolder,
+    detectors: Sequence[DetectorRow],
+    *,
+    with_road_masks: bool = False,
+    meanings: Mapping[str, str] | None = None,
 ) -> Iterator[StoredFrame]:
     """Yield all frames of a run in the order of detection; memory holds one batch of rows.
 
@@ -108,6 +114,8 @@ def stored_frames(
         run: A run with the tables of the detect stage.
         detectors: The manifest's list of detectors, with name and role.
         with_road_masks: Return road masks instead of road fractions of the regions.
+        meanings: Meanings of labels (``label_meanings``) by which objects are the same; by default
+            those with which they were detected.
 
     Raises:
         RunError: A table is missing or damaged.
@@ -129,8 +137,11 @@ def stored_frames(
             size = (width, height)
             by_name: dict[str, list[tuple[Any, ...]]] = {}
             again: dict[str, list[tuple[Any, ...]]] = {}
-            for row in found.of(frame):
-                (by_name if row[10] is None else again).setdefault(row[0], []).append(row)
+            rows = found.of(frame)
+            if meanings is not None:
+                rows = _compared(rows, detectors, meanings, t_ns, size)
+            for row in rows:
+                (by_name if row[SAME_AS] is None else again).setdefault(row[0], []).append(row)
             fractions = road.of(frame) if has_road else []
             some, others = (
                 tuple(
@@ -154,6 +165,27 @@ def stored_frames(
                     for name in objects
                 ),
             )
+
+
+def _compared(
+    rows: list[tuple[Any, ...]],
+    detectors: Sequence[DetectorRow],
+    meanings: Mapping[str, str],
+    t_ns: int,
+    size: tuple[int, int],
+) -> list[tuple[Any, ...]]:
+    """Return the rows of a frame with the detector that found the same object with a better score.
+
+    Rows keep their order, which is by detector.
+    """
+    parts = [[row for row in rows if row[0] == one.name] for one in detectors]
+    found = [_detections(t_ns, size, part) for part in parts]
+    same = same_objects(found, meanings, [one.is_calibrated for one in detectors])
+    return [
+        (*row[:SAME_AS], None if k == KEPT else detectors[k].name, *row[SAME_AS + 1 :])
+        for part, again in zip(parts, same, strict=True)
+        for row, k in zip(part, again.tolist(), strict=True)
+    ]
 
 
 def _detections(t_ns: int, size: tuple[int, int], rows: list[tuple[Any, ...]]) -> Detections:

@@ -1,4 +1,4 @@
-"""``crosscue detect``: from a camera log to a run folder with detections and cues."""
+"""``crosscue detect``: from a camera log to a run folder with detections."""
 
 import json
 import shutil
@@ -104,7 +104,7 @@ def test_notice_names_rules_that_use_boxes_instead_of_masks(
     vehicle.write_text(f"version = 1\n{counted}\n")
 
     args = ["--vehicle", str(vehicle), "--detectors", BRIGHT, "--no-cache", "-q"]
-    assert run(["detect", str(log), "-o", str(out), *args]) == 0
+    assert run(["replay", str(log), "-o", str(out), *args]) == 0
 
     notices = [one for one in open_run(out).drive_manifest().notices if "no masks" in one]
     assert [message in one for one in notices if message] == [True] * (message is not None)
@@ -232,7 +232,7 @@ def test_real_segmentation_network_finds_road_ahead_but_not_in_sky(
     (log / "timestamps.txt").write_text("rate_hz: 15\n")
     args = ["--detectors", str(card), "--vehicle", str(vehicle), "--no-cache", "-q"]
 
-    assert run(["detect", str(log), "-o", str(tmp_path / "run"), *args]) == 0
+    assert run(["replay", str(log), "-o", str(tmp_path / "run"), *args]) == 0
 
     fractions = open_run(tmp_path / "run").table("road").to_pylist()[0]
     assert fractions["fraction_straight"] > 0.8
