@@ -39,7 +39,7 @@ def claims(run: RunFolder, vehicle: Vehicle) -> Iterator[tuple[int, str, float, 
     before: CarShapes | None = None
     rules = vehicle.cars
     for frame in stored_frames(run, found.detectors):
-        now = car_shapes(frame.seen.objects, rules)
+        now = car_shapes(frame.objects, rules)
         if before is not None:
             pairs = pair_cars(before, now, rules)
             for i, (x, y) in enumerate(pairs.center_px.tolist()):

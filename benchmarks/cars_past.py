@@ -133,8 +133,8 @@ def main() -> None:
     missed: dict[str, list[Missed]] = {"oncoming": [], "outgoing": []}
     found: Counter[str] = Counter()
     for frame, stored in enumerate(stored_frames(run, manifest.detected.detectors)):
-        _, motion = ego(stored.seen.t_ns)
-        tracks(stored.seen.objects, motion)
+        _, motion = ego(stored.t_ns)
+        tracks(stored.objects, motion)
         cars = tracks.longer()
         if place is not None:
             way_m = motion.way_m or 0.0
@@ -149,7 +149,7 @@ def main() -> None:
             is_here = is_beyond & boxes.along(oncoming=name == "oncoming") & (boxes.frame == frame)
             whys = [
                 Missed(
-                    why_missed(row, boxes, rows, cars, stored.seen.objects, vehicle, place),
+                    why_missed(row, boxes, rows, cars, stored.objects, vehicle, place),
                     float(boxes.ahead_m[row]),
                     float(boxes.visible[row]),
                 )
@@ -157,7 +157,7 @@ def main() -> None:
             ]
             if whys:
                 some.append(min(whys, key=lambda one: (FOUND, *REASONS).index(one.reason)))
-        place = at.get(stored.seen.t_ns)
+        place = at.get(stored.t_ns)
     for name, some in missed.items():
         print(f"{name}: {found[name]} frames found, {len(some)} missed")
         for reason in REASONS:

@@ -99,8 +99,8 @@ def frame_by_frame(run: RunFolder, path: Path) -> None:
     detected = run.drive_manifest().detected
     assert detected is not None
     for frame in stored_frames(run, detected.detectors):
-        recording.set_time("drive", timestamp=np.datetime64(frame.seen.t_ns, "ns"))
-        for found in frame.seen.objects:
+        recording.set_time("drive", timestamp=np.datetime64(frame.t_ns, "ns"))
+        for found in frame.objects:
             classes = np.zeros(found.size_px[::-1], np.uint8)
             for label, mask in zip(found.labels, found.masks, strict=True):
                 classes[rle.decode_mask(mask, found.size_px)] = CLASSES[label]

@@ -122,6 +122,7 @@ def check_cue(cue: CueSpec) -> None:
     Raises:
         AssertionError: The contract is broken; the message states where.
     """
+    from crosscue.detectors.cues.candidates import Count
     from crosscue.detectors.cues.rules import rule_of
     from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -137,13 +138,14 @@ def check_cue(cue: CueSpec) -> None:
     vehicle = Vehicle(version=1)
     settings = vehicle.past if cue.observed_by == "mobileye" else vehicle
     for what, observed in _observations(cue.observed_by).items():
-        count = rule(observed, settings, cue)
+        found = rule(observed, settings, cue)
+        count = found.number if isinstance(found, Count) else found
         _expect(
             count is None or (isinstance(count, int) and count >= 0),
             f"{cue.name}: {what}: got {count!r}, expected a count or None",
         )
         _expect(
-            rule(observed, settings, cue) == count,
+            rule(observed, settings, cue) == found,
             f"{cue.name}: {what}: called again, its result differs",
         )
         _expect(not (what == "nothing" and count), f"{cue.name}: counts {count} where nothing is")

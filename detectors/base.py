@@ -78,6 +78,8 @@ class Detections:
             detector; None where the detector sets no thresholds.
         looks: N results of the second look at stop signs (``detectors.signs.second_look``), empty
             for other objects; an empty tuple where there was none.
+        spans_px: Shape (N,): number of rows that each mask spans, or the height of a box without
+            mask; None where masks were not measured.
         decisions: N decisions by tracks over frames: ``ACCEPTED``, or why the detection is no cue;
             empty for objects that are decided by their score. An empty tuple without tracks.
     """
@@ -92,6 +94,7 @@ class Detections:
     min_scores: NDArray[np.float64] | None = None
     looks: tuple[str, ...] = ()
     decisions: tuple[str, ...] = ()
+    spans_px: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         """Reject columns of unequal length and values that are not finite.
@@ -109,8 +112,9 @@ class Detections:
         for name in ("lenses", "looks", "decisions"):
             if len(getattr(self, name)) not in (0, n):
                 raise ValueError(f"{name}: expected {n} or none, got {len(getattr(self, name))}")
-        if self.min_scores is not None and self.min_scores.shape != (n,):
-            raise ValueError(f"min_scores: expected ({n},), got {self.min_scores.shape}")
+        for name, column in (("min_scores", self.min_scores), ("spans_px", self.spans_px)):
+            if column is not None and column.shape != (n,):
+                raise ValueError(f"{name}: expected ({n},), got {column.shape}")
         if not (np.isfinite(self.boxes_px).all() and np.isfinite(self.scores).all()):
             raise ValueError("boxes_px, scores: expected finite numbers")
 
@@ -119,8 +123,19 @@ class Detections:
 
     @property
     def heights_px(self) -> NDArray[np.float64]:
-        """Height of each box, shape (N,)."""
+        """Height of each object, shape (N,): of its mask if that was measured, else of its box."""
+        if self.spans_px is not None:
+            return self.spans_px
         return np.asarray(self.boxes_px[:, 3] - self.boxes_px[:, 1])
+
+    def measured(self) -> Self:
+        """The same detections with the heights of their masks."""
+        spans = self.boxes_px[:, 3] - self.boxes_px[:, 1]
+        for i, mask in enumerate(self.masks):
+            if mask:
+                rows = np.flatnonzero(self.mask(i).any(axis=1))
+                spans[i] = rows[-1] - rows[0] + 1 if len(rows) else 0.0
+        return replace(self, spans_px=spans)
 
     def mask(self, i: int) -> NDArray[np.bool_]:
         """Decode the mask of one detection, shape (height, width).
@@ -181,6 +196,7 @@ class Detections:
             None if self.min_scores is None else self.min_scores[keep],
             tuple(self.looks[i] for i in keep) if self.looks else (),
             tuple(self.decisions[i] for i in keep) if self.decisions else (),
+            None if self.spans_px is None else self.spans_px[keep],
         )
 
 

@@ -31,6 +31,27 @@ NOT_COUNTED: Final = "not counted by its rule"
 Unit = Literal["detections", "frames"]
 
 
+@dataclass(frozen=True, slots=True)
+class Count:
+    """What a rule returns: the count of its cue in one frame, and what became of each candidate.
+
+    Attributes:
+        number: The count; None where the cue is not known in this frame.
+        scores: Score of each candidate.
+        skipped: Number of candidates that are not in the count, by reason.
+        thresholds: Scores that a candidate had to exceed.
+        setting: Key of the threshold in the vehicle file; None without one.
+        unit: What the candidates are; None where the rule does not report them.
+    """
+
+    number: int | None
+    scores: Sequence[float] = ()
+    skipped: Mapping[str, int] = field(default_factory=dict)
+    thresholds: Sequence[float] = ()
+    setting: str | None = None
+    unit: Unit | None = "detections"
+
+
 @dataclass(slots=True)
 class Candidates:
     """Candidates of one cue or range over a run: ``seen`` = ``used`` + all ``skipped``.
@@ -54,21 +75,49 @@ class Candidates:
     skipped: dict[str, int] = field(default_factory=dict)
     max_score: float | None = None
 
-    def meet(self, thresholds: Sequence[float]) -> None:
-        """Lower the threshold to the lowest of ``thresholds``, if it is lower."""
-        met = [*thresholds, *(() if self.threshold is None else (self.threshold,))]
-        self.threshold = min(met, default=None)
-
-    def take(self, scores: Sequence[float], skipped: Mapping[str, int]) -> None:
-        """Count candidates with these scores, and the skipped ones among them by reason."""
-        self.seen += len(scores)
-        self.used += len(scores) - sum(skipped.values())
-        for reason, number in skipped.items():
+    def take(self, found: Count) -> None:
+        """Add the candidates of one frame."""
+        self.seen += len(found.scores)
+        self.used += len(found.scores) - sum(found.skipped.values())
+        for reason, number in found.skipped.items():
             if number:
                 self.skipped[reason] = self.skipped.get(reason, 0) + number
-        if scores:
-            best = max(scores)
-            self.max_score = best if self.max_score is None else max(self.max_score, best)
+        known = (self.max_score,) if self.max_score is not None else ()
+        self.max_score = max((*found.scores, *known), default=None)
+        known = (self.threshold,) if self.threshold is not None else ()
+        self.threshold = min((*found.thresholds, *known), default=None)
+
+
+def take(by_cue: dict[str, Candidates], cue: str, found: Count) -> None:
+    """Add the candidates of one frame to those of their cue, if the rule reports them."""
+    if found.unit is None:
+        return
+    by_cue.setdefault(cue, Candidates(found.unit, found.setting)).take(found)
+
+
+def count_by_label(
+    boxes: Sequence[Detections],
+    labels: Sequence[str],
+    number: int,
+    setting: str | None,
+    score: float | None,
+) -> Count:
+    """Return a count of detections with one of the labels, and why the others are not in it.
+
+    Args:
+        boxes: Detections of a frame.
+        labels: Labels of the candidates.
+        number: The count.
+        setting: Key of the threshold in the vehicle file; None if the rule has no threshold.
+        score: The threshold; None uses the detectors'.
+    """
+    scores = label_scores(boxes, labels)
+    if setting is None:
+        return Count(number, scores, {NOT_COUNTED: len(scores) - min(number, len(scores))})
+    low = unsure_of(boxes, labels, score)
+    high = len(scores) - low.total()
+    skipped = {**low, NOT_COUNTED: high - min(number, high)}
+    return Count(number, scores, skipped, thresholds_met(boxes, labels, score), setting)
 
 
 def label_scores(boxes: Sequence[Detections], labels: Sequence[str]) -> list[float]:

@@ -8,9 +8,9 @@ lower end of its mask.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,17 @@ from numpy.typing import NDArray
 from crosscue.detectors.base import Detections
 from crosscue.replay.vehicle.vehicle import Cars, CueSpec, Vehicle
 
+from .candidates import (
+    BELOW_SCORE,
+    CUT_OR_FAR,
+    ELSEWHERE,
+    NOT_FOUND_BEFORE,
+    NOT_FROM_THE_SIDE,
+    NOT_PAST,
+    OTHER_MOTION,
+    TOO_FEW_FRAMES,
+    Count,
+)
 from .observed import NONE, CarCounts, Sides, nose_of, of_side
 
 
@@ -43,6 +54,25 @@ class CarShapes:
         return len(self.area_px)
 
 
+class CarCandidates(NamedTuple):
+    """All cars among the detections of a frame.
+
+    Attributes:
+        scores: Score of each.
+        low: Number of those whose score is too low.
+        thresholds: Scores that they had to exceed.
+        shapes: Number of those that pass the rules of shape and score.
+    """
+
+    scores: Sequence[float] = ()
+    low: int = 0
+    thresholds: Sequence[float] = ()
+    shapes: int = 0
+
+
+NO_CARS: Final = CarCandidates()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
     """Cars that were found in two consecutive frames, as columns of length M.
@@ -53,6 +83,8 @@ class Pairs:
         nose: Shape (M,), int64: as in ``CarShapes``, in the later frame.
         width_px: Width of the picture.
         judged: Counts of cars, if they were tracked over more than these two frames.
+        cars: Candidates among the detections of the later frame.
+        is_first: True without an earlier frame, where no count is known.
     """
 
     step_px: NDArray[np.float64]
@@ -60,6 +92,8 @@ class Pairs:
     nose: NDArray[np.int64]
     width_px: int
     judged: CarCounts | None = None
+    cars: CarCandidates = NO_CARS
+    is_first: bool = False
 
 
 class Tracker(Protocol):
@@ -167,25 +201,65 @@ def parked_cars(pairs: Pairs, settings: Cars) -> Sides:
     return Sides(int(np.sum(is_still & (pairs.nose < 0))), int(np.sum(is_still & (pairs.nose > 0))))
 
 
-def count_crossing(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int:
+def count_crossing(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> Count:
     """Count cars that cross towards the side that the cue supports."""
-    sides = cross_traffic(pairs, vehicle.cars) if pairs.judged is None else pairs.judged.crossing
-    return of_side(sides, cue)
+    if pairs.judged is None:
+        return _of_pairs(pairs, of_side(cross_traffic(pairs, vehicle.cars), cue))
+    judged = pairs.judged
+    return _followed(pairs, of_side(judged.crossing, cue), of_side(judged.crossing_elsewhere, cue))
 
 
-def count_parked(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int:
+def count_parked(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> Count:
     """Count parked cars that face the side that the cue supports."""
-    sides = parked_cars(pairs, vehicle.cars) if pairs.judged is None else pairs.judged.parked
-    return of_side(sides, cue)
+    if pairs.judged is None:
+        return _of_pairs(pairs, of_side(parked_cars(pairs, vehicle.cars), cue))
+    judged = pairs.judged
+    return _followed(pairs, of_side(judged.parked, cue), of_side(judged.parked_elsewhere, cue))
 
 
-def count_oncoming(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int | None:
+def count_oncoming(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> Count | None:
     """Count oncoming cars past the intersection; None where unknown."""
     past = None if pairs.judged is None else pairs.judged.past
-    return None if past is None else past.oncoming
+    return None if past is None else _past(pairs, past.oncoming)
 
 
-def count_outgoing(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> int | None:
+def count_outgoing(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> Count | None:
     """Count outgoing cars past the intersection; None where unknown."""
     past = None if pairs.judged is None else pairs.judged.past
-    return None if past is None else past.outgoing
+    return None if past is None else _past(pairs, past.outgoing)
+
+
+def _of_pairs(pairs: Pairs, number: int) -> Count:
+    """Return a count of cars in two frames; a car is skipped for the first rule that it fails."""
+    cars, again = pairs.cars, len(pairs.nose)
+    skipped = {
+        BELOW_SCORE: cars.low,
+        NOT_FROM_THE_SIDE: len(cars.scores) - cars.low - cars.shapes,
+        NOT_FOUND_BEFORE: cars.shapes - again,
+        OTHER_MOTION: again - min(number, again),
+    }
+    return _count(cars, None if pairs.is_first else number, skipped)
+
+
+def _followed(pairs: Pairs, here: int, there: int) -> Count:
+    """Return a count of tracked cars at the intersection, of which others are elsewhere."""
+    cars, judged = pairs.cars, pairs.judged
+    assert judged is not None
+    skipped = {
+        BELOW_SCORE: cars.low,
+        CUT_OR_FAR: len(cars.scores) - cars.low - judged.seen,
+        TOO_FEW_FRAMES: judged.seen - judged.followed,
+        OTHER_MOTION: judged.followed - here - there,
+        ELSEWHERE: there,
+    }
+    return _count(cars, here, skipped)
+
+
+def _past(pairs: Pairs, number: int) -> Count:
+    cars = pairs.cars
+    skipped = {BELOW_SCORE: cars.low, NOT_PAST: len(cars.scores) - cars.low - number}
+    return _count(cars, number, skipped)
+
+
+def _count(cars: CarCandidates, number: int | None, skipped: Mapping[str, int]) -> Count:
+    return Count(number, cars.scores, skipped, cars.thresholds, "[cars] score")

@@ -121,7 +121,8 @@ def past_counts(state: MobileyeState, end_m: float | None, past: Past) -> dict[s
     """
     if end_m is None or end_m <= 0.0:
         return {}
-    return counts_of("mobileye", Ahead(state, end_m), past)
+    found = counts_of("mobileye", Ahead(state, end_m), past)
+    return {cue: one.number for cue, one in found.items() if one.number is not None}
 
 
 def count_lanes_past(ahead: Ahead, past: Past, cue: CueSpec) -> int | None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.cues.tracked.judge import cars_past, count_cars
@@ -18,13 +17,21 @@ from crosscue.detectors.ranging.control_tracks import ControlTracks
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .cars import CarShapes, Pairs, Tracker, car_shapes, pair_cars
-from .labelled import count_labels
-from .observed import NOT_SEEN, FrameCues, FrameDetections, Place
+from .candidates import (
+    SAME_OBJECT,
+    Candidates,
+    Count,
+    label_scores,
+    take,
+    thresholds_met,
+    unsure_of,
+)
+from .cars import CarCandidates, CarShapes, Pairs, Tracker, car_shapes, no_pairs, pair_cars
+from .labelled import count_own
+from .observed import NOT_SEEN, FrameCues, FrameDetections, Place, RoadFractions
 from .road import road_fractions
 from .road_ground import ground_fractions
 from .rules import counts_of
-from .tally import CueTally
 
 
 @dataclass(slots=True)
@@ -34,14 +41,14 @@ class CuePass:
     Attributes:
         vehicle: Regions and thresholds.
         tracker: Pairs cars of two frames, if the vehicle file has ``cars.kind = "pairs"``.
-        tally: Account of all candidates; None to skip it.
+        candidates: Candidates of every evaluated cue so far; only cues with a label or a region.
         not_followed: Number of frames in which cars could not be tracked, by reason.
         controls: Tracks of stop signs and traffic lights.
     """
 
     vehicle: Vehicle
     tracker: Tracker = pair_cars
-    tally: CueTally | None = None
+    candidates: dict[str, Candidates] = field(default_factory=dict)
     not_followed: Counter[str] = field(default_factory=Counter)
     controls: ControlTracks = field(init=False)
     _before: CarShapes | None = None
@@ -52,11 +59,7 @@ class CuePass:
         self.controls = ControlTracks(self.vehicle)
 
     def __call__(
-        self,
-        frame: FrameDetections,
-        ego: CarStep | None = None,
-        place: Place | None = None,
-        heights_px: Sequence[NDArray[np.float64]] | None = None,
+        self, frame: FrameDetections, ego: CarStep | None = None, place: Place | None = None
     ) -> FrameCues:
         """Compute the cues of the next frame.
 
@@ -64,47 +67,67 @@ class CuePass:
             frame: Detections in the frame.
             ego: The ego vehicle's motion since the previous frame; None where unknown.
             place: Estimated position of the intersection; None where unknown.
-            heights_px: Number of rows that each mask spans, by detector of objects; by default
-                heights are those of boxes.
         """
-        counts: dict[str, int] = {}
-        pairs: Pairs | None = None
+        objects: dict[str, Count] = {}
+        cars: dict[str, Count] = {}
+        signs: dict[str, Count] = {}
         passed_s = 0.0 if self._last_ns is None else (frame.t_ns - self._last_ns) * 1e-9
         self._last_ns = frame.t_ns
         if frame.objects:
             motion = CarStep(None, 0.0, 0.0, max(passed_s, 0.0)) if ego is None else ego
-            frame = replace(frame, objects=self.controls(frame.objects, motion, heights_px))
-            counts |= counts_of("objects", frame.objects, self.vehicle)
+            frame = replace(frame, objects=self.controls(frame.objects, motion))
+            objects = counts_of("objects", frame.objects, self.vehicle)
             pairs = self._cars(frame.objects, ego, place)
             if pairs is not None:
-                counts |= counts_of("car pairs", pairs, self.vehicle)
+                cars = counts_of("car pairs", pairs, self.vehicle)
         if frame.boxes:
-            counts |= counts_of("signs", frame.boxes, self.vehicle)
+            signs = counts_of("signs", frame.boxes, self.vehicle)
             for name, own in self.vehicle.cues.own.items():
-                counts[name] = count_labels(frame.boxes, own.labels, own.score)
-        if frame.labels is not None:
-            wanted = self.vehicle.cue_labels()
-            counts = {
-                cue: count
-                for cue, count in counts.items()
-                if not wanted[cue] or not frame.labels.isdisjoint(wanted[cue])
-            }
-        road = frame.road
-        if isinstance(road, RoadMask):
-            regions = self.vehicle.regions
-            if regions.kind == "area":
-                # Known only from many frames together; the stage that has them passes fractions.
-                road = NOT_SEEN
-            elif regions.kind == "ground":
-                road = ground_fractions(road, self.vehicle.camera, regions, place)
-            else:
-                road = road_fractions(road, regions)
-        if road is not None:
-            counts |= counts_of("road", road, self.vehicle)
-        found = FrameCues(counts, road, frame.objects)
-        if self.tally is not None:
-            self._explain(self.tally, frame, pairs, found)
-        return found
+                signs[name] = count_own(frame.boxes, name, own)
+        fractions = self._road(frame.road, place)
+        road = {} if fractions is None else counts_of("road", fractions, self.vehicle)
+        found = self._reportable(objects | cars | signs | road, frame.labels)
+        counts = {cue: one.number for cue, one in found.items() if one.number is not None}
+        for cue in (*objects, *signs, *cars, *road):
+            if cue in found:
+                take(self.candidates, cue, found[cue])
+        if frame.doubles:
+            self._take_doubles(frame.doubles, counts)
+        return FrameCues(counts, fractions, frame.objects)
+
+    def _reportable(
+        self, counts: dict[str, Count], labels: frozenset[str] | None
+    ) -> dict[str, Count]:
+        """Return the counts without cues whose labels no detector can report."""
+        if labels is None:
+            return counts
+        wanted = self.vehicle.cue_labels()
+        return {
+            cue: count
+            for cue, count in counts.items()
+            if not wanted[cue] or not labels.isdisjoint(wanted[cue])
+        }
+
+    def _road(
+        self, road: RoadMask | RoadFractions | None, place: Place | None
+    ) -> RoadFractions | None:
+        """Return the fractions of road by region."""
+        if not isinstance(road, RoadMask):
+            return road
+        regions = self.vehicle.regions
+        if regions.kind == "area":
+            # Known only from many frames together; the stage that has them passes fractions.
+            return NOT_SEEN
+        if regions.kind == "ground":
+            return ground_fractions(road, self.vehicle.camera, regions, place)
+        return road_fractions(road, regions)
+
+    def _take_doubles(self, boxes: Sequence[Detections], counts: Mapping[str, int]) -> None:
+        """Account for objects that another detector found with a better score."""
+        for name, labels in self.vehicle.cue_labels().items():
+            scores = label_scores(boxes, labels) if name in counts else []
+            if scores and name in self.candidates:
+                self.candidates[name].take(Count(None, scores, {SAME_OBJECT: len(scores)}))
 
     def restart(self) -> None:
         """Forget the objects of earlier frames."""
@@ -120,23 +143,6 @@ class CuePass:
         return Counter(
             {f"crossing and parked cars: {why}": n for why, n in self.not_followed.items()}
         )
-
-    def _explain(
-        self, tally: CueTally, frame: FrameDetections, pairs: Pairs | None, found: FrameCues
-    ) -> None:
-        tally.labelled("objects", frame.objects, found.counts)
-        tally.labelled("signs", frame.boxes, found.counts)
-        tally.own(frame.boxes, found.counts)
-        is_any = frame.labels is None or not frame.labels.isdisjoint(self.vehicle.cars.labels)
-        if pairs is not None and pairs.judged is not None and is_any:
-            tally.followed(frame.objects, pairs.judged, found.counts)
-        elif self._before is not None and frame.objects and is_any:
-            again = 0 if pairs is None else len(pairs.nose)
-            tally.cars(frame.objects, len(self._before), again, found.counts)
-        if frame.doubles:
-            tally.doubles(frame.doubles, found.counts)
-        if found.road is not None:
-            tally.road(found.road)
 
     def _cars(
         self, boxes: Sequence[Detections], ego: CarStep | None, place: Place | None
@@ -161,13 +167,29 @@ class CuePass:
             np.sign([car.nose for car in found]).astype(np.int64),
             boxes[0].size_px[0],
             judged,
+            self._candidates(boxes),
         )
 
-    def _pairs(self, boxes: Sequence[Detections]) -> Pairs | None:
-        """Cars found in the previous frame and this one; None in the first frame."""
+    def _candidates(self, boxes: Sequence[Detections], shapes: int = 0) -> CarCandidates:
+        """Return all cars among the detections, of which ``shapes`` pass the rules of shape."""
+        cars = self.vehicle.cars
+        return CarCandidates(
+            label_scores(boxes, cars.labels),
+            unsure_of(boxes, cars.labels, cars.score).total(),
+            thresholds_met(boxes, cars.labels, cars.score),
+            shapes,
+        )
+
+    def _pairs(self, boxes: Sequence[Detections]) -> Pairs:
+        """Cars found in the previous frame and this one."""
         now = car_shapes(boxes, self.vehicle.cars)
         before, self._before = self._before, now
-        return None if before is None else self.tracker(before, now, self.vehicle.cars)
+        if before is None:
+            pairs = no_pairs(now.size_px[0])
+        else:
+            pairs = self.tracker(before, now, self.vehicle.cars)
+        cars = self._candidates(boxes, len(now))
+        return replace(pairs, cars=cars, is_first=before is None)
 
 
 NO_ODOMETRY: Final = "no odometry, so the camera's own motion is unknown"

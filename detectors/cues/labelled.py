@@ -5,13 +5,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from crosscue.detectors.base import Detections
-from crosscue.replay.vehicle.vehicle import CueSpec, Vehicle
+from crosscue.replay.vehicle.vehicle import CueSpec, OwnCue, Vehicle
+
+from .candidates import Count, count_by_label
 
 
-def count(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> int:
+def count(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> Count:
     """Count the detections with a cue's labels and a score above its threshold."""
-    setting, min_score = vehicle.threshold_of(cue)
-    return count_labels(boxes, vehicle.labels_of(cue), 0.0 if setting is None else min_score)
+    setting, score = vehicle.threshold_of(cue)
+    labels = vehicle.labels_of(cue)
+    number = count_labels(boxes, labels, 0.0 if setting is None else score)
+    return count_by_label(boxes, labels, number, setting, score)
+
+
+def count_own(boxes: Sequence[Detections], name: str, own: OwnCue) -> Count:
+    """Count the detections of a user-defined cue."""
+    number = count_labels(boxes, own.labels, own.score)
+    return count_by_label(boxes, own.labels, number, f"[cues.own.{name}] score", own.score)
 
 
 def count_labels(boxes: Sequence[Detections], labels: tuple[str, ...], score: float | None) -> int:

@@ -129,6 +129,7 @@ class FrameDetections:
 
     Attributes:
         t_ns: Log time of the frame.
+        size_px: Width and height of the picture; zero where it is not known.
         objects: Results of detectors of objects; empty if none ran.
         signs: Results of detectors of one-way and do-not-enter signs; empty if none ran.
         road: Road pixels, or their fractions by region if already known.
@@ -143,6 +144,12 @@ class FrameDetections:
     road: RoadMask | RoadFractions | None = None
     labels: frozenset[str] | None = None
     doubles: tuple[Detections, ...] = ()
+    size_px: tuple[int, int] = (0, 0)
+
+    @property
+    def found(self) -> tuple[Found, ...]:
+        """Results of each detector; road only where its mask is known."""
+        return (*self.boxes, *((self.road,) if isinstance(self.road, RoadMask) else ()))
 
     @property
     def boxes(self) -> tuple[Detections, ...]:
@@ -165,30 +172,6 @@ def detector_role(found: Found, is_for_signs: bool) -> DetectorRole:
     if isinstance(found, RoadMask):
         return DetectorRole.ROAD
     return DetectorRole.SIGNS if is_for_signs else DetectorRole.OBJECTS
-
-
-def seen(
-    t_ns: int,
-    found: Sequence[Found],
-    is_for_signs: Sequence[bool],
-    labels: frozenset[str] | None = None,
-) -> FrameDetections:
-    """Sort one frame's results by role.
-
-    Args:
-        t_ns: Log time of the frame.
-        found: One result for each detector.
-        is_for_signs: For each detector, True if it finds one-way and do-not-enter signs.
-        labels: Labels that the detectors can report; None for any.
-    """
-    boxes: dict[bool, list[Detections]] = {True: [], False: []}
-    road: RoadMask | None = None
-    for one, for_signs in zip(found, is_for_signs, strict=True):
-        if isinstance(one, Detections):
-            boxes[for_signs].append(one)
-        elif road is None:
-            road = one
-    return FrameDetections(t_ns, tuple(boxes[False]), tuple(boxes[True]), road, labels)
 
 
 @dataclass(frozen=True, slots=True)

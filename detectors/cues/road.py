@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +12,21 @@ from numpy.typing import NDArray
 from crosscue.detectors.base import RoadMask
 from crosscue.replay.vehicle.vehicle import CueSpec, Polygon, Regions, Vehicle
 
+from .candidates import REGION_NOT_SEEN, TOO_LITTLE_ROAD, Count
 from .observed import RoadFractions
 
+SETTING: Final = "[cues] road_fraction"
 
-def is_road(fractions: RoadFractions, vehicle: Vehicle, cue: CueSpec) -> int | None:
-    """Return 1 if enough of the cue's region is road, else 0 (eq. 14); None if it is not seen."""
-    side = ("left", "straight", "right").index(cue.supports[0])
-    if math.isnan((fractions.left, fractions.straight, fractions.right)[side]):
-        return None
-    return int(fractions.positive(vehicle.cues.road_fraction)[side])
+
+def is_road(fractions: RoadFractions, vehicle: Vehicle, cue: CueSpec) -> Count:
+    """Count 1 if enough of the cue's region is road, else 0 (eq. 14); unknown if it is not seen."""
+    fraction: float = getattr(fractions, cue.supports[0])
+    limit = vehicle.cues.road_fraction
+    if math.isnan(fraction):
+        return Count(None, [0.0], {REGION_NOT_SEEN: 1}, [limit], SETTING, "frames")
+    scores = [fraction] if fraction > 0.0 else []
+    low = sum(one <= limit for one in scores)
+    return Count(int(fraction > limit), scores, {TOO_LITTLE_ROAD: low}, [limit], SETTING, "frames")
 
 
 @lru_cache(maxsize=64)

@@ -19,7 +19,6 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.detectors.base import ACCEPTED, MIN_SCORE, Detections, is_repeated
 from crosscue.detectors.cues.candidates import TOO_LITTLE_EVIDENCE
@@ -60,28 +59,20 @@ class ControlTracks:
     _before: tuple[Detections, ...] = ()
     _of_cue: dict[str, ObjectTracks] = field(default_factory=dict)
 
-    def __call__(
-        self,
-        found: Sequence[Detections],
-        motion: CarStep,
-        heights_px: Sequence[NDArray[np.float64]] | None = None,
-    ) -> tuple[Detections, ...]:
+    def __call__(self, found: Sequence[Detections], motion: CarStep) -> tuple[Detections, ...]:
         """Track the objects of the next frame; return the detections with the decisions on them.
 
         Args:
             found: Detections of each detector of objects.
             motion: Motion of the car since the previous frame.
-            heights_px: Number of rows that each mask spans, by detector; by default the boxes'.
         """
-        if heights_px is None:
-            heights_px = [one.heights_px for one in found]
         decisions = [[""] * len(one) for one in found]
         is_new, self._before = not is_repeated(self._before, found), tuple(found)
         # The variance of slip_per_sqrt_m is not used: the tracks have scale_sd of the distance.
         slip_m2 = self.vehicle.odometry.slip_per_sqrt_m**2 * abs(motion.way_m or 0.0)
         motion = motion._replace(var_m2=max(motion.var_m2 - slip_m2, 0.0))
         for cue in (STOP_SIGN, TRAFFIC_LIGHT):
-            self._track(cue, found, motion, heights_px, decisions, is_new=is_new)
+            self._track(cue, found, motion, decisions, is_new=is_new)
         if self.vehicle.cues.kind != "tracks":
             return tuple(found)
         return tuple(
@@ -100,7 +91,6 @@ class ControlTracks:
         cue: CueSpec,
         found: Sequence[Detections],
         motion: CarStep,
-        heights_px: Sequence[NDArray[np.float64]],
         decisions: list[list[str]],
         *,
         is_new: bool,
@@ -110,6 +100,7 @@ class ControlTracks:
         if not is_tracked and source_of(self.vehicle, cue.name) != "motion":
             return
         rows: list[tuple[int, int]] = []
+        heights_px = [one.heights_px for one in found]
         for k, one in enumerate(found):
             _, score = self.vehicle.threshold_of(cue)
             is_taken = one.scores >= MIN_CANDIDATE if is_tracked else one.are_sure(score)

@@ -37,7 +37,6 @@ def is_cut(found: Detections, i: int) -> bool:
 
 def why_not(
     found: Detections,
-    heights_px: NDArray[np.float64],
     i: int,
     are_sure: NDArray[np.bool_],
     source: Source | None,
@@ -45,7 +44,7 @@ def why_not(
     """Return why a detection has no range; None if it or its track has one."""
     if not are_sure[i]:
         return BELOW_SCORE
-    if heights_px[i] <= 0.0:
+    if found.heights_px[i] <= 0.0:
         return NO_HEIGHT
     if is_cut(found, i):
         return CUT

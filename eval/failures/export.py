@@ -120,11 +120,10 @@ def _things(
     detected = run.drive_manifest().detected
     things: dict[int, tuple[Annotation, ...]] = {}
     for frame in stored_frames(run, detected.detectors) if detected is not None else ():
-        seen = frame.seen
-        if seen.t_ns not in times:
+        if frame.t_ns not in times:
             continue
         kept = []
-        for one in (*seen.objects, *seen.signs):
+        for one in (*frame.objects, *frame.signs):
             for box, score, label in zip(one.boxes_px, one.scores, one.labels, strict=True):
                 if label not in found.labels:
                     found.left_out[OTHER] = found.left_out.get(OTHER, 0) + 1
@@ -132,7 +131,7 @@ def _things(
                 x0, y0, x1, y1 = _inside(box.tolist(), frame.size_px)
                 if x0 < x1 and y0 < y1:
                     kept.append(Annotation(label, (x0, y0, x1, y1), score=round(float(score), 4)))
-        things[seen.t_ns] = tuple(kept)
+        things[frame.t_ns] = tuple(kept)
     return things
 
 

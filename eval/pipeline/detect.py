@@ -523,13 +523,14 @@ class _Tables:
         self, name: str, found: Detections, again: Int64s
     ) -> list[dict[str, object]]:
         rows: list[dict[str, object]] = []
+        heights_px = found.measured().heights_px.tolist()
         for i, label in enumerate(found.labels):
             x0, y0, x1, y1 = found.boxes_px[i].tolist()
             key = f"{name}: {label}"
             self.objects[key] = self.objects.get(key, 0) + 1
             by_mask = self.masked if found.masks[i] else self._boxed
             by_mask.setdefault(name, set()).add(label)
-            height = _height_px(found, i)
+            height = heights_px[i]
             ranged = detection_range(self.vehicle, label, found.boxes_px[i], height, found.size_px)
             rows.append(
                 {
@@ -560,14 +561,6 @@ class _Tables:
         rows, self._held[name] = self._held[name], []
         if rows:
             self._sinks[name].write({key: [row[key] for row in rows] for key in rows[0]})
-
-
-def _height_px(found: Detections, i: int) -> float:
-    """Return the number of rows that the mask spans, or the height of a box without mask."""
-    if not found.masks[i]:
-        return float(found.boxes_px[i, 3] - found.boxes_px[i, 1])
-    rows = np.flatnonzero(found.mask(i).any(axis=1))
-    return float(rows[-1] - rows[0] + 1) if len(rows) else 0.0
 
 
 def detect_schemas() -> dict[str, pa.Schema]:

@@ -188,7 +188,7 @@ def _log_marks(
     frames = stored_frames(run, detected.detectors, with_road_masks=True)
     for number, frame in enumerate(frames):
         if anchored is None:
-            marks.add(frame, cues(frame.seen).objects)
+            marks.add(frame, cues(frame).objects)
         else:
             anchored.add(frame)
         if number % FRAMES_HELD == FRAMES_HELD - 1:

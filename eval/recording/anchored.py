@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import Place
+from crosscue.detectors.cues.observed import FrameDetections, Place
 from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.cues.tracked.judge import along, crossing, is_past, parked
 from crosscue.detectors.cues.tracked.motion import CarMotion
@@ -23,7 +23,6 @@ from crosscue.eval.pipeline.scene.roads import Roads, pitches_of
 from crosscue.eval.pipeline.scene.stage import EgoMotion, Restarts, intersection_place
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DriveManifest
-from crosscue.eval.runs.tables.stored_frames import StoredFrame
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.fusion.approaches import RangeRow
 from crosscue.fusion.intersection_range import Reference
@@ -69,28 +68,28 @@ class Anchored:
         self._restarts = Restarts(vehicle, self.manifest.timeline)
         self._ranges = _ranges_of(self.run)
 
-    def add(self, frame: StoredFrame) -> None:
+    def add(self, frame: FrameDetections) -> None:
         """Draw one frame, with the decisions of tracks on its detections."""
-        seen, vehicle = frame.seen, self.manifest.settings
-        fresh_ns = self._restarts.before(seen.t_ns)
+        vehicle = self.manifest.settings
+        fresh_ns = self._restarts.before(frame.t_ns)
         if fresh_ns is not None:
             self._ego.restart(fresh_ns)
             self._cues.restart()
             self._before = []
             if self._roads is not None:
                 self._roads.restart()
-        evidence, ego = self._ego(seen.t_ns)
+        evidence, ego = self._ego(frame.t_ns)
         if self._roads is not None:
-            self._roads(seen, evidence)
+            self._roads(frame, evidence)
         place = None
         if ego.way_m is not None:
             place = intersection_place(self._before, ego.way_m, vehicle.fusion.length_m)
-        self._before = self._ranges.get(seen.t_ns, [])
-        found = self._cues(seen, ego, place, frame.heights_px)
+        self._before = self._ranges.get(frame.t_ns, [])
+        found = self._cues(frame, ego, place)
         self.marks.add(frame, found.objects)
         if self._roads is not None:
             self._draw_roads(self._roads)
-        if vehicle.regions.kind == "ground" and isinstance(seen.road, RoadMask):
+        if vehicle.regions.kind == "ground" and isinstance(frame.road, RoadMask):
             fractions = found.road
             polygons = outlines(vehicle.camera, vehicle.regions, place, frame.size_px)
             for side, corners in zip(SIDES, polygons, strict=True):

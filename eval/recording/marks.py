@@ -24,9 +24,8 @@ from crosscue.detectors.cues.cars import (
     pair_cars,
     parked_cars,
 )
-from crosscue.detectors.cues.observed import RoadFractions
+from crosscue.detectors.cues.observed import FrameDetections, RoadFractions
 from crosscue.detectors.cues.road import road_fractions
-from crosscue.eval.runs.tables.stored_frames import StoredFrame
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .columns import Colour, DriveTime, Shapes, arrows, boxes, labelled_strips, strips
@@ -71,29 +70,28 @@ class Overlays:
     openings: Shapes = field(default_factory=lambda: Shapes("ahead/openings", labelled_strips))
     _before: CarShapes | None = None
 
-    def add(self, frame: StoredFrame, objects: Sequence[Detections]) -> None:
+    def add(self, frame: FrameDetections, objects: Sequence[Detections]) -> None:
         """Draw one frame.
 
         Args:
             frame: The frame.
             objects: Its detections of objects, with the decisions of tracks on them.
         """
-        seen = frame.seen
         for shapes in self.all():
-            shapes.begin(seen.t_ns)
+            shapes.begin(frame.t_ns)
         for found in objects:
             self._objects(found)
-        for found in seen.signs:
+        for found in frame.signs:
             for box, text, _ in _report_text(found):
                 self.signs.add(box, SIGN, text)
-        if isinstance(seen.road, RoadMask):
-            for line in road_lines(seen.road):
+        if isinstance(frame.road, RoadMask):
+            for line in road_lines(frame.road):
                 self.road.add(line, ROAD)
         # Overlays anchored to the road or tracked over frames are drawn by ``anchored``.
         if self.vehicle.regions.kind == "picture":
-            self._regions(seen.road, frame.size_px)
-        if seen.objects and self.vehicle.cars.kind != "tracks":
-            self._cars(seen.objects)
+            self._regions(frame.road, frame.size_px)
+        if frame.objects and self.vehicle.cars.kind != "tracks":
+            self._cars(frame.objects)
 
     def all(self) -> Iterator[Shapes]:
         """Yield all shapes."""

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections, Found
-from crosscue.detectors.cues.observed import Place
+from crosscue.detectors.cues.observed import FrameDetections, Place
 from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.images import Encoded
 from crosscue.detectors.overlay import draw_frame
 from crosscue.eval.pipeline.scene.road_picture import plans_of
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.stored_images import pictures_at, run_camera
-from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
+from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.cue_table import CUES
@@ -88,23 +88,15 @@ def _likely(found: Found, counted: frozenset[str]) -> Found:
     if not isinstance(found, Detections):
         return found
     least = np.array([COUNTED if one in counted else LIKELY for one in found.labels])
-    rows = np.flatnonzero(found.scores >= least) if len(least) else np.arange(0)
-    return Detections(
-        found.t_ns,
-        found.size_px,
-        found.boxes_px[rows],
-        found.scores[rows],
-        tuple(found.labels[i] for i in rows),
-        tuple(found.masks[i] for i in rows),
-    )
+    return found.taken(found.scores >= least) if len(least) else found
 
 
-def _found(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, StoredFrame]:
+def _found(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, FrameDetections]:
     detected = run.drive_manifest().detected
     if detected is None:
         return {}
     frames = stored_frames(run, detected.detectors, with_road_masks=True)
-    return {one.seen.t_ns: one for one in frames if one.seen.t_ns in wanted}
+    return {one.t_ns: one for one in frames if one.t_ns in wanted}
 
 
 def _places(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, Place]:

@@ -87,13 +87,13 @@ def plans_of(run: RunFolder, wanted: Iterable[int]) -> Mapping[int, Bytes]:
     roads, ego = Roads(vehicle, pitches_of(run)), EgoMotion(odometer_of(run))
     restarts, found = Restarts(vehicle, detected.timeline), {}
     for frame in stored_frames(run, detected.detectors, with_road_masks=True):
-        fresh_ns = restarts.before(frame.seen.t_ns)
+        fresh_ns = restarts.before(frame.t_ns)
         if fresh_ns is not None:
             ego.restart(fresh_ns)
             roads.restart()
-        evidence, _ = ego(frame.seen.t_ns)
-        roads(frame.seen, evidence)
-        plan = roads.plan() if frame.seen.t_ns in times else None
+        evidence, _ = ego(frame.t_ns)
+        roads(frame, evidence)
+        plan = roads.plan() if frame.t_ns in times else None
         if plan is not None:
-            found[frame.seen.t_ns] = draw_plan(plan, roads.seen)
+            found[frame.t_ns] = draw_plan(plan, roads.seen)
     return found

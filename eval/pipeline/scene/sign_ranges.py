@@ -7,11 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from crosscue.detectors.base import Detections
-from crosscue.detectors.cues.candidates import Candidates, label_scores, thresholds_met
+from crosscue.detectors.cues.candidates import (
+    Candidates,
+    Count,
+    label_scores,
+    take,
+    thresholds_met,
+)
 from crosscue.detectors.ranging.height_to_range import range_of
 from crosscue.detectors.ranging.usable import source_of, why_not
 from crosscue.fusion.evidence import SignRange
@@ -35,22 +38,11 @@ class SignRanges:
     vehicle: Vehicle
     by_cue: dict[str, Candidates] = field(default_factory=dict)
 
-    def __call__(
-        self, found: Sequence[Detections], heights_px: Sequence[NDArray[np.float64]]
-    ) -> tuple[SignRange, ...]:
-        """Return the ranges of one frame.
+    def __call__(self, found: Sequence[Detections]) -> tuple[SignRange, ...]:
+        """Return the ranges of one frame, from the detections of each detector of objects."""
+        return tuple(one for row in range(len(MEASURED)) for one in self._of_cue(found, row))
 
-        Args:
-            found: Detections of each detector of objects.
-            heights_px: Number of rows that each mask spans, by detector.
-        """
-        return tuple(
-            one for row in range(len(MEASURED)) for one in self._of_cue(found, heights_px, row)
-        )
-
-    def _of_cue(
-        self, found: Sequence[Detections], heights_px: Sequence[NDArray[np.float64]], row: int
-    ) -> list[SignRange]:
+    def _of_cue(self, found: Sequence[Detections], row: int) -> list[SignRange]:
         """Return the ranges of one row of ``MEASURED``."""
         cue, reference = MEASURED[row]
         labels = self.vehicle.labels_of(cue)
@@ -59,18 +51,17 @@ class SignRanges:
         source = source_of(self.vehicle, cue.name)
         ranges: list[SignRange] = []
         skipped: Counter[str] = Counter()
-        for detections, heights in zip(found, heights_px, strict=True):
+        for detections in found:
             are_sure = detections.are_sure(threshold)
             for i, label in enumerate(detections.labels):
                 if label not in labels:
                     continue
-                why = why_not(detections, heights, i, are_sure, source)
+                why = why_not(detections, i, are_sure, source)
                 if why is not None:
                     skipped[why] += 1
                 elif curve is not None and source == "curve":
-                    range_m = float(range_of(np.array([heights[i]]), curve)[0])
+                    range_m = float(range_of(detections.heights_px[i : i + 1], curve)[0])
                     ranges.append(SignRange(reference, range_m, curve.residual_sd_m**2))
-        counted = self.by_cue.setdefault(cue.name, Candidates("detections", setting, threshold))
-        counted.meet(thresholds_met(found, labels, threshold))
-        counted.take(label_scores(found, labels), skipped)
+        met = thresholds_met(found, labels, threshold)
+        take(self.by_cue, cue.name, Count(None, label_scores(found, labels), skipped, met, setting))
         return ranges

@@ -16,7 +16,6 @@ from crosscue.detectors.base import is_repeated
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections, Place
 from crosscue.detectors.cues.same_object import label_meanings
-from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.eval.pipeline.progress import report_time
 from crosscue.eval.pipeline.scene.looked_for import needing_masks, not_looked_for
@@ -24,7 +23,7 @@ from crosscue.eval.pipeline.scene.motion_ranges import MotionRanges, RangedObjec
 from crosscue.eval.pipeline.scene.sign_ranges import MEASURED, SignRanges
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
-from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
+from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.eval.runs.tables.travelled import Odometer, odometer_of
 from crosscue.fusion.approaches import Approaches, RangeRow, Step
 from crosscue.fusion.belief import begin, probabilities
@@ -104,12 +103,12 @@ def estimate_scene(
     )
     for frame in frames:
         vehicle.camera.check_size(frame.size_px)
-        fresh_ns = restarts.before(frame.seen.t_ns)
+        fresh_ns = restarts.before(frame.t_ns)
         if fresh_ns is not None:
             scene.restart(fresh_ns)
             on_restart(fresh_ns)
-        scene.step(frame, past(frame.seen.t_ns), without | boxes_only)
-        report_time("estimating beliefs", timeline, frame.seen.t_ns)
+        scene.step(frame, past(frame.t_ns), without | boxes_only)
+        report_time("estimating beliefs", timeline, frame.t_ns)
     scene.rows.flush()
     scene.approaches.finish()
     return SceneOutcome(
@@ -121,7 +120,7 @@ def estimate_scene(
         + scene.cues.controls.counts
         + scene.cues.notes(),
         scene.ego.without_odometry,
-        {cue: one for cue, one in scene.tally.by_cue.items() if cue not in boxes_only},
+        {cue: one for cue, one in scene.cues.candidates.items() if cue not in boxes_only},
         scene.signs.by_cue,
         not_looked_for(
             scene.looked,
@@ -205,7 +204,6 @@ class _Scene:
     rows: _Rows
     roads: Roads | None = None
     cues: CuePass = field(init=False)
-    tally: CueTally = field(init=False)
     signs: SignRanges = field(init=False)
     motion: MotionRanges = field(init=False)
     priors: Mapping[str, float] = field(init=False)
@@ -217,24 +215,21 @@ class _Scene:
     _ranges: tuple[RangeRow, ...] = ()
 
     def __post_init__(self) -> None:
-        self.tally = CueTally(self.vehicle)
         self.signs = SignRanges(self.vehicle)
-        self.cues = CuePass(self.vehicle, tally=self.tally)
+        self.cues = CuePass(self.vehicle)
         self.motion = MotionRanges(self.vehicle)
         graph = graph_of(self.vehicle.fusion)
         self.priors = probabilities(begin(graph), graph)
 
-    def step(self, frame: StoredFrame, past: PastCues | None, without: frozenset[str]) -> None:
-        seen = frame.seen
+    def step(self, frame: FrameDetections, past: PastCues | None, without: frozenset[str]) -> None:
+        seen = frame
         evidence, ego = self.ego(seen.t_ns)
         if self.roads is not None:
             seen = replace(seen, road=self.roads(seen, evidence))
-        found = self.cues(seen, ego, self._place(ego), frame.heights_px)
+        found = self.cues(seen, ego, self._place(ego))
         counts = {cue: count for cue, count in found.counts.items() if cue not in without}
         signs = tuple(
-            sign
-            for sign in self.signs(found.objects, frame.heights_px)
-            if _MEASURES[sign.reference] not in without
+            sign for sign in self.signs(found.objects) if _MEASURES[sign.reference] not in without
         )
         evidence = replace(evidence, counts=counts, signs=signs)
         posteriors = self.motion(self.cues.controls.tracks, ego, without)

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from crosscue.detectors.base import Detections, Found, RoadMask
+from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.cues.observed import (
     DetectorRole,
     FrameDetections,
@@ -23,27 +22,6 @@ from crosscue.eval.runs.manifest import DetectorRow
 from .parquet import TableFolder
 
 NO_BOXES: Final = np.empty((0, 4))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StoredFrame:
-    """One frame of the camera.
-
-    Attributes:
-        seen: Detections by role.
-        size_px: Width and height of the picture.
-        heights_px: Number of rows that each mask spans, one array per item of ``seen.objects``.
-    """
-
-    seen: FrameDetections
-    size_px: tuple[int, int]
-    heights_px: tuple[NDArray[np.float64], ...]
-
-    @property
-    def found(self) -> tuple[Found, ...]:
-        """Results of each detector; road only if its mask was read."""
-        road = (self.seen.road,) if isinstance(self.seen.road, RoadMask) else ()
-        return (*self.seen.objects, *self.seen.signs, *road)
 
 
 @dataclass(slots=True)
@@ -105,10 +83,10 @@ def stored_frames(
     *,
     with_road_masks: bool = False,
     meanings: Mapping[str, str] | None = None,
-) -> Iterator[StoredFrame]:
+) -> Iterator[FrameDetections]:
     """Yield all frames of a run in the order of detection; memory holds one batch of rows.
 
-    Detections for which another detector has a better score are in ``seen.doubles``.
+    Detections for which another detector has a better score are in ``doubles``.
 
     Args:
         run: A run with the tables of the detect stage.
@@ -150,20 +128,14 @@ def stored_frames(
                 )
                 for names in (objects, signs)
             )
-            yield StoredFrame(
-                FrameDetections(
-                    t_ns,
-                    some,
-                    others,
-                    _road(t_ns, size, fractions[0], with_road_masks) if fractions else None,
-                    labels,
-                    tuple(_detections(t_ns, size, rows) for rows in again.values()),
-                ),
+            yield FrameDetections(
+                t_ns,
+                some,
+                others,
+                _road(t_ns, size, fractions[0], with_road_masks) if fractions else None,
+                labels,
+                tuple(_detections(t_ns, size, rows) for rows in again.values()),
                 size,
-                tuple(
-                    np.array([row[8] for row in by_name.get(name, [])], np.float64)
-                    for name in objects
-                ),
             )
 
 
@@ -200,6 +172,7 @@ def _detections(t_ns: int, size: tuple[int, int], rows: list[tuple[Any, ...]]) -
         tuple(row[7] or b"" for row in rows),
         tuple(row[9] or "" for row in rows),
         looks=tuple(row[11] or "" for row in rows),
+        spans_px=np.array([row[8] for row in rows], np.float64),
     )
 
 

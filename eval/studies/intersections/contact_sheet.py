@@ -8,12 +8,12 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.detectors.base import Found, RoadMask
+from crosscue.detectors.cues.observed import FrameDetections
 from crosscue.detectors.images import decode
 from crosscue.detectors.overlay import draw_detections, write_label
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.stored_images import StoredCamera, picture_at, run_camera
-from crosscue.eval.runs.tables.stored_frames import StoredFrame, stored_frames
+from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.files.whole_file import write_bytes
@@ -67,7 +67,7 @@ def _tile(one: RunScored) -> Bytes:
     return found
 
 
-def _frame_near(one: RunScored) -> StoredFrame | None:
+def _frame_near(one: RunScored) -> FrameDetections | None:
     """Return the frame nearest to ``AWAY_M`` before the first intersection."""
     times: Int64s = one.run.table("frames", ["t_ns"])["t_ns"].to_numpy()
     inside = times[one.truth.approach_at(times) >= 0]
@@ -81,21 +81,18 @@ def _frame_near(one: RunScored) -> StoredFrame | None:
     if detected is None:
         return None
     for frame in stored_frames(one.run, detected.detectors, with_road_masks=True):
-        if frame.seen.t_ns == wanted:
+        if frame.t_ns == wanted:
             return frame
     return None
 
 
-def _picture(camera: StoredCamera, frame: StoredFrame, run: RunFolder) -> Bytes | None:
-    t_ns = frame.seen.t_ns
-    found: list[Found] = [*frame.seen.objects, *frame.seen.signs]
-    if isinstance(frame.seen.road, RoadMask):
-        found.insert(0, frame.seen.road)
+def _picture(camera: StoredCamera, frame: FrameDetections, run: RunFolder) -> Bytes | None:
+    t_ns = frame.t_ns
     picture = picture_at(camera, t_ns)
     if picture is None:
         return None
     pixels, _ = decode(picture)
-    return draw_detections(pixels, found, _cues_at(run, t_ns), ENLARGE)
+    return draw_detections(pixels, frame.found, _cues_at(run, t_ns), ENLARGE)
 
 
 def _cues_at(run: RunFolder, t_ns: int) -> dict[str, int]:

@@ -13,10 +13,10 @@ from crosscue.detectors.cues.candidates import (
     OTHER_MOTION,
     TOO_FEW_FRAMES,
     TOO_LITTLE_ROAD,
+    Candidates,
 )
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections, RoadFractions
-from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Camera, Cars, Cues, OwnCue, Vehicle
@@ -42,9 +42,9 @@ def _found(t_ns: int, *found: tuple[str, float, float]) -> Detections:
     return Detections(t_ns, (640, 480), boxes, scores, labels, (b"",) * len(found))
 
 
-def _pass(vehicle: Vehicle = VEHICLE) -> tuple[CuePass, CueTally]:
-    tally = CueTally(vehicle)
-    return CuePass(vehicle, tally=tally), tally
+def _pass(vehicle: Vehicle = VEHICLE) -> tuple[CuePass, dict[str, Candidates]]:
+    cues = CuePass(vehicle)
+    return cues, cues.candidates
 
 
 def test_lights_below_threshold_are_counted_with_their_max_score() -> None:
@@ -52,7 +52,7 @@ def test_lights_below_threshold_are_counted_with_their_max_score() -> None:
     for t, score in enumerate((0.41, 0.62, 0.3)):
         cues(FrameDetections(t, objects=(_found(t, ("traffic light", score, 20.0)),)))
 
-    lights = tally.by_cue["traffic_light"]
+    lights = tally["traffic_light"]
     assert (lights.seen, lights.used, lights.skipped) == (3, 0, {BELOW_SCORE: 3})
     assert (lights.max_score, lights.threshold) == (0.62, 0.9)
     assert lights.setting == "[cues] traffic_light_score"
@@ -66,7 +66,7 @@ def test_car_of_a_pair_is_skipped_for_the_first_rule_it_fails() -> None:
     )
     cues(FrameDetections(10**8, objects=(_found(10**8, standing),)))
 
-    cars = tally.by_cue["cross_traffic_left"]
+    cars = tally["cross_traffic_left"]
     assert (cars.seen, cars.used) == (4, 0)
     assert cars.skipped == {
         BELOW_SCORE: 1,
@@ -82,7 +82,7 @@ def test_tracked_car_is_skipped_for_the_first_rule_it_fails() -> None:
         found = ("car", 0.99, 100.0), ("car", 0.5, 100.0), ("car", 0.99, 640.0)
         cues(FrameDetections(0, objects=(_found(0, *found),)), CarStep(0.0, 0.0, 0.0, 0.1))
 
-    cars = tally.by_cue["parked_right"]
+    cars = tally["parked_right"]
     assert (cars.seen, cars.used) == (6, 0)
     assert cars.skipped == {BELOW_SCORE: 2, CUT_OR_FAR: 2, TOO_FEW_FRAMES: 2}
 
@@ -91,10 +91,10 @@ def test_region_with_too_little_road_is_counted_as_skipped() -> None:
     cues, tally = _pass()
     cues(FrameDetections(0, road=RoadFractions(left=0.13, straight=0.5, right=0.0)))
 
-    assert tally.by_cue["road_left"].skipped == {TOO_LITTLE_ROAD: 1}
-    assert tally.by_cue["road_left"].max_score == 0.13
-    assert tally.by_cue["road_straight"].used == 1
-    assert tally.by_cue["road_right"].seen == 0
+    assert tally["road_left"].skipped == {TOO_LITTLE_ROAD: 1}
+    assert tally["road_left"].max_score == 0.13
+    assert tally["road_straight"].used == 1
+    assert tally["road_right"].seen == 0
 
 
 @given(FRAMES, FRAMES, st.sampled_from([VEHICLE, TRACKED]))
@@ -112,7 +112,7 @@ def test_used_and_skipped_candidates_add_up_for_every_cue(
         for cue, number in cues(frame, ego).counts.items():
             counted[cue] = counted.get(cue, 0) + number
 
-    for name, one in tally.by_cue.items():
+    for name, one in tally.items():
         assert one.seen == one.used + sum(one.skipped.values())
         assert all(number > 0 for number in one.skipped.values())
         assert one.used == counted.get(name, 0)
@@ -121,4 +121,4 @@ def test_used_and_skipped_candidates_add_up_for_every_cue(
         for name, cue in CUES.items()
         if cue.observed_by not in ("road", "mobileye") and cue.group != "cars_past"
     }
-    assert set(tally.by_cue) == evaluated | {"crossing"}
+    assert set(tally) == evaluated | {"crossing"}

@@ -26,13 +26,16 @@ from crosscue.detectors.cues.candidates import (
     TOO_FEW_FRAMES,
     TOO_LITTLE_ROAD,
     Candidates,
+    Count,
+    count_by_label,
     label_scores,
+    take,
     thresholds_met,
     unsure_of,
 )
-from crosscue.detectors.cues.cars import CarShapes, Pairs, no_pairs
+from crosscue.detectors.cues.cars import CarCandidates, CarShapes, Pairs, no_pairs
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.labelled import count, count_labels
+from crosscue.detectors.cues.labelled import count, count_labels, count_own
 from crosscue.detectors.cues.observed import (
     CarCounts,
     DetectorRole,
@@ -42,13 +45,12 @@ from crosscue.detectors.cues.observed import (
     Sides,
     Ways,
     detector_role,
-    seen,
 )
 from crosscue.detectors.cues.rules import counts_of, rule_of
 from crosscue.detectors.cues.same_object import KEPT, label_meanings, same_objects
-from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.cues.tracked.judge import count_cars
 from crosscue.detectors.ranging.object_tracks import CarStep
+from crosscue.replay.vehicle.cue_spec import CueSpec, Input
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Camera, Cars, Cues, OwnCue, Regions, Vehicle
 
@@ -125,21 +127,21 @@ def test_lights_need_a_score_and_signs_only_their_label() -> None:
         found(("one way left", 0.01), ("one way left", 0.9), ("one way right", 0.9)),
     ]
 
-    assert count(boxes, VEHICLE, CUES["traffic_light"]) == 1
-    assert count(boxes, VEHICLE, CUES["one_way_left"]) == 2
-    assert count(boxes, VEHICLE, CUES["one_way_right"]) == 1
+    assert count(boxes, VEHICLE, CUES["traffic_light"]).number == 1
+    assert count(boxes, VEHICLE, CUES["one_way_left"]).number == 2
+    assert count(boxes, VEHICLE, CUES["one_way_right"]).number == 1
 
 
 def test_candidates_are_seen_used_and_skipped() -> None:
     """3 seen, of which 2 skipped: 1 used. Then 2 seen and none skipped: in all 5 and 3."""
     one = Candidates("detections")
-    one.take([], {"low": 0})
+    one.take(Count(0, [], {"low": 0}))
     assert (one.seen, one.used, one.skipped, one.max_score) == (0, 0, {}, None)
 
-    one.take([0.2, 0.4, 0.3], {"low": 1, "far": 1, "none": 0})
+    one.take(Count(1, [0.2, 0.4, 0.3], {"low": 1, "far": 1, "none": 0}))
     assert (one.seen, one.used, one.max_score) == (3, 1, 0.4)
-    one.take([0.1, 0.3], {"low": 0})
-    one.take([0.9], {"low": 1})
+    one.take(Count(2, [0.1, 0.3], {"low": 0}))
+    one.take(Count(0, [0.9], {"low": 1}))
 
     assert (one.seen, one.used, one.max_score) == (6, 3, 0.9)
     assert one.skipped == {"low": 2, "far": 1}
@@ -147,27 +149,58 @@ def test_candidates_are_seen_used_and_skipped() -> None:
 
 def test_threshold_of_candidates_is_the_lowest() -> None:
     one = Candidates("detections")
-    one.meet([])
-    assert one.threshold is None
-    one.meet([0.5, 0.4])
-    assert one.threshold == 0.4
-    one.meet([0.6])
-    assert one.threshold == 0.4
-    one.meet([0.3])
-    assert one.threshold == 0.3
+    for thresholds, lowest in (((), None), ((0.5, 0.4), 0.4), ((0.6,), 0.4), ((0.3,), 0.3)):
+        one.take(Count(0, thresholds=thresholds))
+        assert one.threshold == lowest
+
+
+def _numbers(observed_by: Input, observed: object) -> dict[str, int | None]:
+    return {cue: one.number for cue, one in counts_of(observed_by, observed, VEHICLE).items()}
+
+
+def _taken(
+    observed_by: Input, observed: object, vehicle: Vehicle = VEHICLE
+) -> dict[str, Candidates]:
+    """Return the candidates of every cue of one kind of input, in one frame."""
+    found: dict[str, Candidates] = {}
+    for cue, one in counts_of(observed_by, observed, vehicle).items():
+        take(found, cue, one)
+    return found
+
+
+def test_number_of_a_rule_is_explained_by_the_labels_and_threshold_of_its_row(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A plug-in's rule returns a number: lights of 0.5 and 0.7, of which it counts one."""
+    row = replace(CUES["traffic_light"], rule=f"{__name__}:one_of_them")
+    monkeypatch.setitem(CUES, "traffic_light", row)
+
+    lights = _taken("objects", [found(("traffic light", 0.5), ("traffic light", 0.7))])
+
+    assert skipped(lights, "traffic_light") == (2, 1, {BELOW_SCORE: 1})
+    monkeypatch.setitem(
+        CUES, "cross_traffic_left", replace(CUES["cross_traffic_left"], rule=row.rule)
+    )
+    assert "cross_traffic_left" not in _taken("car pairs", no_pairs(640))
+    assert _numbers("car pairs", no_pairs(640))["cross_traffic_left"] == 1
+
+
+def one_of_them(observed: object, vehicle: Vehicle, cue: CueSpec) -> int:
+    """Return 1, as a plug-in's rule may."""
+    return 1
 
 
 def test_rules_are_found_by_module_and_function() -> None:
     assert rule_of("crosscue.detectors.cues.labelled:count") is count
     light = found(("traffic light", 0.7))
-    assert counts_of("objects", [light], VEHICLE) == {"stop_sign": 0, "traffic_light": 1}
+    assert _numbers("objects", [light]) == {"stop_sign": 0, "traffic_light": 1}
     assert list(counts_of("signs", [light], VEHICLE)) == [
         "one_way_left",
         "one_way_right",
         "do_not_enter",
     ]
     pairs = no_pairs(640)
-    assert counts_of("car pairs", pairs, VEHICLE) == {
+    assert _numbers("car pairs", pairs) == {
         "cross_traffic_left": 0,
         "cross_traffic_right": 0,
         "parked_left": 0,
@@ -183,15 +216,14 @@ def road(fraction: float = 1.0) -> RoadMask:
     return RoadMask(0, SIZE, rle.encode_mask(is_road, (0, 0), size), size)
 
 
-def test_results_are_sorted_by_role() -> None:
-    cars, signs, other = found(("car", 0.9)), found(("stop sign", 0.9)), found()
-    first, second = road(), road(0.5)
+def test_results_have_roles() -> None:
+    cars, signs = found(("car", 0.9)), found(("stop sign", 0.9))
+    first = road()
+    frame = FrameDetections(7, (cars,), (signs,), first)
 
-    one = seen(7, [cars, signs, first, other, second], [False, True, False, False, True], None)
-
-    assert one == FrameDetections(7, (cars, other), (signs,), first, None)
-    assert one.boxes == (cars, other, signs)
-    assert seen(8, [], [], frozenset({"car"})) == FrameDetections(8, labels=frozenset({"car"}))
+    assert frame.boxes == (cars, signs)
+    assert frame.found == (cars, signs, first)
+    assert FrameDetections(7, (cars,), road=RoadFractions(1, 1, 1)).found == (cars,)
     assert detector_role(first, True) == DetectorRole.ROAD
     assert detector_role(cars, True) == DetectorRole.SIGNS
     assert detector_role(cars, False) == DetectorRole.OBJECTS
@@ -266,9 +298,9 @@ def _again(results: Sequence[Detections], calibrated: Sequence[bool]) -> list[li
     return [one.tolist() for one in same_objects(results, {}, calibrated)]
 
 
-def _cues(vehicle: Vehicle = VEHICLE) -> tuple[CuePass, CueTally]:
-    tally = CueTally(vehicle)
-    return CuePass(vehicle, tally=tally), tally
+def _cues(vehicle: Vehicle = VEHICLE) -> tuple[CuePass, dict[str, Candidates]]:
+    cues = CuePass(vehicle)
+    return cues, cues.candidates
 
 
 def test_frame_counts_each_kind_of_cue() -> None:
@@ -325,8 +357,8 @@ def test_road_on_the_ground_needs_a_place() -> None:
     assert math.isnan(unknown.road.left)
     assert unknown.counts == {}
     assert known.counts["road_straight"] == 1
-    assert tally.by_cue["road_straight"].skipped == {REGION_NOT_SEEN: 1}
-    assert (tally.by_cue["road_straight"].seen, tally.by_cue["road_straight"].used) == (2, 1)
+    assert tally["road_straight"].skipped == {REGION_NOT_SEEN: 1}
+    assert (tally["road_straight"].seen, tally["road_straight"].used) == (2, 1)
 
 
 def test_cars_are_paired_with_the_previous_frame_until_restarted() -> None:
@@ -395,7 +427,7 @@ def test_frames_without_tracked_cars_are_counted_by_reason(
     frames = 3 if "focal" in why else 2
     assert cues.not_followed == {why: frames}
     assert cues.notes() == {f"crossing and parked cars: {why}": frames}
-    assert tally.by_cue.get("cross_traffic_left", Candidates("detections")).seen == 3 - frames
+    assert tally.get("cross_traffic_left", Candidates("detections")).seen == 3 - frames
 
 
 def test_tracked_cars_are_those_of_the_newest_frame() -> None:
@@ -411,7 +443,7 @@ def test_tracked_cars_are_those_of_the_newest_frame() -> None:
     assert {name for name in counts if "cars" in name} == set()
     past = cues(frame, EGO._replace(way_m=0.0), Place(10.0, 20.0, 1.0)).counts
     assert (past["oncoming_cars"], past["outgoing_cars"]) == (0, 0)
-    assert tally.by_cue["oncoming_cars"].skipped == {NOT_PAST: 1}
+    assert tally["oncoming_cars"].skipped == {NOT_PAST: 1}
     cues.restart()
     assert cues.followed() == []
 
@@ -424,7 +456,7 @@ def test_rules_get_the_tracked_cars_and_their_judgement(monkeypatch: pytest.Monk
     given: list[Pairs] = []
     judged_with: list[tuple[object, ...]] = []
 
-    def rules(observed_by: str, observed: object, settings: object) -> dict[str, int]:
+    def rules(observed_by: str, observed: object, settings: object) -> dict[str, Count]:
         given.extend([observed] if isinstance(observed, Pairs) else [])
         return {}
 
@@ -460,67 +492,64 @@ def test_rules_get_the_tracked_cars_and_their_judgement(monkeypatch: pytest.Monk
     assert len(judged_with) == 4
 
 
-def skipped(tally: CueTally, name: str) -> tuple[int, int, dict[str, int]]:
-    one = tally.by_cue[name]
+def skipped(tally: dict[str, Candidates], name: str) -> tuple[int, int, dict[str, int]]:
+    one = tally[name]
     assert one.seen == one.used + sum(one.skipped.values())
     return one.seen, one.used, one.skipped
 
 
 def test_labelled_candidates_are_below_the_score_or_not_counted() -> None:
-    """Lights 0.5, 0.6, 0.7 and 0.8 with 0.6: 2 are low; the rule counts 1 of the other 2."""
-    tally = CueTally(VEHICLE)
+    """Lights 0.5, 0.6, 0.7 and 0.8 with 0.6: 2 are low; a rule counts 1, or 9, of the other 2."""
     lights = found(*[("traffic light", score) for score in (0.5, 0.6, 0.7, 0.8)])
+    setting = "[cues] traffic_light_score"
 
-    tally.labelled("objects", [lights], {"traffic_light": 1, "stop_sign": 0, "one_way_left": 1})
+    few = count_by_label([lights], ["traffic light"], 1, setting, 0.6)
+    many = count_by_label([lights], ["traffic light"], 9, setting, 0.6)
 
-    assert set(tally.by_cue) == {"traffic_light", "stop_sign"}
-    assert skipped(tally, "traffic_light") == (4, 1, {BELOW_SCORE: 2, NOT_COUNTED: 1})
-    made = tally.by_cue["traffic_light"]
-    assert (made.unit, made.setting) == ("detections", "[cues] traffic_light_score")
-    assert (made.threshold, made.max_score) == (0.6, 0.8)
-    assert tally.by_cue["stop_sign"].threshold is None
-    tally.labelled("objects", [lights], {"traffic_light": 9})
-    assert skipped(tally, "traffic_light") == (8, 3, {BELOW_SCORE: 4, NOT_COUNTED: 1})
+    assert (few.number, many.number) == (1, 9)
+    assert few.skipped == {BELOW_SCORE: 2, NOT_COUNTED: 1}
+    assert many.skipped == {BELOW_SCORE: 2, NOT_COUNTED: 0}
+    assert (few.setting, few.thresholds, few.unit) == (setting, [0.6], "detections")
+    free = count_by_label([lights], ["traffic light"], 1, None, None)
+    assert (free.skipped, free.setting, free.thresholds) == ({NOT_COUNTED: 3}, None, ())
 
 
 def test_signs_have_no_threshold() -> None:
-    tally = CueTally(VEHICLE)
+    signs = _taken("signs", [found(("one way left", 0.1))])
 
-    tally.labelled("signs", [found(("one way left", 0.1))], {"one_way_left": 1})
-
-    assert skipped(tally, "one_way_left") == (1, 1, {})
-    assert (tally.by_cue["one_way_left"].setting, tally.by_cue["one_way_left"].threshold) == (
-        None,
-        None,
-    )
+    assert skipped(signs, "one_way_left") == (1, 1, {})
+    assert (signs["one_way_left"].setting, signs["one_way_left"].threshold) == (None, None)
 
 
 def test_own_cues_have_their_own_score() -> None:
-    """Zebras of 0.3 and 0.4 with 0.3: one is low. The cue without a count is left out."""
-    tally = CueTally(VEHICLE)
+    """Zebras of 0.3 and 0.4 with 0.3: one is low."""
+    things = [found(("stripes", 0.3), ("zebra", 0.4), ("dog", 0.9))]
 
-    tally.own([found(("stripes", 0.3), ("zebra", 0.4), ("dog", 0.9))], {"crossing": 1})
-    assert set(tally.by_cue) == {"crossing"}
-    assert skipped(tally, "crossing") == (2, 1, {BELOW_SCORE: 1})
-    made = tally.by_cue["crossing"]
-    assert (made.setting, made.threshold) == ("[cues.own.crossing] score", 0.3)
+    made = count_own(things, "crossing", VEHICLE.cues.own["crossing"])
 
-    tally.own([found(("dog", 0.9))], {"dogs": 1})
-    assert skipped(tally, "dogs") == (1, 1, {})
-    assert tally.by_cue["dogs"].threshold == 0.5
+    assert (made.number, made.scores, made.skipped) == (
+        1,
+        [0.3, 0.4],
+        {BELOW_SCORE: 1, NOT_COUNTED: 0},
+    )
+    assert (made.setting, made.thresholds) == ("[cues.own.crossing] score", [0.3])
 
 
-# 11 cars, of which 2 are not above 0.5.
-CARS = found(*[("car", 0.9)] * 9, ("car", 0.5), ("van", 0.4), ("dog", 0.9))
+def _pairs(cars: CarCandidates, judged: CarCounts | None = None) -> Pairs:
+    """Four cars, of which one moves to the left and the others away."""
+    steps = np.array([[-9.0, 0.0], [0.0, 9.0], [0.0, 9.0], [0.0, 9.0]])
+    return Pairs(steps, np.zeros((4, 2)), np.zeros(4, np.int64), 640, judged, cars)
+
+
+# 11 cars, of which 2 are not above 0.5; 7 are seen from the side.
+CARS = CarCandidates((*[0.9] * 9, 0.5, 0.4), 2, (0.5,), 7)
 
 
 def test_pairs_are_skipped_by_the_first_rule_that_fails() -> None:
     """11 cars: 2 low; 7 of 9 from the side; 4 of 7 found before; 1 and 0 cross."""
-    tally = CueTally(VEHICLE)
+    tally = _taken("car pairs", _pairs(CARS))
 
-    tally.cars([CARS], 7, 4, {"cross_traffic_left": 1, "parked_left": 6})
-
-    assert set(tally.by_cue) == {
+    assert set(tally) == {
         "cross_traffic_left",
         "cross_traffic_right",
         "parked_left",
@@ -529,52 +558,37 @@ def test_pairs_are_skipped_by_the_first_rule_that_fails() -> None:
     before = {BELOW_SCORE: 2, NOT_FROM_THE_SIDE: 2, NOT_FOUND_BEFORE: 3}
     assert skipped(tally, "cross_traffic_left") == (11, 1, before | {OTHER_MOTION: 3})
     assert skipped(tally, "cross_traffic_right") == (11, 0, before | {OTHER_MOTION: 4})
-    assert skipped(tally, "parked_left") == (11, 4, before)
-    made = tally.by_cue["cross_traffic_left"]
+    assert skipped(tally, "parked_left") == (11, 0, before | {OTHER_MOTION: 4})
+    made = tally["cross_traffic_left"]
     assert (made.unit, made.setting, made.threshold) == ("detections", "[cars] score", 0.5)
     assert made.max_score == 0.9
 
 
-def test_threshold_of_cars_is_the_detectors_where_none_is_set() -> None:
-    unset = VEHICLE.model_copy(update={"cars": Cars(kind="pairs")})
-    tally = CueTally(unset)
+@pytest.mark.parametrize(
+    ("cars", "low", "threshold"),
+    [(Cars(kind="pairs"), 1, 0.7), (Cars(kind="pairs", score=0.8), 1, 0.8)],
+)
+def test_score_of_cars_that_is_set_replaces_the_detectors(
+    cars: Cars, low: int, threshold: float
+) -> None:
+    """0.7 and 0.9: one is not above the detector's 0.7, nor above 0.8."""
+    cues, tally = _cues(VEHICLE.model_copy(update={"cars": cars}))
 
-    tally.cars([found(("car", 0.9), min_scores=[0.7])], 1, 1, {})
+    cues(FrameDetections(0, (found(("car", 0.7), ("car", 0.9), min_scores=[0.7, 0.7]),)))
 
-    assert tally.by_cue["parked_left"].threshold == 0.7
-
-
-def test_score_of_cars_that_is_set_replaces_the_detectors() -> None:
-    """0.7 and 0.9 with 0.8: one is low, although the detector's threshold is 0.6."""
-    tally = CueTally(VEHICLE.model_copy(update={"cars": Cars(kind="pairs", score=0.8)}))
-    cars = found(("car", 0.7), ("car", 0.9), min_scores=[0.6, 0.6])
-
-    tally.cars([cars], 1, 1, {"parked_left": 1})
-
-    assert skipped(tally, "parked_left") == (2, 1, {BELOW_SCORE: 1})
-    assert tally.by_cue["parked_left"].threshold == 0.8
-
-
-def test_threshold_of_followed_cars_is_the_detectors_where_none_is_set() -> None:
-    tally = CueTally(VEHICLE.model_copy(update={"cars": Cars(kind="tracks")}))
-    nothing = CarCounts(Sides(0, 0), Sides(0, 0), Sides(0, 0), Sides(0, 0), 1, 1)
-
-    tally.followed([found(("car", 0.9), min_scores=[0.7])], nothing, {"outgoing_cars": 0})
-
-    assert tally.by_cue["outgoing_cars"].threshold == 0.7
-    assert tally.by_cue["parked_left"].threshold == 0.7
+    assert tally["parked_left"].skipped[BELOW_SCORE] == low
+    assert tally["parked_left"].threshold == threshold
 
 
 def test_followed_cars_are_skipped_by_the_first_rule_that_fails() -> None:
     """11 cars: 2 low; 8 of 9 complete; 6 of 8 followed.
 
     Crossing left: 1 here and 2 elsewhere of 6, so 3 move otherwise. Right: 2 and 1. Parked left: 0
-    and 3; right: 4 and 0. Past: 2 of 9 outgoing; oncoming has no count.
+    and 3; right: 4 and 0. Past: 2 of 9 outgoing and 3 oncoming, where a place is known.
     """
-    tally = CueTally(VEHICLE)
     judged = CarCounts(Sides(1, 2), Sides(0, 4), Sides(2, 1), Sides(3, 0), 8, 6)
 
-    tally.followed([CARS], judged, {"outgoing_cars": 2})
+    tally = _taken("car pairs", _pairs(CARS, judged._replace(past=Ways(3, 2))))
 
     before = {BELOW_SCORE: 2, CUT_OR_FAR: 1, TOO_FEW_FRAMES: 2, OTHER_MOTION: 3}
     assert skipped(tally, "cross_traffic_left") == (11, 1, before | {ELSEWHERE: 2})
@@ -582,45 +596,46 @@ def test_followed_cars_are_skipped_by_the_first_rule_that_fails() -> None:
     assert skipped(tally, "parked_left") == (11, 0, before | {ELSEWHERE: 3})
     assert skipped(tally, "parked_right") == (11, 4, before | {OTHER_MOTION: 2})
     assert skipped(tally, "outgoing_cars") == (11, 2, {BELOW_SCORE: 2, NOT_PAST: 7})
-    assert "oncoming_cars" not in tally.by_cue
+    assert skipped(tally, "oncoming_cars") == (11, 3, {BELOW_SCORE: 2, NOT_PAST: 6})
+    assert tally["outgoing_cars"].threshold == 0.5
+    assert "oncoming_cars" not in _taken("car pairs", _pairs(CARS, judged))
 
 
 def test_doubles_are_skipped_for_cues_that_were_counted() -> None:
-    """Of a dog and two cars, the dog's cue has no count and that of crossing cars has a tally."""
-    tally = CueTally(VEHICLE)
-    tally.cars([found()], 0, 0, {})
+    """Of a dog and two cars in the second frame, the dog's cue has a count, and so have cars."""
+    cues, tally = _cues()
+    cues(FrameDetections(0, (found(),)))
+    doubles = (found(("dog", 0.9), ("car", 0.4), ("van", 0.95)),)
 
-    tally.doubles([found(("dog", 0.9), ("car", 0.4), ("van", 0.95))], {"parked_left": 0, "dogs": 1})
+    cues(FrameDetections(100 * MS, (found(t_ns=100 * MS),), doubles=doubles))
 
     assert skipped(tally, "parked_left") == (2, 0, {SAME_OBJECT: 2})
-    assert tally.by_cue["parked_left"].max_score == 0.95
-    assert skipped(tally, "parked_right") == (0, 0, {})
-    assert "dogs" not in tally.by_cue
+    assert tally["parked_left"].max_score == 0.95
+    assert skipped(tally, "dogs") == (1, 0, {SAME_OBJECT: 1})
+    assert skipped(tally, "traffic_light") == (0, 0, {})
 
 
 def test_road_is_a_candidate_of_its_side() -> None:
     """Fractions 0.2, not above 0.2; 0.21; and 0, where no road was found. Then none is seen."""
-    tally = CueTally(VEHICLE)
+    tally = _taken("road", RoadFractions(0.2, 0.21, 0.0))
 
-    tally.road(RoadFractions(0.2, 0.21, 0.0))
-
-    assert set(tally.by_cue) == {"road_left", "road_straight", "road_right"}
+    assert set(tally) == {"road_left", "road_straight", "road_right"}
     assert skipped(tally, "road_left") == (1, 0, {TOO_LITTLE_ROAD: 1})
     assert skipped(tally, "road_straight") == (1, 1, {})
     assert skipped(tally, "road_right") == (0, 0, {})
-    made = tally.by_cue["road_left"]
+    made = tally["road_left"]
     assert (made.unit, made.setting, made.threshold) == ("frames", "[cues] road_fraction", 0.2)
     assert made.max_score == 0.2
 
-    tally.road(RoadFractions(math.nan, math.nan, 0.5))
-    assert skipped(tally, "road_left") == (2, 0, {TOO_LITTLE_ROAD: 1, REGION_NOT_SEEN: 1})
-    assert skipped(tally, "road_right") == (1, 1, {})
-    unseen = CueTally(VEHICLE)
-    unseen.road(RoadFractions(math.nan, 0.1, 1.0))
-    made = unseen.by_cue["road_left"]
-    assert (made.unit, made.setting, made.threshold) == ("frames", "[cues] road_fraction", 0.2)
-    assert made.max_score == 0.0
+    unseen = _taken("road", RoadFractions(math.nan, 0.1, 1.0))
+    assert skipped(unseen, "road_left") == (1, 0, {REGION_NOT_SEEN: 1})
+    assert unseen["road_left"].max_score == 0.0
     assert skipped(unseen, "road_straight") == (1, 0, {TOO_LITTLE_ROAD: 1})
+    assert _numbers("road", RoadFractions(math.nan, 0.1, 1.0)) == {
+        "road_left": None,
+        "road_straight": 0,
+        "road_right": 1,
+    }
 
 
 def test_frames_are_explained_by_the_detectors_that_ran() -> None:
@@ -657,7 +672,7 @@ def test_cars_are_explained_if_a_detector_can_report_them(
 
     cues(FrameDetections(0, (found(("car", 0.9)),), labels=reported), EGO)
 
-    assert ("parked_left" in tally.by_cue) == is_explained
+    assert ("parked_left" in tally) == is_explained
     cues(FrameDetections(0, (), (found(("car", 0.9)),), labels=reported), EGO)
     if is_explained:
-        assert tally.by_cue["parked_left"].seen == 1
+        assert tally["parked_left"].seen == 1

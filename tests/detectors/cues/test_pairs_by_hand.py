@@ -9,6 +9,7 @@ import pytest
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.candidates import Count
 from crosscue.detectors.cues.cars import (
     CarShapes,
     Pairs,
@@ -265,14 +266,18 @@ def test_parked_car_stands_on_both_axes_and_shows_its_nose() -> None:
     assert parked_cars(pairs(), RULES) == Sides(0, 0)
 
 
+def number_of(found: Count | None) -> int | None:
+    return None if found is None else found.number
+
+
 def test_cues_of_a_pair_count_their_side() -> None:
     """Two cars cross to the left and one to the right; one is parked left and two right."""
     found = pairs((-4, 0), (-4, 0), (4, 0), (0, 0), (0, 0), (0, 0), noses=[0, 0, 0, -1, 1, 1])
 
-    assert count_crossing(found, VEHICLE, CUES["cross_traffic_left"]) == 2
-    assert count_crossing(found, VEHICLE, CUES["cross_traffic_right"]) == 1
-    assert count_parked(found, VEHICLE, CUES["parked_left"]) == 1
-    assert count_parked(found, VEHICLE, CUES["parked_right"]) == 2
+    assert number_of(count_crossing(found, VEHICLE, CUES["cross_traffic_left"])) == 2
+    assert number_of(count_crossing(found, VEHICLE, CUES["cross_traffic_right"])) == 1
+    assert number_of(count_parked(found, VEHICLE, CUES["parked_left"])) == 1
+    assert number_of(count_parked(found, VEHICLE, CUES["parked_right"])) == 2
     assert count_oncoming(found, VEHICLE, CUES["oncoming_cars"]) is None
     assert count_outgoing(found, VEHICLE, CUES["outgoing_cars"]) is None
 
@@ -281,12 +286,12 @@ def test_cues_of_tracked_cars_are_those_judged_over_frames() -> None:
     judged = CarCounts(Sides(1, 2), Sides(3, 4), Sides(5, 6), Sides(7, 8), 9, 9, Ways(10, 11))
     found = Pairs(np.array([[-4.0, 0.0]]), np.zeros((1, 2)), np.zeros(1, np.int64), 400, judged)
 
-    assert count_crossing(found, VEHICLE, CUES["cross_traffic_left"]) == 1
-    assert count_crossing(found, VEHICLE, CUES["cross_traffic_right"]) == 2
-    assert count_parked(found, VEHICLE, CUES["parked_left"]) == 3
-    assert count_parked(found, VEHICLE, CUES["parked_right"]) == 4
-    assert count_oncoming(found, VEHICLE, CUES["oncoming_cars"]) == 10
-    assert count_outgoing(found, VEHICLE, CUES["outgoing_cars"]) == 11
+    assert number_of(count_crossing(found, VEHICLE, CUES["cross_traffic_left"])) == 1
+    assert number_of(count_crossing(found, VEHICLE, CUES["cross_traffic_right"])) == 2
+    assert number_of(count_parked(found, VEHICLE, CUES["parked_left"])) == 3
+    assert number_of(count_parked(found, VEHICLE, CUES["parked_right"])) == 4
+    assert number_of(count_oncoming(found, VEHICLE, CUES["oncoming_cars"])) == 10
+    assert number_of(count_outgoing(found, VEHICLE, CUES["outgoing_cars"])) == 11
     unknown = Pairs(found.step_px, found.center_px, found.nose, 400, judged._replace(past=None))
     assert count_oncoming(unknown, VEHICLE, CUES["oncoming_cars"]) is None
     assert count_outgoing(unknown, VEHICLE, CUES["outgoing_cars"]) is None

@@ -97,7 +97,8 @@ def test_road_is_a_cue_above_the_fraction(
     fractions = RoadFractions(left, straight, right)
 
     found = [
-        is_road(fractions, vehicle, CUES[f"road_{side}"]) for side in ("left", "straight", "right")
+        is_road(fractions, vehicle, CUES[f"road_{side}"]).number
+        for side in ("left", "straight", "right")
     ]
 
     assert tuple(found) == counts

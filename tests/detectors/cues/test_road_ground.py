@@ -16,7 +16,6 @@ from crosscue.detectors.cues.candidates import REGION_NOT_SEEN
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections, Place, RoadFractions
 from crosscue.detectors.cues.road_ground import ground_fractions, outlines
-from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Regions, Vehicle, parse
@@ -166,8 +165,8 @@ def test_coarse_mask_does_not_resolve_a_distant_region() -> None:
 
 def test_unseen_region_yields_no_count_and_is_tallied() -> None:
     vehicle = Vehicle(version=1, camera=CAMERA, regions=Regions(kind="ground"))
-    tally = CueTally(vehicle)
-    cues = CuePass(vehicle, tally=tally)
+    cues = CuePass(vehicle)
+    tally = cues.candidates
 
     unseen = cues(FrameDetections(0, road=pictured(3.0, 6.0)))
     seen = cues(FrameDetections(1, road=pictured(3.0, 6.0)), None, at(16.0))
@@ -178,7 +177,7 @@ def test_unseen_region_yields_no_count_and_is_tallied() -> None:
         "road_straight": 1,
         "road_right": 0,
     }
-    assert tally.by_cue["road_left"].skipped[REGION_NOT_SEEN] == 1
+    assert tally["road_left"].skipped[REGION_NOT_SEEN] == 1
     assert isinstance(seen.road, RoadFractions)
 
 

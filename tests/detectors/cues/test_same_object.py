@@ -11,7 +11,6 @@ from crosscue.detectors.cues.candidates import SAME_OBJECT
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections
 from crosscue.detectors.cues.same_object import KEPT, MIN_IOU, label_meanings, same_objects
-from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.object_tracks import iou
 from crosscue.replay.vehicle.vehicle import Cars, Cues, Vehicle
 
@@ -106,12 +105,12 @@ def test_identical_second_detector_is_dropped_completely(things: list[Object]) -
 
 
 def test_duplicate_detection_is_tallied_with_its_reason() -> None:
-    tally = CueTally(VEHICLE)
-    cues = CuePass(VEHICLE, tally=tally)
+    cues = CuePass(VEHICLE)
+    tally = cues.candidates
     light, weaker = found(("traffic light", 0.95, 10.0)), found(("traffic light", 0.7, 10.0))
 
     counts = cues(FrameDetections(0, objects=(light, found()), doubles=(weaker,))).counts
 
-    lights = tally.by_cue["traffic_light"]
+    lights = tally["traffic_light"]
     assert counts["traffic_light"] == lights.used == 1
     assert (lights.seen, lights.skipped) == (2, {SAME_OBJECT: 1})

@@ -10,7 +10,6 @@ from crosscue.detectors.base import ACCEPTED, Detections
 from crosscue.detectors.cues.candidates import TOO_LITTLE_EVIDENCE
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections
-from crosscue.detectors.cues.tally import CueTally
 from crosscue.detectors.ranging.control_tracks import ControlTracks
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
@@ -202,8 +201,7 @@ def test_sign_that_looks_like_another_one_is_rejected_with_the_reason(look: str,
 
 def test_cue_counts_accepted_tracks_and_the_rest_is_accounted_for() -> None:
     vehicle = car()
-    tally = CueTally(vehicle)
-    cues = CuePass(vehicle, tally=tally)
+    cues = CuePass(vehicle)
     counts = []
     for i in range(20):
         seen = frame(
@@ -213,7 +211,7 @@ def test_cue_counts_accepted_tracks_and_the_rest_is_accounted_for() -> None:
 
     assert counts[0] == 0
     assert counts[-1] == 1
-    found = tally.by_cue["traffic_light"]
+    found = cues.candidates["traffic_light"]
     assert (found.seen, found.used) == (40, sum(counts))
     assert found.skipped == {TOO_LITTLE_EVIDENCE: 40 - sum(counts)}
 

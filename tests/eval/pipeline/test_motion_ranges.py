@@ -144,7 +144,7 @@ def test_boxes_cut_by_image_edge_yield_no_range_and_are_counted() -> None:
     car = vehicle()
     seen = found([aside], 0.0)
     counted = SignRanges(car)
-    counted([seen], [seen.boxes_px[:, 3] - seen.boxes_px[:, 1]])
+    counted([seen])
 
     assert drive(Drive(car), [aside], 3)[0] == ()
     assert counted.by_cue["traffic_light"].skipped == {CUT: 1}
