@@ -23,7 +23,7 @@ from crosscue.datasets.simulated.log_files import BUS, GYRO, MAGNETOMETER, senso
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, DetectorChoice, Found, Frame, View
 from crosscue.eval.pipeline.detect import detect_drive
-from crosscue.eval.pipeline.replay import estimate_run
+from crosscue.eval.pipeline.whole_run import estimate_run
 from crosscue.eval.runs.folder import create, open_run
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Images, Messages, Topic

@@ -33,7 +33,7 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import DetectorChoice
 from crosscue.detectors.images import Encoded
 from crosscue.eval.pipeline.detect import detect_drive
-from crosscue.eval.pipeline.replay import estimate_run
+from crosscue.eval.pipeline.whole_run import estimate_run
 from crosscue.eval.recording import save_rrd
 from crosscue.eval.runs.folder import RunFolder, create, open_run
 from crosscue.eval.runs.stored_images import read_pictures, run_camera

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +12,7 @@ from crosscue.eval.logs.log import DriveGiven, opened, vehicle_of
 from crosscue.eval.pipeline.drive_time import time_segments, whole_timeline
 from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
 from crosscue.eval.runs.account import Account, account, account_lines, details_of, reading_of
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, clear, created, locked, staged, write_manifest
 from crosscue.eval.runs.logs import log_names
 from crosscue.eval.runs.manifest import DecodeManifest
@@ -150,22 +151,15 @@ def decode(
     """
     settings = vehicle_of(log, vehicle)
     with opened(log) as drive, created(Path(output), overwrite=overwrite) as folder:
-        return decode_tables(drive.logs, settings, folder, drive.selection)
+        return decode_tables(Drive(drive.logs, settings, drive.selection), folder)
 
 
-def decode_tables(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    run: RunFolder,
-    selection: Selection,
-) -> Decoded:
+def decode_tables(drive: Drive, run: RunFolder) -> Decoded:
     """Write all streams of a drive as tables.
 
     Args:
-        logs: Open logs.
-        vehicle: DBC files, buses and the Mobileye's mounting.
+        drive: The drive; its vehicle has DBC files, buses and the Mobileye's mounting.
         run: Folder for the tables; cleared first.
-        selection: The part of the logs to decode.
 
     Raises:
         SchemaError: A DBC file cannot be read.
@@ -173,10 +167,11 @@ def decode_tables(
         EmptyResultError: The selected part contains no row; the folder is unchanged.
         OutputError: The disk is full.
     """
+    logs, vehicle, selection = drive.logs, drive.vehicle, drive.selection
     ledgers = tuple(map(Ledger, log_names(logs)))
     tables: dict[str, _Table] = {}
     declared = sum(map(rows_declared, logs))
-    timeline = whole_timeline(logs, vehicle, selection)
+    timeline = whole_timeline(drive)
     with locked(run), staged(run, always=True) as new, nothing_left(new):
         clear(new)
         with ExitStack() as stack:

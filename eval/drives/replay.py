@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 from crosscue.detectors.result_cache import default_cache
 from crosscue.eval.logs.log import DriveGiven, Log, UnopenedLog, opened, vehicle_of
 from crosscue.eval.pipeline.run import Run, RunGiven, run_given
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, copy_files, created
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.vehicle.pose import GnssUse
@@ -126,7 +127,7 @@ def replay_with(
     from crosscue.eval.fit.first_pose import check_start, with_start
     from crosscue.eval.pipeline.detect import Detecting
     from crosscue.eval.pipeline.landmarks import matcher_for, open_for
-    from crosscue.eval.pipeline.replay import replay_drive as replay_into
+    from crosscue.eval.pipeline.whole_run import replay_drive as replay_into
 
     overwrite, resume = settings.overwrite, settings.resume
     vehicle = vehicle_of(log, settings.vehicle)
@@ -147,15 +148,8 @@ def replay_with(
         drive = stack.enter_context(opened(log))
         vehicle = with_start(drive.logs, vehicle, drive.selection, settings.gnss, first_pose)
         folder = stack.enter_context(created(Path(output), overwrite=overwrite, resume=resume))
-        outcome = replay_into(
-            drive.logs,
-            vehicle,
-            folder,
-            drive.selection,
-            database,
-            detecting,
-            overwrite=overwrite,
-        )
+        whole = Drive(drive.logs, vehicle, drive.selection)
+        outcome = replay_into(whole, folder, detecting, database, overwrite=overwrite)
     return Run(folder, outcome)
 
 
@@ -186,22 +180,16 @@ def detect_drive(
         EmptyResultError: The result is empty; the folder is unchanged.
     """
     from crosscue.detectors.registry import known
-    from crosscue.eval.pipeline.detect import detect_drive as detect_into
+    from crosscue.eval.pipeline.detect import Detecting
+    from crosscue.eval.pipeline.whole_run import detect_drive as detect_into
 
     vehicle = vehicle_of(log, settings.vehicle)
     choices = choices_for(vehicle, settings.detector_names)
     if not choices:
         raise UsageError(f"detectors: none named; expected some of {', '.join(known({}))}")
     with opened(log) as drive, created(Path(output), overwrite=settings.overwrite) as folder:
-        outcome = detect_into(
-            drive.logs,
-            vehicle,
-            folder,
-            drive.selection,
-            choices,
-            settings.cache_path,
-            settings.draw,
-        )
+        detecting = Detecting(choices, settings.cache_path, settings.draw)
+        outcome = detect_into(Drive(drive.logs, vehicle, drive.selection), folder, detecting)
     return Run(folder, outcome)
 
 
@@ -234,7 +222,7 @@ def estimate_run(
         RunError: The run is damaged, or its log is missing.
         OutputError: The new folder exists.
     """
-    from crosscue.eval.pipeline.replay import estimate_run as estimate_in
+    from crosscue.eval.pipeline.whole_run import estimate_run as estimate_in
 
     folder = run_given(run).folder
     settings = _settings_again(

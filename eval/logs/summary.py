@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Final
 
 from crosscue.eval.pipeline.drive_time import plan_for_time, time_segments
-from crosscue.replay.base import Log, Selection
+from crosscue.eval.runs.drive import Drive
 from crosscue.replay.clocks.findings import instant_text
 from crosscue.replay.logs.log_summary import (
     LogSummary,
@@ -99,27 +99,20 @@ def info(
     """
     settings = vehicle_given(vehicle)
     with opened(log) as drive:
-        return summary_of(drive.logs, drive.selection, settings, quick=quick)
+        return summary_of(Drive(drive.logs, settings, drive.selection), quick=quick)
 
 
-def summary_of(
-    logs: Sequence[Log],
-    selection: Selection,
-    vehicle: Vehicle,
-    *,
-    quick: bool,
-) -> DriveSummary:
+def summary_of(drive: Drive, *, quick: bool) -> DriveSummary:
     """Summarise logs, by reading each once or only its declarations.
 
     Args:
-        logs: Open logs of one drive.
-        selection: The part to read.
-        vehicle: Vehicle file with the topic of wheel speeds, to find gaps.
+        drive: The drive; its vehicle has the topic of wheel speeds, to find gaps.
         quick: Do not read messages.
     """
+    logs, vehicle, selection = drive.logs, drive.vehicle, drive.selection
     if quick:
         return DriveSummary(tuple(map(quick_summary, logs)), None)
-    planned, wheels = plan_for_time(logs, vehicle, selection)
+    planned, wheels = plan_for_time(drive)
     watches = [LogWatch(i, planned, vehicle, wheels[i]) for i in range(len(logs))]
     found = tuple(
         summarise_log(log, selection, watch.add) for log, watch in zip(logs, watches, strict=True)

@@ -7,9 +7,9 @@ stores, in ``estimate``, so a rule or its settings can change without a picture.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,15 +36,13 @@ from crosscue.detectors.runner import FrameCounts, FrameResult, Named, Runner
 from crosscue.eval.pipeline.outcome import DetectOutcome
 from crosscue.eval.pipeline.scene.looked_for import uncounted
 from crosscue.eval.runs.account import Account, account, detecting_of, reading_of
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import (
     RunFolder,
-    clear,
-    locked,
-    staged,
     write_manifest,
     write_timings,
 )
-from crosscue.eval.runs.logs import input_of, is_simulated, log_names, log_rows
+from crosscue.eval.runs.logs import is_simulated, log_names, log_rows
 from crosscue.eval.runs.manifest import (
     DetectCounts,
     DetectManifest,
@@ -57,20 +55,19 @@ from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.replay.base import Log, Selection
 from crosscue.replay.columns import Block, Int64s, Topic
-from crosscue.replay.errors import EmptyResultError, VehicleError
+from crosscue.replay.errors import VehicleError
 from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.signals.extractor import SampleExtractor, probe_clocks
-from crosscue.replay.signals.plan import chosen_camera, pictures_only
-from crosscue.replay.time.segments import LogClock, TimedLog, Timeline, gaps_text, shift_of
+from crosscue.replay.signals.plan import pictures_only
+from crosscue.replay.time.segments import TimedLog, gaps_text, shift_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.versions import versions_and_commit
 
 from .clocks import clock_rows
-from .drive_time import camera_timeline, time_segments
-from .empty_result import empty_result, nothing_left
+from .drive_time import time_segments
+from .empty_result import empty_result
 from .visual import TABLE as VISUAL
 from .visual import VisualPass, uses_pictures, visual_schema
 
@@ -109,101 +106,103 @@ def choices_of(vehicle: Vehicle) -> dict[str, DetectorChoice]:
     }
 
 
-def detect_drive(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    run: RunFolder,
-    selection: Selection,
-    choices: Sequence[DetectorChoice],
-    cache: Path | None = None,
-    draw: int = 0,
-) -> DetectOutcome:
-    """Run detectors over the only camera of a drive, into an empty run folder.
+class DetectStage:
+    """Detectors over the only camera of a drive, with the tables of a locked run folder."""
 
-    The folder is locked meanwhile, and cleared first. See ``detect_into`` for the arguments.
-    """
-    with locked(run), staged(run) as new, nothing_left(new):
-        clear(new, input_of(run, logs, vehicle, selection, choices, draw, None))
-        detecting = Detecting(tuple(choices), cache, draw)
-        outcome = detect_into(logs, vehicle, new, selection, detecting)
-    return replace(outcome, run=run)
+    def __init__(self, drive: Drive, run: RunFolder, detecting: Detecting, cache: ResultCache):
+        """Build the detectors.
 
-
-def detect_into(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    run: RunFolder,
-    selection: Selection,
-    detecting: Detecting,
-    timeline: Timeline | None = None,
-) -> DetectOutcome:
-    """Run detectors over the only camera of a drive, into a locked run folder.
-
-    Args:
-        logs: All open logs of the drive.
-        vehicle: Settings of the vehicle file.
-        run: The run folder.
-        selection: The part of the logs to use.
-        detecting: Detectors, cache and pictures to write.
-        timeline: The drive's time segments, if already known.
-
-    Raises:
-        VehicleError: The drive has several cameras, or a card, weights or settings are invalid.
-        EmptyResultError: The drive has no camera, or the selected part contains no frame.
-        OutputError: The disk is full.
-    """
-    began = time.monotonic()
-    choices = detecting.choices
-    camera = only_camera(logs, vehicle)
-    named = [Named(choice.name, make(choice)) for choice in choices]
-    _refuse_uncounted(named, choices, vehicle)
-    reading = _Reading(logs, camera, vehicle, selection, timeline)
-    with ResultCache(detecting.cache) as results:
-        runner = Runner(
+        Raises:
+            VehicleError: The drive has several cameras, or a card, weights or settings are invalid.
+            EmptyResultError: The drive has no camera.
+        """
+        self._began = time.monotonic()
+        self._drive, self._choices, vehicle = drive, detecting.choices, drive.vehicle
+        self._camera = drive.only_camera()
+        named = [Named(choice.name, make(choice)) for choice in detecting.choices]
+        _refuse_uncounted(named, detecting.choices, vehicle)
+        self._pictures = _Pictures(drive, self._camera)
+        self._runner = Runner(
             named,
-            results,
-            reading.topic.name,
+            cache,
+            self._pictures.topic.name,
             vehicle.camera.depth_bits,
-            reading.spoil,
+            self._pictures.spoil,
             vehicle.cues.traffic_light_labels,
             vehicle.cues.stop_sign_labels,
             is_one_size=vehicle.camera.focal_px is not None,
         )
-        tables = _Tables(
+        is_compared = uses_pictures(drive, finds_road=_finds_road(named))
+        self.tables = DetectTables(
             run,
-            reading.topic.name,
-            vehicle,
+            self._pictures.topic.name,
+            drive,
             named,
             Drawer(run.file("pictures"), detecting.draw),
-            [choice.kind == "signs" for choice in choices],
-            reading.timeline,
-            reading.clock,
-            visual=VisualPass(vehicle)
-            if uses_pictures(logs, vehicle, finds_road=_finds_road(named))
-            else None,
+            [choice.kind == "signs" for choice in detecting.choices],
+            visual=VisualPass(vehicle) if is_compared else None,
         )
-        _run_detectors(reading, runner, tables)
-        frames = runner.counts.frames
-        if not frames:
-            raise empty_result(_no_frames(reading.topic, reading.ledger), logs, selection)
+
+    def frames(self) -> Iterator[FrameResult]:
+        """Yield the results of all pictures, in order."""
+        topic, counts = self._pictures.topic, self._runner.counts
+        # A part of the drive has an unknown number of frames.
+        declared = None if self._drive.selection.is_timed else topic.declared
+        for block in self._pictures.blocks():
+            for result in self._runner(block):
+                yield result
+                emit(Progress("detecting", counts.frames, declared, "frames"))
+
+    def finish(self) -> DetectOutcome:
+        """Write account, timings and manifest.
+
+        Raises:
+            EmptyResultError: The selected part contains no frame.
+            OutputError: The disk is full.
+        """
+        drive, tables, pictures = self._drive, self.tables, self._pictures
+        counts, ledger, run = self._runner.counts, pictures.ledger, tables.run
+        if not counts.frames:
+            raise empty_result(_no_frames(pictures.topic, ledger), drive.logs, drive.selection)
         made = account(
-            reading_of([reading.ledger]), detecting_of(reading.topic.name, reading.ledger, frames)
+            reading_of([ledger]), detecting_of(pictures.topic.name, ledger, counts.frames)
         )
-        write_skipped(run, [reading.ledger], made.reading, timeline=reading.timeline)
-        seconds = time.monotonic() - began
-        write_timings(run, _timings(seconds, runner.counts))
-        manifest = _manifest(reading, choices, runner.counts, tables, made)
+        write_skipped(run, [ledger], made.reading, timeline=drive.segments)
+        seconds = time.monotonic() - self._began
+        write_timings(run, _timings(seconds, counts))
+        manifest = self._manifest(made)
         write_manifest(run, manifest)
-    return DetectOutcome(
-        run,
-        reading.ledger,
-        runner.counts,
-        tables.objects,
-        manifest.notices,
-        seconds,
-        made,
-        reading.timeline.has_gaps,
-    )
+        return DetectOutcome(
+            run,
+            ledger,
+            counts,
+            tables.objects,
+            manifest.notices,
+            seconds,
+            made,
+            drive.segments.has_gaps,
+        )
+
+    def _manifest(self, made: Account) -> DetectManifest:
+        drive, tables, extractor = self._drive, self.tables, self._pictures.extractor
+        return DetectManifest(
+            versions=versions_and_commit(),
+            logs=log_rows(drive.logs, tables.run),
+            selection=selection_record(drive.selection),
+            settings=drive.vehicle,
+            camera=self._camera[1].name,
+            camera_log=self._camera[0],
+            time=time_segments(drive.segments),
+            detectors=_detector_rows(tables.detectors, self._choices, tables),
+            clocks=(clock_rows(extractor.clocks, extractor.watch.reports()),),
+            account=made,
+            counts=DetectCounts(frames=self._runner.counts.frames, objects=tables.objects),
+            notices=(
+                *gaps_text(drive.segments.segments),
+                *_simulated_only(self._choices, drive.logs),
+                *tables.size_notices(),
+            ),
+        )
 
 
 def _finds_road(named: Sequence[Named]) -> bool:
@@ -211,118 +210,44 @@ def _finds_road(named: Sequence[Named]) -> bool:
     return any(reportable(one.detector) == () for one in named)
 
 
-def only_camera(logs: Sequence[Log], vehicle: Vehicle) -> tuple[int, Topic]:
-    """Return the index of the camera's log, and its topic.
+class _Pictures:
+    """The pictures of a drive, with their ledger and clock."""
 
-    Raises:
-        VehicleError: The drive has several cameras.
-        EmptyResultError: It has none.
-        LogError: It has none, and a log is damaged.
-    """
-    camera = chosen_camera(
-        [(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle
-    )
-    with unless_damaged(logs, EmptyResultError):
-        if camera is None:
-            raise EmptyResultError(
-                f"{logs[0].path}: no camera in the logs, which detectors and landmarks need; name "
-                "its topic under [topics], or leave them out"
-            )
-    return camera
-
-
-class _Reading:
-    """The camera of a drive, with its ledger, time segments and chosen clock."""
-
-    def __init__(
-        self,
-        logs: Sequence[Log],
-        camera: tuple[int, Topic],
-        vehicle: Vehicle,
-        selection: Selection,
-        timeline: Timeline | None,
-    ) -> None:
-        self.logs = logs
-        self.number, self.topic = camera
-        self.vehicle = vehicle
-        self.selection = selection
-        self.ledger = Ledger(log_names(logs)[self.number])
-        self._log = logs[self.number]
-        self._narrowed = Selection(
-            frozenset({self.topic.name}), selection.start_ns, selection.end_ns
-        )
+    def __init__(self, drive: Drive, camera: tuple[int, Topic]) -> None:
+        number, self.topic = camera
+        self.ledger = Ledger(log_names(drive.logs)[number])
+        self._log, part = drive.logs[number], drive.selection
+        self._part = Selection(frozenset({self.topic.name}), part.start_ns, part.end_ns)
+        self._clock = drive.segments.clock(number)
         planned = pictures_only(camera)
-        clocks = probe_clocks(self._log, planned, vehicle, self.number, self._narrowed)
-        self.timeline = timeline or camera_timeline(logs, vehicle, selection, camera)
-        self.clock = self.timeline.clock(self.number)
+        clocks = probe_clocks(self._log, planned, drive.vehicle, number, self._part)
         self.extractor = SampleExtractor(
             planned,
-            vehicle,
-            self.number,
+            drive.vehicle,
+            number,
             self.ledger,
             clocks,
-            shift_at=shift_of(self.timeline, self.number),
+            shift_at=shift_of(drive.segments, number),
         )
 
     def spoil(self, t_ns: int, reason: str, why: str) -> None:
         """Count the picture at a drive time as dropped."""
-        log_ns = int(self.clock.log_times(np.array([t_ns]))[0])
+        log_ns = int(self._clock.log_times(np.array([t_ns]))[0])
         self.ledger.spoil(self.topic.name, reason, 1, why, log_ns)
 
-    def pass_pictures(self, on_pictures: Callable[[Block], None]) -> None:
-        """Read the camera's log and pass every block of pictures to ``on_pictures``."""
-        self.extractor.on_pictures = on_pictures
-        timed = TimedLog(self._log, self.clock)
-        for block in self.ledger.handing_on(timed.read(self.ledger, self._narrowed)):
+    def blocks(self) -> Iterator[Block]:
+        """Read the camera's log and yield every block of pictures."""
+        held: list[Block] = []
+        self.extractor.on_pictures = held.append
+        timed = TimedLog(self._log, self._clock)
+        for block in self.ledger.handing_on(timed.read(self.ledger, self._part)):
             for _ in self.extractor(block):
                 pass
+            yield from held
+            held.clear()
         for _ in self.extractor.finish():
             pass
-
-
-def _run_detectors(reading: _Reading, runner: Runner, tables: _Tables) -> None:
-    """Run the detectors over all pictures and write the tables."""
-    declared = _declared(reading.topic, reading.selection)
-
-    def detect(block: Block) -> None:
-        for result in runner(block):
-            tables.add(result)
-            emit(Progress("detecting", runner.counts.frames, declared, "frames"))
-
-    with tables:
-        reading.pass_pictures(detect)
-
-
-def _manifest(
-    reading: _Reading,
-    choices: Sequence[DetectorChoice],
-    counts: FrameCounts,
-    tables: _Tables,
-    made: Account,
-) -> DetectManifest:
-    """Return the manifest of the detect stage."""
-    extractor = reading.extractor
-    return DetectManifest(
-        versions=versions_and_commit(),
-        logs=log_rows(reading.logs, tables.run),
-        selection=selection_record(reading.selection),
-        settings=reading.vehicle,
-        camera=reading.topic.name,
-        camera_log=reading.number,
-        time=time_segments(reading.timeline),
-        detectors=_detector_rows(tables.detectors, choices, tables),
-        clocks=(clock_rows(extractor.clocks, extractor.watch.reports()),),
-        account=made,
-        counts=DetectCounts(
-            frames=counts.frames,
-            objects=tables.objects,
-        ),
-        notices=(
-            *gaps_text(reading.timeline.segments),
-            *_simulated_only(choices, reading.logs),
-            *tables.size_notices(),
-        ),
-    )
+        yield from held
 
 
 def _timings(seconds: float, counts: FrameCounts) -> Timings:
@@ -333,11 +258,6 @@ def _timings(seconds: float, counts: FrameCounts) -> Timings:
     return Timings(seconds=seconds, detect=detect)
 
 
-def _declared(topic: Topic, selection: Selection) -> int | None:
-    """Return the number of frames that the log declares; None if a time span is selected."""
-    return None if selection.is_timed else topic.declared
-
-
 def _no_frames(topic: Topic, ledger: Ledger) -> str:
     gone = ledger.topic(topic.name).dropped.total()
     dropped = f" ({gone:,} are damaged)" if gone else ""
@@ -345,7 +265,7 @@ def _no_frames(topic: Topic, ledger: Ledger) -> str:
 
 
 def _detector_rows(
-    named: Sequence[Named], choices: Sequence[DetectorChoice], tables: _Tables
+    named: Sequence[Named], choices: Sequence[DetectorChoice], tables: DetectTables
 ) -> tuple[DetectorRow, ...]:
     """Return the manifest's rows of the detectors, in order."""
     return tuple(
@@ -402,17 +322,15 @@ def _refuse_uncounted(
 
 
 @dataclass(slots=True)
-class _Tables:
+class DetectTables:
     """The tables of the stage, written frame by frame."""
 
     run: RunFolder
     camera: str
-    vehicle: Vehicle
+    drive: Drive
     detectors: Sequence[Named]
     drawer: Drawer
     is_for_signs: Sequence[bool]
-    timeline: Timeline
-    clock: LogClock
     visual: VisualPass | None = None
     objects: dict[str, int] = field(default_factory=dict)
     masked: dict[str, set[str]] = field(default_factory=dict)
@@ -431,12 +349,14 @@ class _Tables:
         """Labels of objects reported only without masks, by detector."""
         return {name: labels - self.masked.get(name, set()) for name, labels in self._boxed.items()}
 
-    def __enter__(self) -> _Tables:
+    def __enter__(self) -> DetectTables:
         with ExitStack() as stack:
+            timeline = self.drive.segments
+            clock = timeline.clock(self.drive.only_camera()[0])
             for name, schema in detect_schemas().items():
                 if name == VISUAL and self.visual is None:
                     continue
-                sink = LabelledSink(self.run, name, schema, self.timeline, self.clock)
+                sink = LabelledSink(self.run, name, schema, timeline, clock)
                 self._sinks[name] = stack.enter_context(sink)
                 self._held[name] = []
             self._open = stack.pop_all()
@@ -464,8 +384,8 @@ class _Tables:
         self._sizes[result.size_px] = number + 1, first_ns
         self._frame += 1
         if self._frame == 0:
-            self.vehicle.camera.check_size(result.size_px)
-            self._meanings = label_meanings(self.vehicle)
+            self.drive.vehicle.camera.check_size(result.size_px)
+            self._meanings = label_meanings(self.drive.vehicle)
         again = self._duplicates(result.found)
         self._held["frames"].append(
             {
@@ -484,7 +404,7 @@ class _Tables:
                 self._held["detections"] += self._detection_rows(named.name, found, again[number])
         road = next((one for one in result.found if isinstance(one, RoadMask)), None)
         if road is not None:
-            fractions = road_fractions(road, self.vehicle.regions)
+            fractions = road_fractions(road, self.drive.vehicle.regions)
             self._held["road"].append(
                 {
                     "frame": self._frame,
@@ -523,7 +443,7 @@ class _Tables:
         self, name: str, found: Detections, again: Int64s
     ) -> list[dict[str, object]]:
         rows: list[dict[str, object]] = []
-        heights_px = found.measured().heights_px.tolist()
+        heights_px, vehicle = found.measured().heights_px.tolist(), self.drive.vehicle
         for i, label in enumerate(found.labels):
             x0, y0, x1, y1 = found.boxes_px[i].tolist()
             key = f"{name}: {label}"
@@ -531,7 +451,7 @@ class _Tables:
             by_mask = self.masked if found.masks[i] else self._boxed
             by_mask.setdefault(name, set()).add(label)
             height = heights_px[i]
-            ranged = detection_range(self.vehicle, label, found.boxes_px[i], height, found.size_px)
+            ranged = detection_range(vehicle, label, found.boxes_px[i], height, found.size_px)
             rows.append(
                 {
                     "frame": self._frame,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import TimeSegments
-from crosscue.replay.base import Log, Selection
+from crosscue.replay.base import Selection
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.signals.extractor import SampleExtractor, probe_clocks, wheels_only
@@ -19,51 +20,46 @@ from crosscue.replay.time.segments import Timeline, gaps_text
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 
-def drive_timeline(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    selection: Selection,
-    camera: tuple[int, Topic] | None = None,
-    known: Timeline | None = None,
-) -> Timeline:
-    """Read a drive's stamps once and find its segments.
+def with_segments(
+    drive: Drive, camera: tuple[int, Topic] | None = None, known: Timeline | None = None
+) -> Drive:
+    """Read a drive's stamps once, and return it with its time segments.
 
     Args:
-        logs: All open logs of the drive.
-        vehicle: Settings of the vehicle file.
-        selection: The part of the logs that will be read.
+        drive: The drive, without segments.
         camera: Camera whose stamps are examined as well.
         known: Segments found by an earlier stage; their shifts are kept.
 
     Raises:
         VehicleError: The vehicle file does not fit the logs.
     """
-    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
-    planned = plan(topics, vehicle)
+    logs, vehicle = drive.logs, drive.vehicle
+    planned = plan(drive.topics, vehicle)
     if camera is not None:
         planned = with_pictures(planned, camera)
-    selections = selections_of(logs, planned, selection)
+    selections = selections_of(drive, planned)
     wheels = [
         wheels_only(planned, vehicle, i, probe_clocks(log, planned, vehicle, i, selections[i]))
         for i, log in enumerate(logs)
     ]
-    return scan(logs, planned, vehicle, selections, wheels, known)
+    return replace(drive, segments=scan(logs, planned, vehicle, selections, wheels, known))
 
 
-def camera_timeline(
-    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, camera: tuple[int, Topic]
-) -> Timeline:
-    """Return the segments as ``drive_timeline`` does, for a stage that needs only the camera.
+def with_camera_segments(drive: Drive) -> Drive:
+    """Return a drive with segments as ``with_segments``, for a stage that needs only the camera.
 
     If the vehicle file does not fit the odometry, only the camera's own clock is examined. The
     stage that needs the odometry reports the error.
     """
+    camera = drive.only_camera()
     try:
-        return drive_timeline(logs, vehicle, selection, camera)
+        return with_segments(drive, camera)
     except VehicleError:
-        planned = pictures_only(camera)
-        selections = selections_of(logs, planned, selection)
-        return scan(logs, planned, vehicle, selections, _no_wheels(planned, vehicle, len(logs)))
+        planned, logs, vehicle = pictures_only(camera), drive.logs, drive.vehicle
+        wheels = _no_wheels(planned, vehicle, len(logs))
+        return replace(
+            drive, segments=scan(logs, planned, vehicle, selections_of(drive, planned), wheels)
+        )
 
 
 def refuse_other_segments(run: RunFolder, timeline: Timeline) -> None:
@@ -87,28 +83,26 @@ def refuse_other_segments(run: RunFolder, timeline: Timeline) -> None:
             )
 
 
-def whole_timeline(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> Timeline:
-    """Return the segments as ``drive_timeline`` does, from the stamps of all topics."""
-    planned, wheels = plan_for_time(logs, vehicle, selection)
-    return scan(logs, planned, vehicle, [selection] * len(logs), wheels)
+def whole_timeline(drive: Drive) -> Timeline:
+    """Return the segments as ``with_segments`` does, from the stamps of all topics."""
+    planned, wheels = plan_for_time(drive)
+    return scan(drive.logs, planned, drive.vehicle, [drive.selection] * len(drive.logs), wheels)
 
 
-def plan_for_time(
-    logs: Sequence[Log], vehicle: Vehicle, selection: Selection
-) -> tuple[SignalPlan, list[SampleExtractor]]:
+def plan_for_time(drive: Drive) -> tuple[SignalPlan, list[SampleExtractor]]:
     """Return the plan for the wheel speeds, and an extractor for each log.
 
     Without wheel speeds nothing is planned; clock set-backs are still found.
     """
-    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
+    logs, vehicle = drive.logs, drive.vehicle
     try:
-        planned = plan(topics, vehicle)
+        planned = plan(drive.topics, vehicle)
     except VehicleError:
         planned = SignalPlan((), {})
         return planned, _no_wheels(planned, vehicle, len(logs))
     wheels = planned.source_of(Signal.WHEEL_SPEEDS)
     planned = SignalPlan(() if wheels is None else (wheels,), {})
-    selections = selections_of(logs, planned, selection)
+    selections = selections_of(drive, planned)
     clocks = [
         probe_clocks(log, planned, vehicle, i, selections[i]) if selections[i].topics else {}
         for i, log in enumerate(logs)
@@ -120,11 +114,9 @@ def _no_wheels(planned: SignalPlan, vehicle: Vehicle, logs: int) -> list[SampleE
     return [wheels_only(planned, vehicle, i, {}) for i in range(logs)]
 
 
-def selections_of(
-    logs: Sequence[Log], planned: SignalPlan, selection: Selection
-) -> list[Selection]:
+def selections_of(drive: Drive, planned: SignalPlan) -> list[Selection]:
     """Return the selection of each log, narrowed to the topics that are used."""
-    return [_narrowed(selection, planned.topics_of(i)) for i in range(len(logs))]
+    return [_narrowed(drive.selection, planned.topics_of(i)) for i in range(len(drive.logs))]
 
 
 def _narrowed(selection: Selection, planned: frozenset[str]) -> Selection:

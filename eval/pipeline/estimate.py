@@ -1,4 +1,4 @@
-"""The estimate stage: the pose from the logs' signals, and the scene from stored detections.
+"""What the estimate stage needs beside its loop: signals, tables of the pose, account, manifest.
 
 No picture is opened unless landmarks are searched for: detections are read from the run's tables.
 """
@@ -6,23 +6,18 @@ No picture is opened unless landmarks are searched for: detections are read from
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from itertools import chain
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
 from crosscue.eval.pipeline.scene.looked_for import detector_notices
 from crosscue.eval.pipeline.scene.outcome import SceneOutcome
-from crosscue.eval.pipeline.scene.stage import (
-    estimate_scene,
-    features_of,
-    gives_reasons,
-    scene_schemas,
-)
 from crosscue.eval.runs.account import UNATTRIBUTED, Account, account, joined_accounts, reading_of
 from crosscue.eval.runs.candidates import candidate_rows
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, write_manifest, write_timings
 from crosscue.eval.runs.logs import log_names, log_rows
 from crosscue.eval.runs.manifest import (
@@ -39,18 +34,19 @@ from crosscue.eval.runs.manifest import (
 )
 from crosscue.eval.runs.tables import measurements
 from crosscue.eval.runs.tables.labelled import LabelledSink
-from crosscue.eval.runs.tables.mobileye_tables import MobileyeSink, StoredMobileye
+from crosscue.eval.runs.tables.mobileye_tables import MobileyeSink
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tables.pose_tables import PoseTally, pose_rows, pose_schema
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.localization.landmarks.database import LandmarkDatabase
-from crosscue.replay.base import Log, Selection
+from crosscue.localization.pose_track import PoseColumns
+from crosscue.replay.base import Log
 from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.signals.extractor import SampleExtractor, probe_clocks
 from crosscue.replay.signals.kinds import Signal, SignalPlan
-from crosscue.replay.signals.plan import chosen_camera, plan, with_pictures
-from crosscue.replay.signals.windows import windows
+from crosscue.replay.signals.plan import plan, with_pictures
+from crosscue.replay.signals.windows import SampleWindow, windows
 from crosscue.replay.time.segments import (
     LogClock,
     TimedLog,
@@ -63,12 +59,12 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.versions import versions_and_commit
 
 from .clocks import clock_changes, clock_rows
-from .drive_time import drive_timeline, refuse_other_segments, selections_of, time_segments
+from .drive_time import refuse_other_segments, selections_of, time_segments
 from .empty_result import empty_result, silent_roles
 from .landmarks import landmark_stage
 from .pose import PoseStage, estimating_of, fused_positions, turn_signal_of
 from .progress import report_time
-from .visual import VisualSource, visual_source, with_visual_scale
+from .visual import visual_source, with_visual_scale
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -82,176 +78,242 @@ class Earlier:
         detected: Outcome of the detect stage, if it ran just now.
         manifest: Manifest of the detect stage, if it ran earlier.
         logs: ``log_rows`` of the run, if already computed.
-        timeline: The drive's time segments, if already known.
     """
 
     detected: DetectOutcome | None = None
     manifest: DetectManifest | None = None
     logs: Sequence[LogRow] | None = None
-    timeline: Timeline | None = None
 
 
-def estimate_into(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    run: RunFolder,
-    selection: Selection,
-    before: Earlier,
-    landmarks: LandmarkDatabase | None = None,
-) -> Outcome:
-    """Write pose, cues, ranges, beliefs and the manifest into a locked run folder.
+class EstimateStage:
+    """Pose and scene of a drive, with the account and the manifest of a locked run folder.
 
-    Args:
-        logs: All open logs of the drive.
-        vehicle: Settings of the vehicle file.
-        run: The run folder, with or without tables of the detect stage.
-        selection: The part of the logs to use.
-        before: What earlier stages found.
-        landmarks: Database with which camera frames are compared, or None.
-
-    Raises:
-        VehicleError: The vehicle file does not fit the logs.
-        EmptyResultError: The selected part contains nothing to estimate from.
-        UsageError: The frames of the detect stage have other time segments.
-        OutputError: The disk is full.
+    Attributes:
+        found: Manifest of the detect stage; None if no detector ran.
+        pose: The pose filter.
     """
-    began = time.monotonic()
-    detected = before.detected
-    found = before.manifest if detected is None else run.drive_manifest().detected
-    kept = None if found is None else _camera_skips(run, found.camera)
-    reading = _Reading(logs, vehicle, selection, landmarks, before.timeline, found)
-    if found is not None:
-        refuse_other_segments(run, reading.timeline)
-    stage = _pose_stage(reading)
-    if detected is None:
-        begin_again(run, found)
-    tally = _pose(reading, stage, run)
-    silent = silent_roles(reading.planned, stage.received)
-    _refuse_empty(reading, silent, tally)
-    scene = None if found is None else _scene(run, vehicle, found, reading)
-    made = _account(reading, stage, scene)
-    write_skipped(run, reading.ledgers, made.reading, kept, reading.timeline)
-    results = _Results(stage, tally, scene, made, _notices(reading, stage, silent))
-    detect_s = 0.0 if detected is None else detected.seconds
-    seconds = time.monotonic() - began + detect_s
-    rows = _hashed(logs, run, found) if before.logs is None else tuple(before.logs)
-    detecting = None if found is None else run.timings()
-    detect = None if detecting is None else detecting.detect
-    write_timings(run, Timings(seconds=seconds, detect=detect))
-    write_manifest(run, _manifest(run, reading, results, rows))
-    return Outcome(
-        run,
-        reading.ledgers,
-        tally.rows,
-        tally.travelled_m,
-        tally.major_axis_m,
-        results.notices,
-        seconds,
-        _driven_s(reading.timeline, tally),
-        stage.landmarks.counts(),
-        made,
-        detected,
-        scene,
-        reading.timeline.segments,
-    )
+
+    def __init__(
+        self,
+        drive: Drive,
+        run: RunFolder,
+        before: Earlier,
+        landmarks: LandmarkDatabase | None = None,
+    ) -> None:
+        """Plan the signals of a drive.
+
+        Args:
+            drive: The drive, with its time segments.
+            run: The run folder, with or without tables of the detect stage.
+            before: What earlier stages found.
+            landmarks: Database with which camera frames are compared, or None.
+
+        Raises:
+            VehicleError: The vehicle file does not fit the logs.
+            UsageError: The frames of the detect stage have other time segments.
+        """
+        self._began = time.monotonic()
+        self._drive, self._run, self._before, self._landmarks = drive, run, before, landmarks
+        found = before.manifest if before.detected is None else run.drive_manifest().detected
+        self.found = found
+        self._camera_skips = None if found is None else _camera_skips(run, found.camera)
+        vehicle = drive.vehicle
+        camera = None if landmarks is None else drive.camera
+        self._planned = plan(drive.topics, vehicle)
+        if camera is not None:
+            self._planned = with_pictures(self._planned, camera)
+        self._ledgers = tuple(Ledger(name) for name in log_names(drive.logs))
+        self._selections = selections_of(drive, self._planned)
+        clocks = [
+            probe_clocks(log, self._planned, vehicle, i, self._selections[i])
+            for i, log in enumerate(drive.logs)
+        ]
+        self._extractors = [
+            SampleExtractor(
+                self._planned, vehicle, i, ledger, clocks[i], shift_at=shift_of(drive.segments, i)
+            )
+            for i, ledger in enumerate(self._ledgers)
+        ]
+        if found is not None:
+            refuse_other_segments(run, drive.segments)
+        self.pose = PoseStage(
+            vehicle,
+            turn_signal_of(self._planned, vehicle),
+            positions=fused_positions(vehicle),
+            timeline=drive.segments,
+        )
+        if camera is not None and landmarks is not None:
+            search = landmark_stage(landmarks, vehicle, self._ledgers[camera[0]])
+            self.pose.landmarks = search
+            self._extractors[camera[0]].on_pictures = search.see
+        if before.detected is None:
+            begin_again(run, found)
+        has_speed = self._planned.source_of(Signal.WHEEL_SPEEDS) is not None
+        is_visual = not has_speed and vehicle.odometry.kind != "wheels"
+        self._visual = visual_source(run) if is_visual else None
+        self._tally = PoseTally()
+
+    def windows(self) -> Iterator[SampleWindow]:
+        """Yield the signals of the logs, in order of time."""
+        drive = self._drive
+        timed = [TimedLog(log, drive.segments.clock(i)) for i, log in enumerate(drive.logs)]
+        for window in windows(timed, self._extractors, self._selections, self._planned):
+            yield window
+            report_time("estimating the pose", drive.segments, window.end_ns)
+
+    def last_poses(self) -> Iterator[PoseColumns]:
+        """Yield the poses that waited for more signals, and those of odometry by pictures."""
+        yield from self.pose.finish()
+        if self._visual is not None:
+            yield from self.pose.follow(self._visual)
+
+    @contextmanager
+    def tables(self) -> Iterator[PoseTables]:
+        """Yield the tables of the pose; refuse a drive without anything to estimate from.
+
+        Raises:
+            EmptyResultError: The selected part contains nothing to estimate from.
+            OutputError: The disk is full.
+        """
+        timeline, clock = self._drive.segments, self._clock_of(Signal.WHEEL_SPEEDS)
+        if self._visual is not None and self.found is not None:
+            clock = timeline.clock(self.found.camera_log)
+        device = self._clock_of(Signal.MOBILEYE_OBSTACLES)
+        measured = measurements.TABLE, measurements.measurement_schema()
+        with (
+            LabelledSink(self._run, "pose", pose_schema(), timeline, clock) as poses,
+            LabelledSink(self._run, *measured, timeline, clock) as inputs,
+            MobileyeSink(self._run, timeline, device) as mobileye,
+        ):
+            yield PoseTables(self.pose, poses, inputs, mobileye, self._tally)
+        self._silent = silent_roles(self._planned, self.pose.received)
+        self._refuse_empty()
+
+    def scene_drive(self) -> Drive:
+        """Return the drive with the errors that its ranges have."""
+        if self._visual is None:
+            return self._drive
+        return replace(self._drive, vehicle=with_visual_scale(self._drive.vehicle))
+
+    def finish(self, scene: SceneOutcome | None) -> Outcome:
+        """Write account, timings and manifest.
+
+        Raises:
+            OutputError: The disk is full.
+        """
+        run, drive, tally, found = self._run, self._drive, self._tally, self.found
+        made = self._account(scene)
+        write_skipped(run, self._ledgers, made.reading, self._camera_skips, drive.segments)
+        notices = self._notices()
+        detected = self._before.detected
+        seconds = time.monotonic() - self._began + (0.0 if detected is None else detected.seconds)
+        rows = self._before.logs
+        if rows is None:
+            rows = log_rows(drive.logs, run) if found is None else found.logs
+        timings = None if found is None else run.timings()
+        detect = None if timings is None else timings.detect
+        write_timings(run, Timings(seconds=seconds, detect=detect))
+        landmarks = self._landmarks
+        manifest = EstimateManifest(
+            versions=versions_and_commit(),
+            logs=tuple(rows),
+            selection=selection_record(drive.selection),
+            settings=drive.vehicle,
+            sources=_sources(self._planned, drive.logs),
+            clocks=tuple(
+                clock_rows(each.clocks, each.watch.reports()) for each in self._extractors
+            ),
+            account=made,
+            counts=EstimateCounts(**self.pose.counts()),
+            time=time_segments(drive.segments),
+            landmarks=None if landmarks is None else _landmarks_used(landmarks, run),
+            notices=notices,
+            pose=PoseSummary(
+                rows=tally.rows, travelled_m=tally.travelled_m, major_axis_m=tally.major_axis_m
+            ),
+            scene=None if scene is None else scene_summary(scene),
+            detect=found,
+        )
+        write_manifest(run, manifest)
+        return Outcome(
+            run,
+            self._ledgers,
+            tally.rows,
+            tally.travelled_m,
+            tally.major_axis_m,
+            notices,
+            seconds,
+            _driven_s(drive.segments, tally),
+            self.pose.landmarks.counts(),
+            made,
+            detected,
+            scene,
+            drive.segments.segments,
+        )
+
+    def _clock_of(self, signal: Signal) -> LogClock:
+        """Return the clock of the log that a signal comes from."""
+        source = self._planned.source_of(signal)
+        return self._drive.segments.clock(0 if source is None else source.log)
+
+    def _refuse_empty(self) -> None:
+        """Refuse a drive whose planned wheel speeds have no row, or that has nothing to use."""
+        what = self._silent.get(Signal.WHEEL_SPEEDS)
+        if not (what or self._tally.rows or self.found or self._landmarks):
+            why = self._planned.missing.get(Signal.WHEEL_SPEEDS, "they yielded no pose")
+            what = f"no detector has run over a camera, and of the wheel speeds: {why}"
+        if what is not None:
+            raise empty_result(what, self._drive.logs, self._drive.selection)
+
+    def _account(self, scene: SceneOutcome | None) -> Account:
+        """Return the account of the run, with the detect stage's part if it has run."""
+        accounts, found = reading_of(self._ledgers), self.found
+        if found is None or scene is None:
+            return account(accounts, {}, estimating_of(self.pose, None))
+        return account(
+            joined_accounts(accounts, found.account.reading, found.camera),
+            found.account.detecting,
+            estimating_of(self.pose, (found.counts.frames, scene.frames)),
+        )
+
+    def _notices(self) -> tuple[str, ...]:
+        """Return the notices of the run, gaps first."""
+        planned, found, stage = self._planned, self.found, self.pose
+        return (
+            *gaps_text(self._drive.segments.segments),
+            *_missing(planned, has_speed=stage.visual is not None),
+            *self._silent.values(),
+            *_no_mobileye(found, planned),
+            *_no_scene(found, self._drive),
+            *_of_detecting(found, self._drive.vehicle),
+            *stage.notices,
+            *stage.doubts(),
+            *chain.from_iterable(
+                clock_changes(each.clocks, each.watch.reports()) for each in self._extractors
+            ),
+        )
 
 
-def _pose_stage(reading: _Reading) -> PoseStage:
-    """Return the pose stage, connected to the search for landmarks if there is one."""
-    vehicle, landmarks = reading.vehicle, reading.landmarks
-    stage = PoseStage(
-        vehicle,
-        turn_signal_of(reading.planned, vehicle),
-        positions=fused_positions(vehicle),
-        timeline=reading.timeline,
-    )
-    if reading.camera is not None and landmarks is not None:
-        at = reading.camera[0]
-        search = landmark_stage(landmarks, vehicle, reading.ledgers[at])
-        stage.landmarks, reading.extractors[at].on_pictures = search, search.see
-    return stage
+@dataclass(frozen=True, slots=True)
+class PoseTables:
+    """Tables of the pose: its rows, the filter's inputs, and a Mobileye's rows."""
 
-
-def _refuse_empty(reading: _Reading, silent: Mapping[Signal, str], tally: PoseTally) -> None:
-    """Refuse a drive whose planned wheel speeds have no row, or that has nothing to estimate from.
-
-    Raises:
-        EmptyResultError: The selected part contains nothing to estimate from.
-        LogError: Damage has left no row.
-    """
-    what = silent.get(Signal.WHEEL_SPEEDS)
-    if what is None and not tally.rows and reading.found is None and reading.landmarks is None:
-        why = reading.planned.missing.get(Signal.WHEEL_SPEEDS, "they yielded no pose")
-        what = f"no detector has run over a camera, and of the wheel speeds: {why}"
-    if what is not None:
-        raise empty_result(what, reading.logs, reading.selection)
-
-
-def _account(reading: _Reading, stage: PoseStage, scene: SceneOutcome | None) -> Account:
-    """Return the account of the run, with the detect stage's part if it has run."""
-    accounts, found = reading_of(reading.ledgers), reading.found
-    if found is None or scene is None:
-        return account(accounts, {}, estimating_of(stage, None))
-    return account(
-        joined_accounts(accounts, found.account.reading, found.camera),
-        found.account.detecting,
-        estimating_of(stage, (found.counts.frames, scene.frames)),
-    )
-
-
-def _notices(reading: _Reading, stage: PoseStage, silent: Mapping[Signal, str]) -> tuple[str, ...]:
-    """Return the notices of the run, gaps first."""
-    return (
-        *gaps_text(reading.timeline.segments),
-        *_missing(reading.planned, has_speed=stage.visual is not None),
-        *silent.values(),
-        *_no_mobileye(reading.found, reading.planned),
-        *_no_scene(reading.found, reading),
-        *_of_detecting(reading.found, reading.vehicle),
-        *stage.notices,
-        *stage.doubts(),
-        *chain.from_iterable(
-            clock_changes(each.clocks, each.watch.reports()) for each in reading.extractors
-        ),
-    )
-
-
-class _Results(NamedTuple):
-    """Results of the estimate stage."""
-
-    stage: PoseStage
+    pose: PoseStage
+    poses: TableSink
+    inputs: TableSink
+    mobileye: MobileyeSink
     tally: PoseTally
-    scene: SceneOutcome | None
-    account: Account
-    notices: tuple[str, ...]
 
-
-def _manifest(
-    run: RunFolder,
-    reading: _Reading,
-    results: _Results,
-    rows: tuple[LogRow, ...],
-) -> EstimateManifest:
-    """Return the manifest of the run."""
-    tally, scene, landmarks = results.tally, results.scene, reading.landmarks
-    return EstimateManifest(
-        versions=versions_and_commit(),
-        logs=rows,
-        selection=selection_record(reading.selection),
-        settings=reading.vehicle,
-        sources=_sources(reading.planned, reading.logs),
-        clocks=tuple(clock_rows(each.clocks, each.watch.reports()) for each in reading.extractors),
-        account=results.account,
-        counts=EstimateCounts(**results.stage.counts()),
-        time=time_segments(reading.timeline),
-        landmarks=None if landmarks is None else _landmarks_used(landmarks, run),
-        notices=results.notices,
-        pose=PoseSummary(
-            rows=tally.rows, travelled_m=tally.travelled_m, major_axis_m=tally.major_axis_m
-        ),
-        scene=None if scene is None else scene_summary(scene),
-        detect=reading.found,
-    )
+    def add(self, rows: Iterable[PoseColumns], window: SampleWindow | None = None) -> None:
+        """Add rows of poses, and what the filter has used for them."""
+        for poses in rows:
+            self.poses.write(pose_rows(poses, self.pose.landmarks.take_names(poses.t_ns)))
+            self.tally.add(poses)
+        for columns in self.pose.take_measured():
+            if columns["kind"]:
+                self.inputs.write(columns)
+        if window is not None:
+            self.mobileye.write(window.samples)
 
 
 def _landmarks_used(landmarks: LandmarkDatabase, run: RunFolder) -> LandmarksUsed:
@@ -279,135 +341,12 @@ def _driven_s(timeline: Timeline, tally: PoseTally) -> float:
     return tally.seconds - gaps_ns * 1e-9
 
 
-def _hashed(
-    logs: Sequence[Log], run: RunFolder, found: DetectManifest | None
-) -> tuple[LogRow, ...]:
-    """Return the rows of the logs, from the detect stage of this run if it has hashed them."""
-    return log_rows(logs, run) if found is None else found.logs
-
-
 def begin_again(run: RunFolder, found: DetectManifest | None) -> None:
     """Restore the detect stage's manifest, so that an interrupted run does not look complete."""
     if found is None:
         run.file(MANIFEST).unlink(missing_ok=True)
     else:
         write_manifest(run, found)
-
-
-class _Reading:
-    """A drive's logs with their plan and chosen clocks."""
-
-    def __init__(
-        self,
-        logs: Sequence[Log],
-        vehicle: Vehicle,
-        selection: Selection,
-        landmarks: LandmarkDatabase | None,
-        timeline: Timeline | None,
-        found: DetectManifest | None,
-    ) -> None:
-        topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
-        self.logs = logs
-        self.vehicle = vehicle
-        self.selection = selection
-        self.landmarks = landmarks
-        self.found = found
-        self.has_camera = any(role_of(topic) is Role.CAMERA for _, topic in topics)
-        self.planned = plan(topics, vehicle)
-        self.camera = None if landmarks is None else chosen_camera(topics, vehicle)
-        if self.camera is not None:
-            self.planned = with_pictures(self.planned, self.camera)
-        self.ledgers = tuple(Ledger(name) for name in log_names(logs))
-        self.selections = selections_of(logs, self.planned, selection)
-        if timeline is None:
-            known = None if found is None else found.timeline
-            timeline = drive_timeline(logs, vehicle, selection, self.camera, known)
-        self.timeline = timeline
-        clocks = [
-            probe_clocks(log, self.planned, vehicle, i, self.selections[i])
-            for i, log in enumerate(logs)
-        ]
-        self.extractors = [
-            SampleExtractor(
-                self.planned, vehicle, i, ledger, clocks[i], shift_at=shift_of(timeline, i)
-            )
-            for i, ledger in enumerate(self.ledgers)
-        ]
-
-    @property
-    def timed(self) -> list[TimedLog]:
-        """The logs in drive time."""
-        return [TimedLog(log, self.timeline.clock(i)) for i, log in enumerate(self.logs)]
-
-    def visual(self, run: RunFolder) -> VisualSource | None:
-        """Return the odometry by the pictures, if the run has it and no log has a speed."""
-        has_speed = self.planned.source_of(Signal.WHEEL_SPEEDS) is not None
-        return None if has_speed or self.vehicle.odometry.kind == "wheels" else visual_source(run)
-
-    def clock_of(self, signal: Signal) -> LogClock:
-        """Return the clock of the log that a signal comes from."""
-        source = self.planned.source_of(signal)
-        return self.timeline.clock(0 if source is None else source.log)
-
-
-def _pose(reading: _Reading, stage: PoseStage, run: RunFolder) -> PoseTally:
-    tally = PoseTally()
-    timeline, clock = reading.timeline, reading.clock_of(Signal.WHEEL_SPEEDS)
-    visual = reading.visual(run)
-    if visual is not None and reading.found is not None:
-        clock = timeline.clock(reading.found.camera_log)
-    with (
-        LabelledSink(run, "pose", pose_schema(), timeline, clock) as sink,
-        LabelledSink(
-            run, measurements.TABLE, measurements.measurement_schema(), timeline, clock
-        ) as measured,
-        MobileyeSink(run, timeline, reading.clock_of(Signal.MOBILEYE_OBSTACLES)) as mobileye,
-    ):
-        for window in windows(
-            reading.timed, reading.extractors, reading.selections, reading.planned
-        ):
-            for poses in stage(window):
-                sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
-                tally.add(poses)
-            _write_all(measured, stage.take_measured())
-            mobileye.write(window.samples)
-            report_time("estimating the pose", timeline, window.end_ns)
-        for poses in chain(stage.finish(), () if visual is None else stage.follow(visual)):
-            sink.write(pose_rows(poses, stage.landmarks.take_names(poses.t_ns)))
-            tally.add(poses)
-        _write_all(measured, stage.take_measured())
-    return tally
-
-
-def _write_all(sink: TableSink, parts: Sequence[Mapping[str, object]]) -> None:
-    for columns in parts:
-        if columns["kind"]:
-            sink.write(columns)
-
-
-def _scene(
-    run: RunFolder, vehicle: Vehicle, found: DetectManifest, reading: _Reading
-) -> SceneOutcome:
-    timeline, clock = reading.timeline, reading.timeline.clock(found.camera_log)
-    if reading.visual(run) is not None:
-        vehicle = with_visual_scale(vehicle)
-    with ExitStack() as stack:
-        sinks = {
-            name: stack.enter_context(LabelledSink(run, name, schema, timeline, clock))
-            for name, schema in scene_schemas(
-                features_of(vehicle), gives_reasons=gives_reasons(vehicle)
-            ).items()
-        }
-        past = StoredMobileye(run, vehicle.past)
-        return estimate_scene(
-            run,
-            vehicle,
-            found,
-            lambda name, rows: sinks[name].write(rows),
-            past.cues,
-            timeline=timeline,
-            on_restart=past.forget_before,
-        )
 
 
 def scene_summary(scene: SceneOutcome) -> SceneSummary:
@@ -465,9 +404,9 @@ def _no_mobileye(found: DetectManifest | None, planned: SignalPlan) -> list[str]
     return [f"no Mobileye, so no lane lines or vehicles beyond the intersection: {reason}"]
 
 
-def _no_scene(found: DetectManifest | None, reading: _Reading) -> list[str]:
+def _no_scene(found: DetectManifest | None, drive: Drive) -> list[str]:
     if found is not None:
         return []
-    if not reading.has_camera:
+    if not any(role_of(topic) is Role.CAMERA for _, topic in drive.topics):
         return ["no camera in the logs, so no cue and no belief"]
     return ["no detector ran on the camera, so no cue and no belief; name some"]

@@ -1,253 +1,96 @@
-"""Replay of a drive's logs into a run folder by both stages, or by the second stage again."""
+"""The stages of a replay, in order of time.
+
+``detect`` finds objects and road in pictures, and stores them. ``estimate`` follows what the car
+did, and what it saw there. Both write into a run folder that the caller has locked (``whole_run``).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import replace
-from pathlib import Path
-from typing import Final
-
-from crosscue.detectors.registry import make
+from crosscue.detectors.result_cache import ResultCache
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
-from crosscue.eval.runs.folder import MANIFEST, RunFolder, clear, locked, staged, write_input
-from crosscue.eval.runs.logs import (
-    input_of,
-    log_rows,
-    refuse_other_input,
-    reopened,
-    settings_changed,
-)
-from crosscue.eval.runs.manifest import (
-    DetectManifest,
-    DriveManifest,
-    EstimateManifest,
-    LogRow,
-    selection_record,
-)
+from crosscue.eval.runs.drive import Drive
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.localization.landmarks.database import LandmarkDatabase
-from crosscue.replay.base import Log, Selection
-from crosscue.replay.columns import Topic
-from crosscue.replay.errors import RunError, UsageError
-from crosscue.replay.files.whole_file import sha256_of
-from crosscue.replay.signals.plan import chosen_camera
-from crosscue.replay.time.segments import Timeline
-from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .detect import Detecting, detect_into, only_camera
-from .drive_time import drive_timeline
-from .empty_result import nothing_left
-from .estimate import Earlier, begin_again, estimate_into
-
-# Tables of the first stage that the second stage reads.
-TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
+from .detect import Detecting, DetectStage
+from .estimate import Earlier, EstimateStage
+from .scene.outcome import SceneOutcome
+from .scene.stage import Scene, SceneTables, tables_of_scene
 
 
-NO_DETECTORS: Final = Detecting(())
-
-
-def replay_drive(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    run: RunFolder,
-    selection: Selection,
-    landmarks: LandmarkDatabase | None = None,
-    detecting: Detecting = NO_DETECTORS,
-    *,
-    overwrite: bool = False,
-) -> Outcome:
-    """Replay one drive into a run folder.
-
-    Args:
-        logs: All open logs of the drive.
-        vehicle: Settings of the vehicle file.
-        run: The run folder; locked meanwhile, and cleared first unless its detections are kept.
-        selection: The part of the logs to use.
-        landmarks: Database with which camera frames are compared, or None.
-        detecting: Detectors to run over the camera; without any, the run has only the pose.
-        overwrite: Replace a run of other logs or settings even if ``detecting.resume`` is set.
+def detect(drive: Drive, run: RunFolder, detecting: Detecting) -> DetectOutcome:
+    """Find objects and road in the pictures of a drive; the only stage that opens pictures.
 
     Raises:
-        UsageError: The folder to be resumed holds a run of other logs or settings.
-        VehicleError: The vehicle file does not fit the logs.
-        EmptyResultError: The result is empty, or there is no camera for the detectors or landmarks
-            that the user named; the folder is unchanged.
+        VehicleError: The drive has several cameras, or a card, weights or settings are invalid.
+        EmptyResultError: The drive has no camera, or the selected part contains no frame.
         OutputError: The disk is full.
     """
-    mine = input_of(
-        run,
-        logs,
-        vehicle,
-        selection,
-        detecting.choices,
-        detecting.draw,
-        None if landmarks is None else landmarks.path,
-    )
-    with locked(run):
-        if detecting.resume and not overwrite:
-            refuse_other_input(run, mine)
-        timeline = drive_timeline(
-            logs, vehicle, selection, _camera(logs, vehicle, detecting, landmarks)
-        )
-        earlier = _kept(logs, vehicle, run, selection, detecting) if detecting.resume else None
-        with staged(run, keep=earlier is not None, until=earlier) as new, nothing_left(new):
-            if earlier is None:
-                clear(new, mine)
-                found = _detect(logs, vehicle, new, selection, detecting, timeline)
-            else:
-                found = None
-            before = Earlier(found, earlier, timeline=timeline)
-            outcome = estimate_into(logs, vehicle, new, selection, before, landmarks)
-        detected = None if outcome.detected is None else replace(outcome.detected, run=run)
-        return replace(outcome, run=run, detected=detected)
+    with ResultCache(detecting.cache) as cache:
+        stage = DetectStage(drive, run, detecting, cache)
+        with stage.tables as tables:
+            for frame in stage.frames():
+                tables.add(frame)
+        return stage.finish()
 
 
-def _camera(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    detecting: Detecting,
-    landmarks: LandmarkDatabase | None,
-) -> tuple[int, Topic] | None:
-    """Return the camera if detectors or landmarks need it.
-
-    Raises:
-        EmptyResultError: No camera exists, but the user named detectors or landmarks.
-    """
-    if not detecting.choices and landmarks is None:
-        return None
-    if detecting.is_required or landmarks is not None:
-        return only_camera(logs, vehicle)
-    return chosen_camera(
-        [(i, topic) for i, log in enumerate(logs) for topic in log.topics], vehicle
-    )
-
-
-def _detect(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    run: RunFolder,
-    selection: Selection,
-    detecting: Detecting,
-    timeline: Timeline,
-) -> DetectOutcome | None:
-    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
-    if not detecting.choices or chosen_camera(topics, vehicle) is None:
-        return None
-    return detect_into(logs, vehicle, run, selection, detecting, timeline)
-
-
-def _kept(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    run: RunFolder,
-    selection: Selection,
-    detecting: Detecting,
-) -> DetectManifest | None:
-    """Return the detect stage of an earlier start if its tables would be the same again."""
-    try:
-        earlier = run.drive_manifest().detected
-    except RunError:
-        return None
-    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
-    camera = chosen_camera(topics, vehicle)
-    if earlier is None or camera is None or not all(run.file(name).exists() for name in TABLES):
-        return None
-    wanted = (
-        log_rows(logs, run),
-        selection_record(selection),
-        camera[1].name,
-        [make(choice).identity for choice in detecting.choices],
-        vehicle.camera.depth_bits,
-        vehicle.time,
-    )
-    there = (
-        earlier.logs,
-        earlier.selection,
-        earlier.camera,
-        [detector.identity for detector in earlier.detectors],
-        earlier.settings.camera.depth_bits,
-        earlier.settings.time,
-    )
-    return earlier if wanted == there else None
-
-
-def estimate_run(
-    run: RunFolder,
-    vehicle: Vehicle | None = None,
+def estimate(
+    drive: Drive, run: RunFolder, before: Earlier, landmarks: LandmarkDatabase | None = None
 ) -> Outcome:
-    """Estimate again into the same run folder; no picture is opened.
-
-    The run stays unchanged until the new one is complete.
+    """Estimate what the car did, and what it saw, from signals and stored detections.
 
     Args:
-        run: A finished run, or one whose detect stage has finished.
-        vehicle: Settings; default: those of the run.
+        drive: The drive, with its time segments.
+        run: The run folder, with or without tables of ``detect``.
+        before: What earlier stages found.
+        landmarks: Database with which camera frames are compared, or None.
 
     Raises:
-        RunError: The run's logs are missing or have changed, or it was made with landmarks.
-        VehicleError: The settings do not fit the logs.
-        UsageError: The settings split the drive into other segments than those of the detections.
+        VehicleError: The vehicle file does not fit the logs.
+        EmptyResultError: The selected part contains nothing to estimate from.
+        UsageError: The frames of ``detect`` have other time segments.
+        OutputError: The disk is full.
     """
-    manifest = run.drive_manifest()
-    if isinstance(manifest, EstimateManifest) and manifest.landmarks is not None:
-        raise RunError(
-            f"{run.path}: landmarks are searched for in pictures, which estimate does not open; "
-            "run crosscue replay --landmarks again"
-        )
-    if vehicle is not None:
-        _refuse_other_time(run, manifest, vehicle)
-    with ExitStack() as stack:
-        logs = [stack.enter_context(_reopened(run, row)) for row in manifest.logs]
-        stack.enter_context(locked(run))
-        settings = vehicle or manifest.settings
-        changed = None if vehicle is None else settings_changed(run, vehicle)
-        new = stack.enter_context(staged(run, keep=True, until=manifest.detected))
-        if changed is not None:
-            # In this order, an interrupted run does not look complete.
-            begin_again(new, manifest.detected)
-            write_input(new, changed)
-        outcome = estimate_into(
-            logs,
-            settings,
-            new,
-            manifest.selection.selection,
-            Earlier(manifest=manifest.detected, logs=manifest.logs),
-        )
-    return replace(outcome, run=run)
+    stage = EstimateStage(drive, run, before, landmarks)
+    with stage.tables() as tables:
+        for window in stage.windows():
+            tables.add(stage.pose(window), window)
+        tables.add(stage.last_poses())
+    scene = None
+    if stage.found is not None:
+        seen = stage.scene_drive()
+        with tables_of_scene(seen, run, stage.found) as rows:
+            scene = observe(seen, run, stage.found, rows)
+    return stage.finish(scene)
 
 
-def _refuse_other_time(run: RunFolder, manifest: DriveManifest, vehicle: Vehicle) -> None:
-    """Refuse other ``[time]`` settings than those with which the frames were detected."""
-    wanted = vehicle.time.model_dump()
-    there = wanted if manifest.detected is None else manifest.detected.settings.time.model_dump()
-    for name, value in wanted.items():
-        if there[name] != value:
-            raise UsageError(
-                f"{run.path}: its frames are split into segments by time.{name} = "
-                f"{there[name]:g}, not {value:g}, which estimate keeps; run crosscue replay again"
-            )
+def observe(
+    drive: Drive,
+    run: RunFolder,
+    detected: DetectManifest,
+    tables: SceneTables,
+    without: frozenset[str] = frozenset(),
+) -> SceneOutcome:
+    """Find cues, ranges and belief in a run's stored detections and odometry.
 
+    No picture is opened and no log is read, so settings of cues, ranges and belief can be tried in
+    seconds, and each cue can be left out to measure its contribution.
 
-def _reopened(run: RunFolder, row: LogRow) -> Log:
-    log = reopened(run, row)
-    if row.sha256 and not _is_older(log.path, run) and sha256_of(log.path) != row.sha256:
-        log.close()
-        raise RunError(f"{run.path}: its log {log.path} has changed since; replay again")
-    return log
+    Args:
+        drive: Vehicle file and time segments.
+        run: A run with the tables of ``detect`` and ``measurements.parquet``.
+        detected: Manifest of ``detect``.
+        tables: Receives the rows.
+        without: Cues to leave out, together with their ranges.
 
-
-def _is_older(log: Path, run: RunFolder) -> bool:
-    """Return whether a log is unchanged since the run hashed it, so that it need not be read again.
-
-    The change time of the inode counts, too, because a replaced file may have an older modification
-    time.
+    Raises:
+        RunError: A table is missing or damaged.
+        VehicleError: A cue or feature of the settings does not exist.
     """
-    files = [log] if log.is_file() else [entry for entry in log.rglob("*") if entry.is_file()]
-    hashed_ns = run.file(MANIFEST).stat().st_mtime_ns
-    touched = (time for entry in files for time in _times(entry))
-    return all(time < hashed_ns for time in touched)
-
-
-def _times(file: Path) -> tuple[int, int]:
-    found = file.stat()
-    return found.st_mtime_ns, found.st_ctime_ns
+    scene = Scene(drive, run, detected, without)
+    for step in scene.steps():
+        cues = scene.observe(step)
+        evidence = scene.range(step, cues)
+        tables.add(scene.believe(evidence), scene.objects)
+    return scene.outcome()

@@ -18,10 +18,10 @@ from crosscue.detectors.base import Detections, Found, View
 from crosscue.detectors.images import decode
 from crosscue.detectors.runner import FrameResult
 from crosscue.eval.runs.account import Line, line
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.tables.parquet import TableFolder
 from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
 from crosscue.localization.visual_odometry import HEIGHT_SD, VisualOdometry, VisualStep
-from crosscue.replay.base import Log
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.signals.kinds import Signal
@@ -39,22 +39,21 @@ HELD_NS: Final = 1_000_000_000
 ACCEL_SD_MPS2: Final = 2.0
 
 
-def uses_pictures(logs: Sequence[Log], vehicle: Vehicle, *, finds_road: bool) -> bool:
+def uses_pictures(drive: Drive, *, finds_road: bool) -> bool:
     """Return whether pictures are compared: for the odometry, or for the camera's pitch alone.
 
     Args:
-        logs: All logs of the drive.
-        vehicle: Settings.
+        drive: The drive.
         finds_road: True if a detector finds road, whose projection to the ground needs the pitch.
     """
+    vehicle = drive.vehicle
     kind = vehicle.odometry.kind
     if kind != "auto":
         return kind == "visual"
     if finds_road and vehicle.regions.kind == "area" and vehicle.camera.focal_px is not None:
         return True
-    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
     try:
-        return plan(topics, vehicle).source_of(Signal.WHEEL_SPEEDS) is None
+        return plan(drive.topics, vehicle).source_of(Signal.WHEEL_SPEEDS) is None
     except VehicleError:
         # A named topic is in none of these logs; ``estimate`` reports it.
         return False

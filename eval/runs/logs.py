@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from crosscue.detectors.base import DetectorChoice
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, RunFolder
-from crosscue.replay.base import Log, Selection, origin
+from crosscue.replay.base import Log, origin
 from crosscue.replay.errors import CrosscueError, UnreadableRunError, UsageError
 from crosscue.replay.files import door
 from crosscue.replay.files.identity import identity_of_all, identity_of_log, log_identity
@@ -148,33 +149,29 @@ def reopened(run: RunFolder, row: LogRow) -> Log:
 
 def input_of(
     run: RunFolder,
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    selection: Selection,
+    drive: Drive,
     choices: Sequence[DetectorChoice],
-    draw: int,
-    landmarks: Path | None,
+    draw: int = 0,
+    landmarks: Path | None = None,
 ) -> dict[str, object]:
     """Return the content of ``input.json``.
 
     Args:
         run: The run.
-        logs: All open logs of the drive.
-        vehicle: Settings of the vehicle file.
-        selection: The part of the logs.
+        drive: The drive.
         choices: Detectors, in order.
         draw: Number of pictures drawn.
         landmarks: The database with which frames are compared.
     """
     settings = {
-        "vehicle": vehicle.model_dump(mode="json"),
-        "selection": selection_record(selection).as_json(),
+        "vehicle": drive.vehicle.model_dump(mode="json"),
+        "selection": selection_record(drive.selection).as_json(),
         "detectors": [choice.as_row() for choice in choices],
         "draw": draw,
         "landmarks": None if landmarks is None else str(landmarks.resolve()),
         "versions": versions(),
     }
-    identity = identity_of_all([identity_of_log(log) for log in logs])
+    identity = identity_of_all([identity_of_log(log) for log in drive.logs])
     return {"identity": as_row(identity), "settings": _stored(run, settings)}
 
 

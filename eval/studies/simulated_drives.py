@@ -26,9 +26,9 @@ from crosscue.detectors.registry import EMBEDDED, chosen
 from crosscue.eval.batch.jobs import Engine, Job, JobOutcome, fingerprint_of, run_many
 from crosscue.eval.pipeline.detect import Detecting, choices_of
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.pipeline.whole_run import replay_drive
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import create
-from crosscue.replay.base import EVERYTHING
 from crosscue.replay.files import door
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.logs.opening import open_log
@@ -74,7 +74,7 @@ class Work:
         detecting = Detecting(choices, self.cache / f"{job.name}.sqlite")
         run = create(job.run, overwrite=True)
         with open_log(folder / LOG) as log:
-            outcome = replay_drive([log], vehicle, run, EVERYTHING, detecting=detecting)
+            outcome = replay_drive(Drive([log], vehicle), run, detecting)
         return replace(outcome, ledgers=(), detected=None)
 
     def simulated(self, name: str) -> Path:

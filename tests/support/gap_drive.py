@@ -21,7 +21,8 @@ from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.detectors.base import Detections, Found, Frame, View, nothing_found
 from crosscue.eval.pipeline.detect import Detecting, choices_of
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.pipeline.whole_run import replay_drive
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.can.database import CanDatabase
@@ -149,7 +150,7 @@ def replay(folder: Path, log: Path, run: str = "run", selection: Selection = EVE
     detecting = Detecting(tuple(choices_of(vehicle).values()), cache=folder / "cache.sqlite")
     with open_log(log) as opened:
         into = create(folder / run, overwrite=True)
-        return replay_drive([opened], vehicle, into, selection, detecting=detecting)
+        return replay_drive(Drive([opened], vehicle, selection), into, detecting)
 
 
 def replayed(folder: Path, log: Path, run: str = "run") -> RunFolder:

@@ -8,21 +8,26 @@ and each cue can be left out to measure its contribution.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from crosscue.detectors.base import is_repeated
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import FrameDetections, Place
+from crosscue.detectors.cues.observed import FrameCues, FrameDetections, Place
 from crosscue.detectors.cues.same_object import label_meanings
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.eval.pipeline.progress import report_time
 from crosscue.eval.pipeline.scene.looked_for import needing_masks, not_looked_for
 from crosscue.eval.pipeline.scene.motion_ranges import MotionRanges, RangedObject
 from crosscue.eval.pipeline.scene.sign_ranges import MEASURED, SignRanges
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
+from crosscue.eval.runs.tables.labelled import LabelledSink
+from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
+from crosscue.eval.runs.tables.parquet import TableFolder
 from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.eval.runs.tables.travelled import Odometer, odometer_of
 from crosscue.fusion.approaches import Approaches, RangeRow, Step
@@ -30,7 +35,7 @@ from crosscue.fusion.belief import begin, probabilities
 from crosscue.fusion.evidence import FrameEvidence, PastCues
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
-from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
+from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .outcome import ApproachSummary, SceneOutcome
@@ -51,85 +56,20 @@ FEATURES: Final = ("intersection", "left", "right", "straight")
 Sink = Callable[[str, dict[str, list[Any]]], None]
 
 
-def nothing_past(_t_ns: int) -> PastCues | None:
-    """Return None, because without a Mobileye no cue beyond the intersection is evaluated."""
-    return None
+class SceneStep(NamedTuple):
+    """One frame with the ego vehicle's motion, in order of time.
 
-
-def estimate_scene(
-    run: RunFolder,
-    vehicle: Vehicle,
-    detected: DetectManifest,
-    sink: Sink,
-    past: Callable[[int], PastCues | None] = nothing_past,
-    without: frozenset[str] = frozenset(),
-    timeline: Timeline = ONE_SEGMENT,
-    on_restart: Callable[[int], None] = lambda _: None,
-) -> SceneOutcome:
-    """Run cues, range filter and belief over a run's stored frames.
-
-    Args:
-        run: A run with the tables of the detect stage and ``measurements.parquet``.
-        vehicle: Settings.
-        detected: Manifest of the detect stage.
-        sink: Called with the rows of ``cues``, ``range`` and ``belief``.
-        past: Function from a time to the Mobileye's cues beyond the intersection.
-        without: Cues to leave out, together with their ranges, as if they had not been evaluated.
-        timeline: Time segments of the drive; after a long gap everything starts over.
-        on_restart: Called with the drive time of each new start.
-
-    Raises:
-        RunError: A table is missing or damaged.
-        VehicleError: A cue or feature of the settings does not exist.
+    Attributes:
+        frame: Stored detections.
+        ego: Motion of the ego vehicle since the previous frame.
+        evidence: The same motion, as evidence.
+        place: Where the intersection is now, by the ranges of the previous frame.
     """
-    graph = graph_of(vehicle.fusion)
-    scene = _Scene(
-        vehicle,
-        Approaches(graph, vehicle.fusion, vehicle.range_filter),
-        EgoMotion(odometer_of(run)),
-        _Rows(sink, features_of(vehicle), gives_reasons(vehicle)),
-        Roads(vehicle, pitches_of(run)) if vehicle.regions.kind == "area" else None,
-    )
-    boxes_only = needing_masks(detected.detectors, vehicle.cars.labels)
-    restarts = Restarts(vehicle, timeline)
-    regions = vehicle.regions
-    fresh_regions = regions.kind != "picture" or detected.settings.regions != regions
-    meanings = label_meanings(vehicle)
-    frames = stored_frames(
-        run,
-        detected.detectors,
-        with_road_masks=fresh_regions,
-        meanings=None if meanings == label_meanings(detected.settings) else meanings,
-    )
-    for frame in frames:
-        vehicle.camera.check_size(frame.size_px)
-        fresh_ns = restarts.before(frame.t_ns)
-        if fresh_ns is not None:
-            scene.restart(fresh_ns)
-            on_restart(fresh_ns)
-        scene.step(frame, past(frame.t_ns), without | boxes_only)
-        report_time("estimating beliefs", timeline, frame.t_ns)
-    scene.rows.flush()
-    scene.approaches.finish()
-    return SceneOutcome(
-        scene.frames,
-        dict(sorted(scene.positive.items())),
-        tuple(scene.summaries.values()),
-        scene.approaches.counts
-        + scene.motion.counts
-        + scene.cues.controls.counts
-        + scene.cues.notes(),
-        scene.ego.without_odometry,
-        {cue: one for cue, one in scene.cues.candidates.items() if cue not in boxes_only},
-        scene.signs.by_cue,
-        not_looked_for(
-            scene.looked,
-            detected.detectors,
-            vehicle.cue_labels(),
-            scene.cues.not_followed,
-            boxes_only,
-        ),
-    )
+
+    frame: FrameDetections
+    ego: CarStep
+    evidence: FrameEvidence
+    place: Place | None
 
 
 @dataclass(slots=True)
@@ -196,99 +136,173 @@ class EgoMotion:
         self._last_ns = None
 
 
-@dataclass(slots=True)
-class _Scene:
-    vehicle: Vehicle
-    approaches: Approaches
-    ego: EgoMotion
-    rows: _Rows
-    roads: Roads | None = None
-    cues: CuePass = field(init=False)
-    signs: SignRanges = field(init=False)
-    motion: MotionRanges = field(init=False)
-    priors: Mapping[str, float] = field(init=False)
-    frames: int = 0
-    positive: Counter[str] = field(default_factory=Counter)
-    looked: set[str] = field(default_factory=set)
-    summaries: dict[int, ApproachSummary] = field(default_factory=dict)
-    _before: FrameDetections | None = None
-    _ranges: tuple[RangeRow, ...] = ()
+class Scene:
+    """What the car sees, frame by frame: cues, ranges and belief from a run's stored frames."""
 
-    def __post_init__(self) -> None:
-        self.signs = SignRanges(self.vehicle)
-        self.cues = CuePass(self.vehicle)
-        self.motion = MotionRanges(self.vehicle)
-        graph = graph_of(self.vehicle.fusion)
-        self.priors = probabilities(begin(graph), graph)
+    def __init__(
+        self,
+        drive: Drive,
+        run: RunFolder,
+        detected: DetectManifest,
+        without: frozenset[str] = frozenset(),
+    ) -> None:
+        """Open the stored frames.
 
-    def step(self, frame: FrameDetections, past: PastCues | None, without: frozenset[str]) -> None:
-        seen = frame
-        evidence, ego = self.ego(seen.t_ns)
-        if self.roads is not None:
-            seen = replace(seen, road=self.roads(seen, evidence))
-        found = self.cues(seen, ego, self._place(ego))
-        counts = {cue: count for cue, count in found.counts.items() if cue not in without}
-        signs = tuple(
-            sign for sign in self.signs(found.objects) if _MEASURES[sign.reference] not in without
+        Args:
+            drive: Vehicle file and time segments; after a long gap everything starts over.
+            run: A run with the tables of the detect stage and ``measurements.parquet``.
+            detected: Manifest of the detect stage.
+            without: Cues to leave out, together with their ranges, as if they had not been
+                evaluated.
+
+        Raises:
+            RunError: A table is missing or damaged.
+            VehicleError: A cue or feature of the settings does not exist.
+        """
+        vehicle = drive.vehicle
+        self._drive, self._run, self._detected = drive, run, detected
+        graph = graph_of(vehicle.fusion)
+        self._priors = probabilities(begin(graph), graph)
+        self._approaches = Approaches(graph, vehicle.fusion, vehicle.range_filter)
+        self._ego = EgoMotion(odometer_of(run))
+        self._is_area = vehicle.regions.kind == "area"
+        self._roads = Roads(vehicle, pitches_of(run)) if self._is_area else None
+        self._past = StoredMobileye(run, vehicle.past)
+        self._cues = CuePass(vehicle)
+        self._signs = SignRanges(vehicle)
+        self._motion = MotionRanges(vehicle)
+        self._boxes_only = needing_masks(detected.detectors, vehicle.cars.labels)
+        self._without = without | self._boxes_only
+        self._frames = 0
+        self._positive: Counter[str] = Counter()
+        self._looked: set[str] = set()
+        self._summaries: dict[int, ApproachSummary] = {}
+        self._before: FrameDetections | None = None
+        self._ranges: tuple[RangeRow, ...] = ()
+
+    def steps(self) -> Iterator[SceneStep]:
+        """Yield the frames in order of time, each with the motion since the one before."""
+        vehicle, timeline = self._drive.vehicle, self._drive.segments
+        restarts = Restarts(vehicle, timeline)
+        stored, regions = self._detected.settings, vehicle.regions
+        meanings = label_meanings(vehicle)
+        frames = stored_frames(
+            self._run,
+            self._detected.detectors,
+            with_road_masks=regions.kind != "picture" or stored.regions != regions,
+            meanings=None if meanings == label_meanings(stored) else meanings,
         )
-        evidence = replace(evidence, counts=counts, signs=signs)
-        posteriors = self.motion(self.cues.controls.tracks, ego, without)
-        if not self.ego.is_known:
+        for frame in frames:
+            vehicle.camera.check_size(frame.size_px)
+            fresh_ns = restarts.before(frame.t_ns)
+            if fresh_ns is not None:
+                self._restart(fresh_ns)
+            evidence, ego = self._ego(frame.t_ns)
+            if self._roads is not None:
+                frame = replace(frame, road=self._roads(frame, evidence))
+            yield SceneStep(frame, ego, evidence, self._place(ego))
+            report_time("estimating beliefs", timeline, frame.t_ns)
+        self._approaches.finish()
+
+    def observe(self, step: SceneStep) -> FrameCues:
+        """Return the cues of a frame."""
+        found = self._cues(step.frame, step.ego, step.place)
+        counts = {cue: count for cue, count in found.counts.items() if cue not in self._without}
+        return replace(found, counts=counts)
+
+    def range(self, step: SceneStep, cues: FrameCues) -> FrameEvidence:
+        """Return the evidence of a frame: its motion, its cues, and ranges to the intersection."""
+        without, counts = self._without, cues.counts
+        signs = tuple(
+            sign for sign in self._signs(cues.objects) if _MEASURES[sign.reference] not in without
+        )
+        posteriors = self._motion(self._cues.controls.tracks, step.ego, without)
+        if not self._ego.is_known:
             # From an assumed size alone, without any motion, a range would be a guess.
             posteriors = ()
-        if self.roads is not None and not without >= ROADS:
+        if self._roads is not None and not without >= ROADS:
             if not posteriors:
-                posteriors = self.roads.ranges()
-            elif not self.roads.fits(posteriors):
+                posteriors = self._roads.ranges()
+            elif not self._roads.fits(posteriors):
                 # A side street before the intersection that is ranged.
                 counts = {cue: count for cue, count in counts.items() if cue not in ROADS}
-                evidence = replace(evidence, counts=counts)
-        evidence = replace(evidence, posteriors=posteriors, is_new_picture=self._is_new(seen))
-        self.rows.add_objects(seen.t_ns, self.motion.objects)
-        step = (
-            self.approaches(evidence)
-            if past is None
-            else self.approaches(evidence, _without(past, without))
+        return replace(
+            step.evidence,
+            counts=counts,
+            signs=signs,
+            posteriors=posteriors,
+            is_new_picture=self._is_new(step.frame),
         )
-        self.frames += 1
-        self.looked.update(step.counts)
-        self.positive.update(cue for cue, count in step.counts.items() if count)
+
+    @property
+    def objects(self) -> Sequence[RangedObject]:
+        """Objects that the newest frame ranges."""
+        return self._motion.objects
+
+    def believe(self, evidence: FrameEvidence) -> Step:
+        """Return ranges and belief after a frame."""
+        past = _without(self._past.cues(evidence.t_ns), self._without)
+        step = self._approaches(evidence, past)
+        self._frames += 1
+        self._looked.update(step.counts)
+        self._positive.update(cue for cue, count in step.counts.items() if count)
         self._ranges = step.ranges
-        self.rows.add(step)
         self._sum_up(step)
+        return step
+
+    def outcome(self) -> SceneOutcome:
+        """Return what the frames have shown."""
+        cues, candidates = self._cues, self._cues.candidates
+        return SceneOutcome(
+            self._frames,
+            dict(sorted(self._positive.items())),
+            tuple(self._summaries.values()),
+            self._approaches.counts + self._motion.counts + cues.controls.counts + cues.notes(),
+            self._ego.without_odometry,
+            {cue: one for cue, one in candidates.items() if cue not in self._boxes_only},
+            self._signs.by_cue,
+            not_looked_for(
+                self._looked,
+                self._detected.detectors,
+                self._drive.vehicle.cue_labels(),
+                cues.not_followed,
+                self._boxes_only,
+            ),
+        )
 
     def _place(self, ego: CarStep) -> Place | None:
         """Return the intersection's place in this frame, predicted from the previous frame."""
         if ego.way_m is None:
             return None
-        return intersection_place(self._ranges, ego.way_m, self.vehicle.fusion.length_m)
+        return intersection_place(self._ranges, ego.way_m, self._drive.vehicle.fusion.length_m)
 
-    def _is_new(self, seen: FrameDetections) -> bool:
+    def _is_new(self, frame: FrameDetections) -> bool:
         """Return False for a repeated picture, recognized by bit-identical detections.
 
         Only beliefs that depend on successive frames need this.
         """
-        if self.vehicle.fusion.kind not in ("persistent", "temporal", "combined"):
+        if self._drive.vehicle.fusion.kind not in ("persistent", "temporal", "combined"):
             return True
-        before, self._before = self._before, seen
-        return before is None or not is_repeated(before.boxes, seen.boxes)
+        before, self._before = self._before, frame
+        return before is None or not is_repeated(before.boxes, frame.boxes)
 
-    def restart(self, t_ns: int) -> None:
+    def _restart(self, t_ns: int) -> None:
         """Know nothing of what was before ``t_ns``."""
-        self.approaches.restart()
-        self.ego.restart(t_ns)
-        self.cues.restart()
-        self.motion.restart()
-        if self.roads is not None:
-            self.roads.restart()
+        self._approaches.restart()
+        self._ego.restart(t_ns)
+        self._cues.restart()
+        self._motion.restart()
+        if self._roads is not None:
+            self._roads.restart()
+        self._past.forget_before(t_ns)
         self._before = None
         self._ranges = ()
 
     def _sum_up(self, step: Step) -> None:
         if step.approach is None:
             return
-        is_new = step.approach not in self.summaries
-        one = self.summaries.setdefault(
+        is_new = step.approach not in self._summaries
+        one = self._summaries.setdefault(
             step.approach, ApproachSummary(step.approach, step.t_ns, step.t_ns)
         )
         one.end_ns = step.t_ns
@@ -296,9 +310,9 @@ class _Scene:
         one.not_seen = tuple(
             name
             for name, p in step.probabilities.items()
-            if p == self.priors[name] and (is_new or name in one.not_seen)
+            if p == self._priors[name] and (is_new or name in one.not_seen)
         )
-        is_sure = step.probabilities.get(FEATURES[0], 0.0) > self.vehicle.fusion.established
+        is_sure = step.probabilities.get(FEATURES[0], 0.0) > self._drive.vehicle.fusion.established
         if is_sure and step.ranges and one.detected_ns is None:
             one.detected_ns = step.t_ns
             one.detected_m = step.ranges[0].range_m
@@ -338,8 +352,8 @@ def _without(past: PastCues, without: frozenset[str]) -> PastCues:
 
 
 @dataclass(slots=True)
-class _Rows:
-    """Rows of the tables, passed to the sink in batches of some thousand."""
+class SceneTables:
+    """Rows of the tables of the scene, passed to a sink in batches of some thousand."""
 
     sink: Sink
     features: Sequence[str]
@@ -349,7 +363,9 @@ class _Rows:
     beliefs: list[tuple[Any, ...]] = field(default_factory=list)
     objects: list[tuple[Any, ...]] = field(default_factory=list)
 
-    def add_objects(self, t_ns: int, objects: Sequence[RangedObject]) -> None:
+    def add(self, step: Step, objects: Sequence[RangedObject]) -> None:
+        """Add the rows of a frame: its step, and the objects that were ranged."""
+        t_ns, number = step.t_ns, step.approach
         self.objects += [
             (
                 t_ns,
@@ -364,9 +380,6 @@ class _Rows:
             )
             for one in objects
         ]
-
-    def add(self, step: Step) -> None:
-        t_ns, number = step.t_ns, step.approach
         self.cues += [(t_ns, number, cue, count) for cue, count in step.counts.items()]
         self.ranges += [
             (t_ns, number, str(row.reference), row.range_m, row.var_m2, row.measured_m)
@@ -382,6 +395,7 @@ class _Rows:
             self.flush()
 
     def flush(self) -> None:
+        """Pass on all rows."""
         for name, rows, columns in (
             ("cues", self.cues, CUE_COLUMNS),
             ("range", self.ranges, RANGE_COLUMNS),
@@ -414,6 +428,24 @@ OBJECT_COLUMNS: Final = (
     "y1",
 )
 RANGE_COLUMNS: Final = ("t_ns", "approach", "reference", "range_m", "var_m2", "measured_m")
+
+
+@contextmanager
+def tables_of_scene(
+    drive: Drive, run: TableFolder, detected: DetectManifest
+) -> Iterator[SceneTables]:
+    """Yield the tables of the scene in a run folder."""
+    vehicle, timeline = drive.vehicle, drive.segments
+    clock = timeline.clock(detected.camera_log)
+    features, reasons = features_of(vehicle), gives_reasons(vehicle)
+    with ExitStack() as stack:
+        sinks = {
+            name: stack.enter_context(LabelledSink(run, name, schema, timeline, clock))
+            for name, schema in scene_schemas(features, gives_reasons=reasons).items()
+        }
+        tables = SceneTables(lambda name, rows: sinks[name].write(rows), features, reasons)
+        yield tables
+        tables.flush()
 
 
 def features_of(vehicle: Vehicle) -> tuple[str, ...]:

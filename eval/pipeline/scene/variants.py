@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from crosscue.eval.pipeline.replay import observe
 from crosscue.eval.pipeline.scene.stage import (
-    estimate_scene,
+    SceneTables,
     features_of,
     gives_reasons,
     scene_schemas,
 )
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.labelled import with_labels
-from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
 from crosscue.replay.errors import RunError
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -40,7 +41,8 @@ def scene_tables(
     if detected is None:
         raise RunError(f"{run.path}: no detector ran on its camera; replay with detectors")
     settings = manifest.settings if vehicle is None else vehicle
-    wanted = scene_schemas(features_of(settings), gives_reasons=gives_reasons(settings))
+    features, reasons = features_of(settings), gives_reasons(settings)
+    wanted = scene_schemas(features, gives_reasons=reasons)
     parts: dict[str, list[pa.Table]] = {
         name: [schema.empty_table()] for name, schema in wanted.items()
     }
@@ -48,19 +50,12 @@ def scene_tables(
     def keep(name: str, rows: dict[str, list[Any]]) -> None:
         parts[name].append(pa.table(rows, schema=wanted[name]))
 
-    timeline = manifest.timeline
-    past = StoredMobileye(run, settings.past)
-    estimate_scene(
-        run,
-        settings,
-        detected,
-        keep,
-        past.cues,
-        without,
-        timeline=timeline,
-        on_restart=past.forget_before,
-    )
-    clock = timeline.clock(detected.camera_log)
+    drive = Drive((), settings, segments=manifest.timeline)
+    tables = SceneTables(keep, features, reasons)
+    observe(drive, run, detected, tables, without)
+    tables.flush()
+    clock = drive.segments.clock(detected.camera_log)
     return {
-        name: with_labels(pa.concat_tables(some), timeline, clock) for name, some in parts.items()
+        name: with_labels(pa.concat_tables(some), drive.segments, clock)
+        for name, some in parts.items()
     }

@@ -11,16 +11,16 @@ from typing import Annotated, Any, ClassVar
 from pydantic import ValidationError
 
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
-from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.pipeline.whole_run import replay_drive
 from crosscue.eval.recording import save_rrd
 from crosscue.eval.report.pose_figures import draw_all
 from crosscue.eval.report.summary import pose_summary
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.files import FOLDER, METRICS
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, measure_pose, truth_track
 from crosscue.localization.town.drive import Traced, drive_traced
 from crosscue.localization.town.settings import Navigation, Sensors, TownDrive
-from crosscue.replay.base import EVERYTHING
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
@@ -73,7 +73,7 @@ def through_log(
         landmarks = None
         if files.landmarks is not None:
             landmarks = open_.enter_context(open_for(files.landmarks, matcher_for(vehicle)))
-        outcome = replay_drive([log], vehicle, run, EVERYTHING, landmarks=landmarks)
+        outcome = replay_drive(Drive([log], vehicle), run, landmarks=landmarks)
     scored = score_pose(run, files.truth)
     return Replayed(traced, files, run, scored, outcome.exit_status == 0, outcome.landmark_counts)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from crosscue.eval.catalog.decoded_logs import decode_tables, table_file
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import create
-from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Table, Topic
 from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import DevicePosition
@@ -37,7 +37,7 @@ def _mobileye_drive() -> list[Block]:
 
 def _tables(path: Path, topics: Sequence[Topic], blocks: list[Block], vehicle: Vehicle) -> Path:
     log = MemoryLog(tuple(topics), blocks, path=Path(__file__))
-    decode_tables([log], vehicle, create(path, overwrite=False), EVERYTHING)
+    decode_tables(Drive([log], vehicle), create(path, overwrite=False))
     return path
 
 

@@ -18,7 +18,8 @@ from crosscue.datasets.truth.truth import read_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.eval.fit.first_pose import with_start, with_start_of
 from crosscue.eval.fit.gnss_truth import write_gnss_truth
-from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.pipeline.whole_run import replay_drive
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.smoother import score_smoother
 from crosscue.replay.base import EVERYTHING
@@ -65,9 +66,7 @@ def straight_drive(speed_mps: float = SPEED_MPS, seconds: int = 30) -> MemoryLog
 
 
 def replayed(folder: Path, vehicle: Vehicle) -> RunFolder:
-    return replay_drive(
-        [straight_drive()], vehicle, create(folder, overwrite=False), EVERYTHING
-    ).run
+    return replay_drive(Drive([straight_drive()], vehicle), create(folder, overwrite=False)).run
 
 
 def test_estimate_keeps_the_first_pose_of_a_run_unless_the_vehicle_file_has_one() -> None:

@@ -149,13 +149,13 @@ def test_resumed_run_writes_same_bytes_as_uninterrupted_run(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("crosscue.eval.pipeline.replay.estimate_into", killed)
+        patch.setattr("crosscue.eval.pipeline.whole_run.estimate", killed)
         arguments = (
             f"replay {drive / 'drive.mcap'} -o {tmp_path / 'run'} -q --vehicle "
             f"{drive / 'vehicle.toml'} --no-cache"
         ).split()
         assert run(arguments) == 130
-    monkeypatch.setattr("crosscue.eval.pipeline.replay.detect_into", killed)
+    monkeypatch.setattr("crosscue.eval.pipeline.whole_run.detect", killed)
 
     _replay(drive, tmp_path / "run", "--resume")
 

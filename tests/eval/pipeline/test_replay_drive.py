@@ -9,9 +9,9 @@ import pytest
 
 from crosscue.eval import cli
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.pipeline.whole_run import replay_drive
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import create
-from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block
 from crosscue.replay.vehicle.pose import Start
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -37,7 +37,7 @@ def _drive(yaw_rate_radps: float, seconds: int = 20, speed_mps: float = 10.0) ->
 def _replay(path: Path, blocks: list[Block], vehicle: Vehicle | None = None) -> Outcome:
     log = MemoryLog((WHEELS, GYRO), blocks, path=Path(__file__))
     vehicle = vehicle or Vehicle(version=1, start=Start(heading_rad=0.0))
-    return replay_drive([log], vehicle, create(path, overwrite=True), EVERYTHING)
+    return replay_drive(Drive([log], vehicle), create(path, overwrite=True))
 
 
 def test_full_circle_ends_at_start(tmp_path: Path) -> None:

@@ -11,12 +11,12 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.pipeline.whole_run import replay_drive
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import create
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.pose_track import start_belief
-from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block
 from crosscue.replay.vehicle.pose import Start
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -58,7 +58,7 @@ def _part(blocks: Sequence[Block], first: int = 0, last: int = 1 << 62) -> list[
 def _replay(path: Path, blocks: Sequence[Block], vehicle: Vehicle | None = None) -> Outcome:
     log = MemoryLog((WHEELS, GYRO), [b for b in blocks if len(b)], path=Path(__file__))
     vehicle = vehicle or Vehicle(version=1, start=Start(heading_rad=0.0))
-    return replay_drive([log], vehicle, create(path, overwrite=True), EVERYTHING)
+    return replay_drive(Drive([log], vehicle), create(path, overwrite=True))
 
 
 @pytest.mark.slow

@@ -12,14 +12,14 @@ import pytest
 from crosscue.eval import cli
 from crosscue.eval.pipeline.detect import Detecting, choices_of
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.pipeline.whole_run import replay_drive
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.localization.landmarks.database import (
     LandmarkDatabase,
     LandmarkPosition,
     LandmarkWriter,
 )
-from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Floats
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
@@ -54,7 +54,7 @@ def _two_logs(folder: Path, wheels: Clock, camera: Clock, run: str) -> Outcome:
     with ExitStack() as stack:
         logs = [stack.enter_context(open_log(path)) for path in paths]
         into = create(folder / run, overwrite=True)
-        return replay_drive(logs, vehicle, into, EVERYTHING, detecting=detecting)
+        return replay_drive(Drive(logs, vehicle), into, detecting)
 
 
 def _column(run: RunFolder, name: str, column: str) -> np.typing.NDArray[np.float64]:
@@ -120,7 +120,7 @@ def _with_landmarks(folder: Path, clock: Clock) -> Outcome:
     vehicle = load(folder / "car.toml")
     with open_log(log) as opened, LandmarkDatabase(path) as database:
         into = create(folder / "run", overwrite=True)
-        return replay_drive([opened], vehicle, into, EVERYTHING, landmarks=database)
+        return replay_drive(Drive([opened], vehicle), into, landmarks=database)
 
 
 def _off_m(run: RunFolder) -> Floats:

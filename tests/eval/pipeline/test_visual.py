@@ -156,6 +156,7 @@ def test_distances_from_pictures_have_the_scale_error_of_the_cameras_height() ->
 
 def test_pictures_are_also_compared_for_the_pitch_where_road_is_accumulated() -> None:
     from crosscue.eval.pipeline.visual import uses_pictures
+    from crosscue.eval.runs.drive import Drive
     from crosscue.replay.vehicle.vehicle import parse
 
     for more, finds_road, expected in (
@@ -164,8 +165,8 @@ def test_pictures_are_also_compared_for_the_pitch_where_road_is_accumulated() ->
         ('[regions]\nkind = "ground"\n[odometry]\nkind = "wheels"\n', False, False),
         ('[odometry]\nkind = "visual"\n', False, True),
     ):
-        vehicle = parse(SETUP + more, "here")
-        assert uses_pictures([], vehicle, finds_road=finds_road) is expected
+        drive = Drive((), parse(SETUP + more, "here"))
+        assert uses_pictures(drive, finds_road=finds_road) is expected
 
 
 def test_a_real_side_street_is_believed_from_pictures_alone(

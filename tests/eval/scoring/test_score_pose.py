@@ -9,14 +9,14 @@ import pytest
 from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, write_tum
 from crosscue.eval.drives.score import score_run
-from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.pipeline.whole_run import replay_drive
 from crosscue.eval.recording import save_rrd as save_recording
 from crosscue.eval.report.summary import pose_summary, scores_text
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
 from crosscue.eval.scoring.runs import pooled_scores
 from crosscue.eval.studies.town.replayed import score_pose
-from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.vehicle.pose import Start
@@ -48,7 +48,7 @@ def _circle(t_s: np.ndarray[tuple[int], np.dtype[np.float64]], ahead_m: float = 
 def _run(folder: Path, vehicle: Vehicle | None = None) -> RunFolder:
     log = MemoryLog((WHEELS, GYRO), _blocks(), path=Path(__file__))
     vehicle = vehicle or Vehicle(version=1, start=Start(heading_rad=0.0))
-    return replay_drive([log], vehicle, create(folder, overwrite=False), EVERYTHING).run
+    return replay_drive(Drive([log], vehicle), create(folder, overwrite=False)).run
 
 
 def _truth(folder: Path, track: Trajectory, **more: object) -> Path:

@@ -6,13 +6,13 @@ import numpy as np
 
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
-from crosscue.eval.pipeline.replay import replay_drive
+from crosscue.eval.pipeline.whole_run import replay_drive
 from crosscue.eval.report.summary import poses_summary
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import create
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.studies.town.replayed import score_pose
-from crosscue.replay.base import EVERYTHING
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import load
 
@@ -25,7 +25,7 @@ def test_nees_of_simulated_drives_is_in_band(tmp_path: Path) -> None:
         files = write_drive(tmp_path / str(seed), DriveSettings(seed=seed, blocks=1, block_m=70.0))
         with open_log(files.log) as log:
             run = create(tmp_path / f"run {seed}", overwrite=False)
-            found = replay_drive([log], load(files.vehicle), run, EVERYTHING).run
+            found = replay_drive(Drive([log], load(files.vehicle)), run).run
         poses.append(score_pose(found, files.truth))
 
     low, high = mean_band(3, DRIVES)
