@@ -337,7 +337,7 @@ def advance_pose(
         strict=True,
     ):
         run.by = effect
-        run.drive(start, stop, *interval)
+        run.drive(start, stop, interval)
     return run.result()
 
 
@@ -393,17 +393,9 @@ class _Run:
         self.tally["rows_late"] = 0 if rows is None else len(rows) - len(self.rows)
         self._find_event()
 
-    def drive(
-        self,
-        start_ns: int,
-        stop_ns: int,
-        distance_m: float,
-        turn_rad: float,
-        distance_var: float,
-        turn_var: float,
-        speed_mps: float,
-        speed_var: float,
-    ) -> None:
+    def drive(self, start_ns: int, stop_ns: int, interval: Sequence[float]) -> None:
+        """Predict over an interval: distance, turn, their variances, speed and its variance."""
+        distance_m, turn_rad, distance_var, turn_var, speed_mps, speed_var = interval
         if stop_ns <= self.t_ns:
             self.tally["intervals_late"] += 1
             return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -137,6 +137,23 @@ class World:
     patches: tuple[Patch, ...] = ()
 
 
+class _Box(NamedTuple):
+    """Middle, heading and size of an object."""
+
+    at: tuple[float, float, float]
+    heading: float
+    size: tuple[float, float, float]
+
+
+class _Flow(NamedTuple):
+    """Cars that follow one another: their lane across the heading, and how many a second."""
+
+    role: Role
+    heading: float
+    lane: float
+    rate_hz: float
+
+
 @dataclass(slots=True)
 class _Site:
     """A world under construction."""
@@ -162,30 +179,25 @@ class _Site:
         category: Category,
         role: Role,
         mesh: Mesh,
-        at: tuple[float, float, float],
-        heading: float,
-        size: tuple[float, float, float],
+        box: _Box,
         velocity: tuple[float, float] = (0.0, 0.0),
         span_s: tuple[float, float] = ALWAYS,
-        later: Mesh | None = None,
-        later_s: float = 0.0,
+        later: tuple[Mesh, float] | None = None,
     ) -> None:
-        """Add a labelled object, whose mesh is already in position."""
+        """Add a labelled object, whose mesh is already in position; another from a time on."""
         number = len(self.things)
-        owned = None if later is None else later.owned_by(number)
+        owned = None if later is None else later[0].owned_by(number)
         self.things.append(
             SceneObject(
                 number,
                 category,
                 role,
                 mesh.owned_by(number),
-                at,
-                heading,
-                size,
+                *box,
                 velocity,
                 span_s,
                 owned,
-                later_s,
+                0.0 if later is None else later[1],
             )
         )
 
@@ -208,9 +220,11 @@ class _Site:
             "car",
             role,
             mesh.placed(x, y, heading),
-            (x, y, shape.height_m / 2),
-            heading,
-            (shape.length_m, 2 * shape.half_width_m, shape.height_m),
+            _Box(
+                (x, y, shape.height_m / 2),
+                heading,
+                (shape.length_m, 2 * shape.half_width_m, shape.height_m),
+            ),
             velocity if moving else (0.0, 0.0),
             span_s,
         )
@@ -462,7 +476,8 @@ def _sign(site: _Site, category: Category, x: float, y: float, z: float, turn: f
     flat = face.corners.reshape(-1, 3)
     wide, high = (float(np.ptp(flat[:, k])) for k in (1, 2))
     site.parts += [post(x, y, z + high / 2), sign_back(face).placed(x, y, turn, z)]
-    site.add(category, "furniture", face.placed(x, y, turn, z), (x, y, z), turn, (0.02, wide, high))
+    box = _Box((x, y, z), turn, (0.02, wide, high))
+    site.add(category, "furniture", face.placed(x, y, turn, z), box)
 
 
 def _control(site: _Site, drive: ApproachMotion) -> None:
@@ -494,20 +509,11 @@ def _lights(site: _Site, drive: ApproachMotion) -> None:
     for y, z in ((lane, 5.45), (lane + 3.4, 5.5), (-(w + 1.2), 3.2)):
         red = light_head("red").placed(end, y, 0.0, z)
         green = light_head("green").placed(end, y, 0.0, z)
-        size = (0.24, 0.36, 1.06)
+        box = _Box((end, y, z), 0.0, (0.24, 0.36, 1.06))
         if drive.green_s < 0.0:
-            site.add("traffic_light", "furniture", green, (end, y, z), 0.0, size)
+            site.add("traffic_light", "furniture", green, box)
         else:
-            site.add(
-                "traffic_light",
-                "furniture",
-                red,
-                (end, y, z),
-                0.0,
-                size,
-                later=green,
-                later_s=drive.green_s,
-            )
+            site.add("traffic_light", "furniture", red, box, later=(green, drive.green_s))
 
 
 def _parked(site: _Site, varied: Generator) -> None:
@@ -543,7 +549,6 @@ def _parked(site: _Site, varied: Generator) -> None:
 def _traffic(site: _Site, conditions: Conditions, drive: ApproachMotion, varied: Generator) -> None:
     layout = site.layout
     w, near, far = layout.half_width_m, NEAR_KERB_M, layout.far_kerb_m
-    length_s = len(drive.motion) / 100.0
     rate = layout.cross_traffic * conditions.traffic / 60.0
     flows = []
     # Traffic drives on the right, so cars to the right use the near half.
@@ -554,18 +559,10 @@ def _traffic(site: _Site, conditions: Conditions, drive: ApproachMotion, varied:
         if layout.one_way != "right":
             flows.append((np.pi / 2, far - 0.27 * (far - near)))
     for heading, x in flows:
-        _stream(site, "cross", heading, x, rate, drive, length_s, varied)
+        _stream(site, _Flow("cross", heading, x, rate), drive, varied)
     if layout.has_ahead:
-        _stream(
-            site,
-            "oncoming",
-            np.pi,
-            -lane_y_m(layout),
-            5.0 * conditions.traffic / 60.0,
-            drive,
-            length_s,
-            varied,
-        )
+        rate = 5.0 * conditions.traffic / 60.0
+        _stream(site, _Flow("oncoming", np.pi, -lane_y_m(layout), rate), drive, varied)
         if not layout.ahead_is_closed:
             _outgoing(site, conditions, varied)
         if drive.green_s >= 0.0 and varied.random() < 0.7 * conditions.traffic:
@@ -577,18 +574,10 @@ def _traffic(site: _Site, conditions: Conditions, drive: ApproachMotion, varied:
                 site.add_car(any_look(varied), "cross", x, y, heading)
 
 
-def _stream(
-    site: _Site,
-    role: Role,
-    heading: float,
-    lane: float,
-    rate_hz: float,
-    drive: ApproachMotion,
-    length_s: float,
-    varied: Generator,
-) -> None:
+def _stream(site: _Site, flow: _Flow, drive: ApproachMotion, varied: Generator) -> None:
     """Add cars that follow one another at random, without collisions with the ego vehicle."""
-    at = -9.0
+    role, heading, lane, rate_hz = flow
+    length_s, at = len(drive.motion) / 100.0, -9.0
     speed = float(varied.uniform(8.0, 12.0))
     enter, leave = drive.inside_s
     while True:

@@ -134,10 +134,12 @@ def compare_drives(
             path,
             kinds[path],
             sums[path],
-            effects[path],
-            int(((one.rows > 0.0) | (one.other_rows > 0.0)).sum()),
-            p_of.get(path, 1.0),
-            could_see.get(path, math.inf),
+            _Test(
+                effects[path],
+                int(((one.rows > 0.0) | (one.other_rows > 0.0)).sum()),
+                p_of.get(path, 1.0),
+                could_see.get(path, math.inf),
+            ),
             allowed_of,
         )
         for path, one in drives.items()
@@ -225,16 +227,23 @@ def _value(
     return np.sqrt(np.maximum(mean, 0.0)) if kind == "rms" else mean
 
 
+class _Test(NamedTuple):
+    """What swaps of places say about one metric: effects, drives, p, and what could be seen."""
+
+    effects: Effects
+    drives: int
+    p: float
+    could_see: float
+
+
 def _judged(
     path: str,
     kind: Kind,
     sums: _Sums,
-    effects: Effects,
-    drives: int,
-    p: float,
-    could_see: float,
+    test: _Test,
     allowed_of: Callable[[str, float], float],
 ) -> PairedMetric:
+    effects, drives, p, could_see = test
     better = direction(path)
     assert better is not None
     before, after = _value_of(kind, sums.total, sums.rows), _value_of(kind, *sums[2:])

@@ -16,7 +16,7 @@ from crosscue.eval.pipeline.run import PicturedRun, Run, run_given
 from crosscue.eval.runs.moments import TableFolder, approach_spans, moment_ns
 from crosscue.replay.errors import CrosscueError, OutputError, UsageError
 from crosscue.results import HIDDEN, Result
-from crosscue.verb import Option
+from crosscue.verb import Option, keywords
 
 if TYPE_CHECKING:
     from crosscue.eval.recording.part import RecordingSpan
@@ -135,19 +135,33 @@ def recording_file(text: str) -> Path:
     return Path(text)
 
 
-def view(
-    run: PicturedRun,
-    *,
-    output: Annotated[
-        Path | None, Option(metavar="X.rrd", convert=recording_file, group="how")
-    ] = None,
-    web: Annotated[bool, Option(group="how")] = False,
-    at: Annotated[str | None, Option(metavar="T", group="part")] = None,
-    approach: Annotated[int | None, Option(group="part")] = None,
-    only: Annotated[str, Option(metavar="VIEWS")] = "",
-    truth: Path | None = None,
-    overwrite: bool = False,
-) -> Recording:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewSettings:
+    """Settings of a view.
+
+    Attributes:
+        output: Write the recording without opening the viewer.
+        web: Serve the viewer on 127.0.0.1 for a browser.
+        at: Seconds from the run's first frame, or a time (17...ns).
+        approach: Number of an approach in belief.parquet.
+        only: Comma-separated views, such as cameras,belief.
+        truth: Truth file, to also draw the true track and ranges (default: that of the last score).
+        overwrite: Replace an existing recording.
+    """
+
+    output: Annotated[Path | None, Option(metavar="X.rrd", convert=recording_file, group="how")] = (
+        None
+    )
+    web: Annotated[bool, Option(group="how")] = False
+    at: Annotated[str | None, Option(metavar="T", group="part")] = None
+    approach: Annotated[int | None, Option(group="part")] = None
+    only: Annotated[str, Option(metavar="VIEWS")] = ""
+    truth: Path | None = None
+    overwrite: bool = False
+
+
+@keywords(ViewSettings)
+def view(run: PicturedRun, settings: ViewSettings) -> Recording:
     """Show a run in Rerun.
 
     Without an output file, the viewer is opened. --at records 6 s, from 2 s before a moment, and
@@ -164,21 +178,18 @@ def view(
 
     Args:
         run: Run folder.
-        output: Write the recording without opening the viewer.
-        web: Serve the viewer on 127.0.0.1 for a browser.
-        at: Seconds from the run's first frame, or a time (17...ns).
-        approach: Number of an approach in belief.parquet.
-        only: Comma-separated views, such as cameras,belief.
-        truth: Truth file, to also draw the true track and ranges (default: that of the last score).
-        overwrite: Replace an existing recording.
+        settings: What to show, and where.
     """
-    if output is not None and output.exists() and not overwrite:
+    output = settings.output
+    if output is not None and output.exists() and not settings.overwrite:
         raise OutputError(f"{output}: exists; give another name or --overwrite")
     made = run_given(run)
-    views = [name for name in only.split(",") if name]
-    path = save_recording(made, output, truth, at=at, approach=approach, only=views)
+    views = [name for name in settings.only.split(",") if name]
+    path = save_recording(
+        made, output, settings.truth, at=settings.at, approach=settings.approach, only=views
+    )
     if output is None:
-        _open(path, web)
+        _open(path, settings.web)
     return Recording(path, output is None, made.manifest.account.is_whole)
 
 

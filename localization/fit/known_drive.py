@@ -184,7 +184,7 @@ class KnownDrive:
         found = np.empty((len(self.fixes), len(State._fields)))
         cov = np.empty((0, 2, 2)) if cov_m2 is None else cov_m2
         # Compiled, because a fit calls it hundreds of times.
-        count = kept(_follow)(start, *steps, self.fixes.xy_m, cov, *self.lever_m, found)
+        count = kept(_follow)(start, steps, self.fixes.xy_m, cov, self.lever_m, found)
         return _predicted(found[:count])
 
 
@@ -196,18 +196,15 @@ def _predicted(states: Floats) -> Predicted:
 
 def _follow(
     state: State,
-    at_fix: Int64s,
-    distance_m: Floats,
-    turn_rad: Floats,
-    distance_var_m2: Floats,
-    turn_var_rad2: Floats,
+    steps: Steps,
     fixes_m: Floats,
     cov_m2: Floats,
-    ahead_m: float,
-    left_m: float,
+    lever_m: tuple[float, float],
     found: Floats,
 ) -> int:
     """Write the state at each position into ``found``; return their number."""
+    at_fix, distance_m, turn_rad, distance_var_m2, turn_var_rad2 = steps
+    ahead_m, left_m = lever_m
     count = 0
     for row in range(len(at_fix)):
         state = predict_pose(

@@ -101,15 +101,11 @@ def _places(
 @njit(cache=True, fastmath={"contract"})
 def _add(
     into: Grid,
-    a: Grid,
-    b: Grid,
-    c: Grid,
-    d: Grid,
-    of_a: np.float32,
-    of_b: np.float32,
-    of_c: np.float32,
-    of_d: np.float32,
+    corners: tuple[Grid, Grid, Grid, Grid],
+    weights: tuple[np.float32, np.float32, np.float32, np.float32],
 ) -> None:
+    a, b, c, d = corners
+    of_a, of_b, of_c, of_d = weights
     for i in range(into.size):
         into[i] += of_a * a[i] + of_b * b[i] + of_c * c[i] + of_d * d[i]
 
@@ -147,13 +143,7 @@ def _pool(
                 u = of_right[x]
                 _add(
                     cells[y // samples * side + x // samples],
-                    upper[left[x]],
-                    upper[right[x]],
-                    lower[left[x]],
-                    lower[right[x]],
-                    (one - v) * (one - u),
-                    (one - v) * u,
-                    v * (one - u),
-                    v * u,
+                    (upper[left[x]], upper[right[x]], lower[left[x]], lower[right[x]]),
+                    ((one - v) * (one - u), (one - v) * u, v * (one - u), v * u),
                 )
         cells *= one / np.float32(samples * samples)
