@@ -43,7 +43,7 @@ from crosscue.detectors.cues.cars import (
     parked_cars,
 )
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.scoring.drives import score as as_score
+from crosscue.eval.scoring.drives import pool_scores as as_score
 from crosscue.eval.scoring.drives import score_drive
 from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, fraction
 from crosscue.eval.scoring.runs import read_run_tables

@@ -58,6 +58,7 @@ from crosscue.eval.pipeline.run import Run as Run
 from crosscue.eval.pipeline.run import load_vehicle as load_vehicle
 from crosscue.eval.pipeline.run import open_run as open_run
 from crosscue.eval.recording.view import save_recording as save_recording
+from crosscue.eval.scoring.drives import score as score
 from crosscue.eval.studies.intersections.run import run_intersection_study as run_intersection_study
 from crosscue.eval.studies.layouts.run import run_layout_study as run_layout_study
 from crosscue.eval.studies.town.field_study import run_field_study as run_field_study

@@ -1,13 +1,14 @@
 """Scores of drives from their tables: coverage, cues, approaches, belief, range.
 
-``score_drive`` compares one drive with its truth; ``score`` pools any number of judged drives.
+``score`` scores the tables of one drive. ``score_drive`` compares one with its truth, and
+``pool_scores`` pools any number of compared drives.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -33,7 +34,13 @@ from . import intervals
 from . import truth as score_truth
 from .columns import RunTables
 from .pooling import BINS_M
+from .run_tables import run_tables
 from .truth import DriveTruth
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from crosscue.datasets.truth.truth import Truth
 
 FORMAT: Final = 1
 SECTIONS: Final = ("cues", "approaches", "belief", "range")
@@ -204,7 +211,31 @@ def _not_scored(tables: RunTables, truth: DriveTruth) -> dict[str, str]:
     return found
 
 
-def score(drives: Sequence[DriveJudged], settings: ScoreSettings = DEFAULTS) -> PooledScores:
+def score(
+    tables: Mapping[str, pa.Table],
+    truth: Truth | DriveTruth,
+    settings: ScoreSettings = DEFAULTS,
+) -> PooledScores:
+    """Score the tables of one drive; no run folder is needed, and nothing is read or written.
+
+    Args:
+        tables: Tables ``frames``, ``cues``, ``range`` and ``belief`` with the columns of a run's;
+            what a missing one shows is not scored.
+        truth: Content of a truth file, or ``read_scored_truth`` with its true ranges, without which
+            ranges and distances are not scored.
+        settings: Settings of the scores.
+
+    Raises:
+        RunError: A column is missing, or has impossible values.
+        SchemaError: Their times do not overlap: the truth belongs to another log or clock.
+    """
+    if not isinstance(truth, DriveTruth):
+        truth = DriveTruth(truth.log or "drive", truth, None)
+    found = run_tables(truth.drive, **{f"{name}_table": one for name, one in tables.items()})
+    return pool_scores([score_drive(found, truth, settings)], settings)
+
+
+def pool_scores(drives: Sequence[DriveJudged], settings: ScoreSettings = DEFAULTS) -> PooledScores:
     """Score any number of judged drives together.
 
     Raises:

@@ -16,7 +16,7 @@ from crosscue.replay.files.whole_file import write_table, write_text
 from .by_drive import BY_DRIVE, DriveMetric, by_drive_table, drive_contributions
 from .by_drive import FOLDER as FOLDER
 from .by_drive import METRICS as METRICS
-from .drives import DriveJudged, as_metrics, score
+from .drives import DriveJudged, as_metrics, pool_scores
 from .runs import RunScored
 from .truth import FEATURES
 
@@ -51,7 +51,7 @@ def _parts(one: RunScored) -> Iterator[DriveMetric]:
     rmse_m = None if one.pose is None else one.pose.ape["none"].translation_m.rmse
     is_lost = one.pose is not None and one.pose.lost_at_m is not None
     places = sorted(set(one.truth.places.values()))
-    for part in drive_contributions(logs, as_metrics(score([one.judged])), rmse_m, is_lost):
+    for part in drive_contributions(logs, as_metrics(pool_scores([one.judged])), rmse_m, is_lost):
         yield part._replace(places=places)
 
 

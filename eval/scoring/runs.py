@@ -40,7 +40,7 @@ from .drives import (
     PooledScores,
     ScoreSettings,
     as_metrics,
-    score,
+    pool_scores,
     score_drive,
     score_smoothed,
 )
@@ -282,7 +282,7 @@ def _why_no_pose(run: RunFolder, truth: Truth) -> str:
 
 def pooled_scores(scored: Sequence[RunScored], settings: ScoreSettings = DEFAULTS) -> PooledScores:
     """Return the pooled scores of runs."""
-    return score([one.judged for one in scored], settings)
+    return pool_scores([one.judged for one in scored], settings)
 
 
 def metrics_of(scored: Sequence[RunScored], scores: PooledScores) -> dict[str, Any]:

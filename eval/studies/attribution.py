@@ -20,7 +20,7 @@ from crosscue.eval.scoring.drives import (
     PooledScores,
     ScoreSettings,
     as_metrics,
-    score,
+    pool_scores,
     score_drive,
 )
 from crosscue.eval.scoring.intervals import Mean, mean
@@ -105,7 +105,7 @@ def attribute(
     """
     if groups is None:
         groups = {name: [cue.name for cue in some] for name, some in cue_table.groups().items()}
-    scores = score([one.judged for one in drives], settings)
+    scores = pool_scores([one.judged for one in drives], settings)
     return {name: _without(drives, scores, tuple(cues), settings) for name, cues in groups.items()}
 
 
@@ -117,7 +117,7 @@ def _without(
 ) -> Attribution:
     left = frozenset(cues)
     judged = [score_drive(one.estimate(left), one.truth, settings) for one in drives]
-    scores = score(judged, settings)
+    scores = pool_scores(judged, settings)
     pairs = _pairs(whole, scores)
     detected = [(a.detected_m, b.detected_m) for a, b in pairs]
     full = [(a.full_m, b.full_m) for a, b in pairs]

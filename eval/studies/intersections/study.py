@@ -10,7 +10,7 @@ from typing import Final
 from crosscue.datasets.truth.truth import FILE
 from crosscue.eval.fit.annotated_runs import AnnotatedRuns, add_approaches, graph_of_runs
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.scoring.drives import ScoreSettings, score, score_drive
+from crosscue.eval.scoring.drives import ScoreSettings, pool_scores, score_drive
 from crosscue.eval.scoring.runs import RunScored, judge_run
 from crosscue.eval.scoring.scene.belief import compare_belief
 from crosscue.eval.studies.attribution import AttributedDrive, attribute
@@ -49,16 +49,16 @@ def score_intersection_study(
     first = [one.judged for one in scored]
     learned = calibrated_vehicles(scored)
     if learned is None:
-        return StudyScores(scored, score(first, AS_PUBLISHED), worth, None, {})
+        return StudyScores(scored, pool_scores(first, AS_PUBLISHED), worth, None, {})
     second = [
         score_drive(estimate_of(one.run, vehicle)(frozenset()), one.truth, AS_PUBLISHED)
         for one, vehicle in zip(scored, learned, strict=True)
     ]
     return StudyScores(
         scored,
-        score(first, AS_PUBLISHED),
+        pool_scores(first, AS_PUBLISHED),
         worth,
-        score(second, AS_PUBLISHED),
+        pool_scores(second, AS_PUBLISHED),
         compare_belief(
             [part for one in first for part in one.belief],
             [part for one in second for part in one.belief],

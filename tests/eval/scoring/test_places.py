@@ -9,7 +9,7 @@ import pytest
 from crosscue.datasets.truth.truth import Origin, Truth
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.eval.scoring.columns import NONE
-from crosscue.eval.scoring.drives import score, score_drive
+from crosscue.eval.scoring.drives import pool_scores, score_drive
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS, fraction, mean
 from crosscue.eval.scoring.places import group_drives, group_places, places_of
 from crosscue.eval.scoring.truth import DriveTruth, read_scored_truth
@@ -62,7 +62,7 @@ def test_drives_to_one_intersection_have_no_interval_of_scores() -> None:
             truth = good_truth()
             placed = DriveTruth(f"drive {number}", truth.truth, truth.ranges, {0: name, NONE: name})
             drives.append(score_drive(good_tables(), placed))
-        found = score(drives)
+        found = pool_scores(drives)
         assert found.approaches is not None
         precision = found.cues["stop_sign"].precision
         brier = found.belief["left"].brier

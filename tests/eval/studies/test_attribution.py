@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import pytest
 
 from crosscue.eval.scoring.columns import RunTables
-from crosscue.eval.scoring.drives import as_metrics, score, score_drive
+from crosscue.eval.scoring.drives import as_metrics, pool_scores, score_drive
 from crosscue.eval.studies.attribution import (
     AttributedDrive,
     attribute,
@@ -60,7 +60,7 @@ def test_cue_effect_is_distance_lost_without_it() -> None:
 def test_attribution_is_serialised_and_summary_fits_80_columns() -> None:
     drive = _drive("d", {"stop_sign": NEVER})
     found = attribute([drive], GROUPS)
-    metrics = as_metrics(score([drive.judged])) | {"attribution": attribution_tree(found)}
+    metrics = as_metrics(pool_scores([drive.judged])) | {"attribution": attribution_tree(found)}
 
     assert '"detected_only_with": 1' in strict_json(metrics)
     lines = attribution_lines(found)
