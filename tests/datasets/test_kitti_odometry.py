@@ -11,6 +11,7 @@ import crosscue
 from crosscue.datasets.adapters.kitti_odometry import read_kitti_poses, write_kitti_odometry_truth
 from crosscue.datasets.truth.truth import read_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
+from crosscue.replay.columns import Table
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
@@ -25,7 +26,8 @@ from support.kitti_odometry_drive import (
 def test_left_turn_has_positive_yaw_rate_and_heading(tmp_path: Path) -> None:
     folder = kitti_odometry_drive(tmp_path)
 
-    odometry = read_kitti_poses(folder).odometry().table
+    odometry = read_kitti_poses(folder).odometry().rows
+    assert isinstance(odometry, Table)
     truth = read_truth(write_kitti_odometry_truth(folder, tmp_path / "truth"))
 
     np.testing.assert_allclose(np.asarray(odometry["speed_x_mps"], float), SPEED_MPS, rtol=2e-3)

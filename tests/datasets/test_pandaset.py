@@ -12,6 +12,7 @@ from crosscue.datasets.real.label_pandaset import write_labels
 from crosscue.datasets.truth.truth import read_truth, write_carried
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.replay.base import Selection
+from crosscue.replay.columns import Table
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
@@ -33,7 +34,8 @@ def rows(path: Path, selection: Selection | None = None) -> tuple[dict[str, int]
 
 
 def test_odometry_matches_simulated_motion(tmp_path: Path) -> None:
-    table = read_pandaset_poses(pandaset_drive(tmp_path / "002")).odometry().table
+    table = read_pandaset_poses(pandaset_drive(tmp_path / "002")).odometry().rows
+    assert isinstance(table, Table)
 
     # A chord of 0.2 s at 0.2 rad/s is 0.007 % shorter than its arc.
     np.testing.assert_allclose(np.asarray(table["speed_x_mps"], float)[1:-1], SPEED_MPS, rtol=1e-4)
@@ -83,7 +85,9 @@ def test_real_sequence_is_read_with_known_speed_and_distance(tmp_path: Path) -> 
     path = shared("sequences", "pandaset_002")
 
     found, ledger = rows(path)
-    speed = read_pandaset_poses(path).odometry().table["speed_x_mps"]
+    table = read_pandaset_poses(path).odometry().rows
+    assert isinstance(table, Table)
+    speed = table["speed_x_mps"]
 
     assert found == {"front_camera": 80, "odometry": 80, "gnss": 80}
     assert ledger.is_whole
