@@ -11,25 +11,29 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.datasets.truth.truth import Truth
+from crosscue.eval.pipeline.run import Run, run_given
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.travelled import odometer_of
-from crosscue.eval.scoring.truth import CROSSING_NS, DriveTruth
+from crosscue.eval.scoring.columns import NONE
+from crosscue.eval.scoring.places import group_places
+from crosscue.eval.scoring.truth import CROSSING_NS, DriveTruth, read_scored_truth
 from crosscue.fusion.factor_graph import FactorGraph, graph_of
 from crosscue.fusion.fit.annotated_approach import NOT_EVALUATED, AnnotatedApproach
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive
 from crosscue.fusion.intersection_range import Reference
 from crosscue.fusion.temporal import MeasuredRange, ranges_to_start
 from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import OutputError, RunError, UsageError
+from crosscue.replay.errors import RunError, UsageError
+from crosscue.replay.progress import Progress, emit
 from crosscue.replay.vehicle.vehicle import RangeCurve, Vehicle
 
 if TYPE_CHECKING:
@@ -41,39 +45,43 @@ NOTHING_THERE: Final = {"intersection": False, "left": False, "right": False}
 CURVES: Final = {Reference.START: "stop_sign", Reference.END: "traffic_light"}
 
 
-@dataclass(slots=True)
-class AnnotatedRuns:
-    """Annotated approaches of runs.
-
-    Attributes:
-        approaches: Approaches to fit to.
-        used: Number of the runs' approaches by kind.
-    """
-
-    approaches: list[AnnotatedApproach]
-    used: Counter[str]
+Part = TypeVar("Part", AnnotatedApproach, AnnotatedDrive)
 
 
-def check_arguments(
-    runs: int, truth: int, output: Path | str | None, *, overwrite: bool
-) -> Path | None:
-    """Check the arguments of a fit before any run is read.
-
-    Returns:
-        The output's path, if any.
+def read_annotated(
+    runs: Sequence[Run | Path | str],
+    truth: Sequence[Path | str],
+    parts_of: Callable[[RunFolder, DriveTruth, Vehicle], Iterable[Part]],
+) -> tuple[FactorGraph, list[Part]]:
+    """Return the factor graph that all runs share, and their annotated parts, grouped by place.
 
     Raises:
-        UsageError: The numbers of runs and truth files differ.
-        OutputError: The output exists.
+        UsageError: The numbers of runs and truth files, or the factor graphs, differ.
+        RunError: A run is damaged.
+        AnnotationError: A truth file is not valid.
     """
-    if runs != truth:
+    if len(runs) != len(truth):
         raise UsageError(
-            f"truth: {runs} runs, {truth} truth files; give one for each, in the same order"
+            f"truth: {len(runs)} runs, {len(truth)} truth files; give one for each, in the same "
+            "order"
         )
-    path = None if output is None else Path(output)
-    if path is not None and path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists; give another name or --overwrite")
-    return path
+    folders = [run_given(one).folder for one in runs]
+    graph, vehicle = graph_of_runs(folders)
+    parts: list[Part] = []
+    for done, (folder, known) in enumerate(zip(folders, truth, strict=True), 1):
+        parts += parts_of(folder, read_scored_truth(Path(known), str(folder.path)), vehicle)
+        emit(Progress("reading", done, len(folders), "runs"))
+    return graph, by_place(parts)
+
+
+def by_place(parts: Sequence[Part]) -> list[Part]:
+    """Return the parts with one name for each place, as in scores."""
+    names: dict[int, str] = {}
+    numbers = group_places([one.place for one in parts]).tolist()
+    return [
+        replace(one, place=names.setdefault(number, one.place))
+        for number, one in zip(numbers, parts, strict=True)
+    ]
 
 
 def graph_of_runs(runs: Sequence[RunFolder]) -> tuple[FactorGraph, Vehicle]:
@@ -94,17 +102,20 @@ def graph_of_runs(runs: Sequence[RunFolder]) -> tuple[FactorGraph, Vehicle]:
     return graphs[0], vehicles[0]
 
 
-def add_approaches(run: RunFolder, truth: Truth, vehicle: Vehicle, into: AnnotatedRuns) -> None:
-    """Add the approaches of one run.
+def annotated_approaches(
+    run: RunFolder, known: DriveTruth, vehicle: Vehicle, used: Counter[str]
+) -> Iterator[AnnotatedApproach]:
+    """Yield the approaches of one run to fit to, and count all by kind in ``used``.
 
     Raises:
         RunError: A table is missing or damaged, or the run is outside the truth's time.
     """
     run.refuse_set_back("fit messages")
+    truth = known.truth
     belief = run.table("belief", ["t_ns", "approach", "established"])
     t_ns = _int64s(belief["t_ns"])
     number, established = _int64s(belief["approach"]), np.asarray(belief["established"])
-    if len(t_ns) and not ((t_ns >= truth.start_ns) & (t_ns < truth.end_ns)).any():
+    if len(t_ns) and not known.is_annotated(t_ns).any():
         raise RunError(
             f"{run.path}: no approach between {truth.start_ns} and {truth.end_ns} ns, which the "
             "truth covers; give the truth of this drive"
@@ -114,44 +125,42 @@ def add_approaches(run: RunFolder, truth: Truth, vehicle: Vehicle, into: Annotat
     counts = _counts_at(run.table("cues", ["t_ns", "cue", "count"]), t_ns)
     for one in np.unique(number).tolist():
         rows = np.flatnonzero(number == one)
-        kept, features, place, what = _annotation_of(t_ns[rows], truth)
-        into.used[what] += 1
+        kept, features, at, what = _annotation_of(t_ns[rows], truth)
+        used[what] += 1
         if features is None or not kept.any():
             continue
         rows = rows[kept]
         before = np.concatenate([[False], established[number == one][:-1]])[kept]
-        into.approaches.append(
-            AnnotatedApproach(
-                way_m[rows] - way_m[rows[0]],
-                (t_ns[rows] - t_ns[rows[0]]) * 1e-9,
-                near[rows],
-                before.astype(np.bool_),
-                {cue: column[rows] for cue, column in counts.items()},
-                features,
-                place or f"{run.path}, approach {one}",
-            )
+        yield AnnotatedApproach(
+            way_m[rows] - way_m[rows[0]],
+            (t_ns[rows] - t_ns[rows[0]]) * 1e-9,
+            near[rows],
+            before.astype(np.bool_),
+            {cue: column[rows] for cue, column in counts.items()},
+            features,
+            known.places.get(at, f"{run.path}, approach {one}"),
         )
 
 
 def _annotation_of(
     t_ns: Int64s, truth: Truth
-) -> tuple[NDArray[np.bool_], dict[str, bool] | None, str, str]:
-    """Return the frames to use, the true features, the intersection, and the approach's kind."""
+) -> tuple[NDArray[np.bool_], dict[str, bool] | None, int, str]:
+    """Return the frames to use, the true features, the true approach, and the approach's kind."""
     shared = [((t_ns >= a.start_ns) & (t_ns < a.enter_ns)).sum() for a in truth.approaches]
     if shared and max(shared) > 0:
         one = truth.approaches[int(np.argmax(shared))]
         features = {"intersection": True, **one.features.model_dump()}
         before = (t_ns >= one.start_ns) & (t_ns < one.enter_ns)
         if None in features.values():
-            return before, None, "", "to an intersection with unknown roads, left out"
-        return before, features, one.intersection, "to an intersection"
+            return before, None, NONE, "to an intersection with unknown roads, left out"
+        return before, features, one.id, "to an intersection"
     inside = (t_ns >= truth.start_ns) & (t_ns < truth.end_ns)
     for a in truth.approaches:
         if ((t_ns >= a.enter_ns) & (t_ns < a.enter_ns + CROSSING_NS)).any():
-            return inside, None, "", "in an intersection, left out"
+            return inside, None, NONE, "in an intersection, left out"
     if not inside.all():
-        return inside, None, "", "outside the truth's time, left out"
-    return inside, dict(NOTHING_THERE), "", "to nothing"
+        return inside, None, NONE, "outside the truth's time, left out"
+    return inside, dict(NOTHING_THERE), NONE, "to nothing"
 
 
 def _int64s(column: object) -> Int64s:
@@ -225,7 +234,7 @@ def annotated_drives(
     counts = _counts_at(tables["cues"], t_ns)
     ranges = _ranges(tables["range"], t_ns, moves.way_m, vehicle)
     start_m = truth.start_m(t_ns)
-    for kept, features, place in _parts(truth.truth, t_ns):
+    for kept, features, at in _parts(truth.truth, t_ns):
         rows = np.flatnonzero(kept)
         if not len(rows):
             continue
@@ -237,7 +246,7 @@ def annotated_drives(
             {cue: column[rows] for cue, column in counts.items()},
             tuple(ranges[i] for i in rows.tolist()),
             features,
-            place or str(run.path),
+            truth.places.get(at, str(run.path)),
         )
 
 
@@ -250,8 +259,8 @@ def _from_first(column: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _parts(
     truth: Truth, t_ns: NDArray[np.int64]
-) -> Iterator[tuple[NDArray[np.bool_], dict[str, bool], str]]:
-    """Yield the frames of each part, its true features, and the intersection's name."""
+) -> Iterator[tuple[NDArray[np.bool_], dict[str, bool], int]]:
+    """Yield the frames of each part, its true features, and the id of the approach or ``NONE``."""
     ahead = np.zeros(len(t_ns), np.bool_)
     for one in truth.approaches:
         kept = (t_ns >= one.start_ns) & (t_ns < one.enter_ns)
@@ -259,7 +268,7 @@ def _parts(
         known = {
             name: value for name, value in one.features.model_dump().items() if value is not None
         }
-        yield kept, {"intersection": True, **known}, one.intersection
+        yield kept, {"intersection": True, **known}, one.id
     rest = ~ahead & (t_ns >= truth.start_ns) & (t_ns < truth.end_ns)
     begins = np.flatnonzero(np.diff(rest.astype(np.int8), prepend=0) == 1)
     for begin in begins.tolist():
@@ -267,7 +276,7 @@ def _parts(
         end = begin + int(gaps[0]) if len(gaps) else len(rest)
         kept = np.zeros(len(rest), np.bool_)
         kept[begin:end] = True
-        yield kept, dict(NOTHING_THERE), ""
+        yield kept, dict(NOTHING_THERE), NONE
 
 
 def _moves(run: RunFolder, t_ns: NDArray[np.int64]) -> _Moves:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 import numpy as np
-import tomlkit
 
 from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.eval.pipeline.pose import compass_settings
@@ -18,14 +17,13 @@ from crosscue.localization.fit.compass import CompassFit
 from crosscue.localization.fit.compass import fit_compass as fit_readings
 from crosscue.replay.base import Log, Selection
 from crosscue.replay.errors import EmptyResultError, VehicleError
-from crosscue.replay.files.tree_text import toml_document
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option
 
 from .log_signals import read_signals, signal_plan
-from .vehicle_output import check_output, write_fit
+from .vehicle_output import check_output, with_section, write_fit
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -120,7 +118,9 @@ def fit_compass(
     settings = vehicle_given(vehicle)
     with opened(log) as drive:
         fitted = fit_log_compass(drive.logs, settings, drive.selection)
-    path = write_fit(vehicle, output, lambda text: with_compass(text, fitted))
+    path = write_fit(
+        vehicle, output, lambda text: with_section(text, "compass", compass_section(fitted))
+    )
     return FittedCompass(fitted, path)
 
 
@@ -164,12 +164,3 @@ def compass_section(fitted: CompassFit) -> dict[str, object]:
     if np.isfinite(fitted.persists_s):
         section["interval_s"] = round(2.0 * fitted.persists_s, 2)
     return section
-
-
-def with_compass(text: str, fitted: CompassFit) -> str:
-    """Return a vehicle file's text with its [compass] values replaced and comments kept."""
-    document = toml_document(text)
-    section = document.setdefault("compass", tomlkit.table())
-    for key, value in compass_section(fitted).items():
-        section[key] = value
-    return tomlkit.dumps(document)

@@ -11,40 +11,32 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from crosscue.datasets.truth.truth import read_truth
-from crosscue.eval.fit.annotated_runs import (
-    AnnotatedRuns,
-    add_approaches,
-    check_arguments,
-    graph_of_runs,
-)
-from crosscue.eval.pipeline.run import Run, run_given
+from crosscue.eval.fit.annotated_runs import annotated_approaches, read_annotated
+from crosscue.eval.fit.vehicle_output import FittedSection, new_file, section_text
+from crosscue.eval.pipeline.run import Run
 from crosscue.eval.scoring.intervals import TOO_FEW, Interval, mean_by_cluster, wilson
 from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.fusion.fit.message_fit import fit_messages as fit_approaches
 from crosscue.replay.errors import EmptyResultError
 from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.progress import Progress, emit
-from crosscue.results import HIDDEN, Result
+from crosscue.results import HIDDEN
 from crosscue.verb import Option
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedMessages(Result):
+class FittedMessages(FittedSection):
     """Learned reliability of each cue.
 
     Attributes:
         fitted: Rates, decorrelation scales and exponents.
         used: Number of approaches of the runs, by kind.
         runs: Number of runs.
-        path: File that the section was written to; None without one.
     """
 
     fitted: MessageFit = field(metadata=HIDDEN)
     used: Counter[str]
     runs: int = field(metadata=HIDDEN)
-    path: Path | None = field(metadata=HIDDEN)
 
     also: ClassVar = {
         "approaches": "fitted.approaches",
@@ -55,8 +47,8 @@ class FittedMessages(Result):
 
     @property
     def section(self) -> str:
-        """The vehicle file's section ``[fusion.calibrated]``."""
-        return _section_of(self.fitted)
+        """The vehicle file's section ``[fusion.calibrated]``, with counts as comments."""
+        return section_of(self.fitted)
 
     @property
     def calibrated(self) -> dict[str, Any]:
@@ -92,10 +84,9 @@ class FittedMessages(Result):
             for one in self.fitted.fades
         ]
 
-    def lines(self) -> Iterator[str]:
-        """Yield the rates, scales and exponents, and the section."""
+    def report(self) -> Iterator[str]:
+        """Yield the rates, scales and exponents."""
         yield _report_text(self.fitted, self.used, self.runs)
-        yield self.section if self.path is None else f"written to {self.path}"
 
 
 def _report_text(fitted: MessageFit, used: Counter[str], runs: int) -> str:
@@ -189,30 +180,28 @@ def _rates_of(side: Side) -> _SideRate:
     )
 
 
-def _section_of(fit: MessageFit) -> str:
-    """Return the vehicle file's section, with counts as comments."""
-    lines = ["[fusion.calibrated]", "rates = ["]
-    lines += [_rate_line(one) for one in fit.rates if one.rates is not None]
-    lines += ["]", "", "[fusion.calibrated.exponents]"]
-    lines += [f"{name} = {value:.3f}" for name, value in fit.calibrated.exponents.items()]
-    lines += ["", "[fusion.calibrated.fades]"]
-    for one in fit.fades:
-        if one.is_learned:
-            key, value = ("way_m", one.fade.way_m), ("time_s", one.fade.time_s)
-            name, number = key if key[1] is not None else value
-            lines.append(
-                f"{one.cue} = {{ {name} = {number:.3g} }}  "
-                f"# {one.positives} positive of {one.observations} frames"
-            )
-    return "\n".join(lines) + "\n"
-
-
-def _rate_line(one: RateFit) -> str:
-    assert one.rates is not None
-    return (
-        f'  {{ cue = "{one.cue}", feature = "{one.feature}", near = {str(one.near).lower()}, '
-        f"if_there = {one.rates.if_there:.4g}, if_not = {one.rates.if_not:.4g} }},  "
-        f"# {one.there.places} and {one.missing.places} places"
+def section_of(fit: MessageFit) -> str:
+    """Return the vehicle file's section, with the counts behind each line as comments."""
+    learned = fit.calibrated
+    return section_text(
+        "fusion.calibrated",
+        {
+            "rates": [one.model_dump() for one in learned.rates],
+            "exponents": learned.exponents,
+            "fades": {name: fade.model_dump() for name, fade in learned.fades.items()},
+        },
+        {
+            "rates": [
+                f"{one.there.places} and {one.missing.places} places"
+                for one in fit.rates
+                if one.rates is not None
+            ],
+            "fades": [
+                f"{one.positives} positive of {one.observations} frames"
+                for one in fit.fades
+                if one.is_learned
+            ],
+        },
     )
 
 
@@ -244,23 +233,20 @@ def fit_messages(
         EmptyResultError: Nothing can be learned.
         OutputError: The file exists, or cannot be written.
     """
-    path = check_arguments(len(runs), len(truth), output, overwrite=overwrite)
-    folders = [run_given(one).folder for one in runs]
-    graph, vehicle = graph_of_runs(folders)
-    found = AnnotatedRuns([], Counter())
-    for done, (folder, known) in enumerate(zip(folders, truth, strict=True), 1):
-        add_approaches(folder, read_truth(Path(known)), vehicle, found)
-        emit(Progress("reading", done, len(folders), "runs"))
-    if not found.approaches:
+    path, used = new_file(output, overwrite=overwrite), Counter[str]()
+    graph, approaches = read_annotated(
+        runs, truth, lambda run, known, car: annotated_approaches(run, known, car, used)
+    )
+    if not approaches:
         raise EmptyResultError(
             "fit messages: no approach of any run matches an annotated one; use more drives"
         )
-    fitted = fit_approaches(found.approaches, graph)
+    fitted = fit_approaches(approaches, graph)
     if all(one.rates is None for one in fitted.rates):
         raise EmptyResultError(
-            f"fit messages: {len(found.approaches)} approaches are too few to learn from, so every "
+            f"fit messages: {len(approaches)} approaches are too few to learn from, so every "
             "published message is kept; use more drives with truth"
         )
     if path is not None:
-        write_text(path, _section_of(fitted))
-    return FittedMessages(fitted, found.used, len(folders), path)
+        write_text(path, section_of(fitted))
+    return FittedMessages(path, fitted, used, len(runs))

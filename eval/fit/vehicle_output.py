@@ -1,17 +1,112 @@
-"""Write the values of a fit into a vehicle file."""
+"""What fits share: a result with a section of the vehicle file, and writing it.
+
+A fit reads its inputs, fits, and returns a ``FittedSection``. It is printed as a report and the
+section, or the section is written: to a file of its own, or into a copy of a vehicle file.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+import tomlkit
 
 from crosscue.replay.errors import OutputError, UsageError
+from crosscue.replay.files.tree_text import toml_document
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
+from crosscue.results import HIDDEN, Result
 
 # Vehicle file with only default values.
 DEFAULTS: Final = "version = 1\n"
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FittedSection(Result):
+    """A fit whose result is a section of a vehicle file.
+
+    Attributes:
+        path: File that the section was written to; None without one.
+    """
+
+    path: Path | None = field(metadata=HIDDEN)
+
+    @property
+    @abstractmethod
+    def section(self) -> str:
+        """The vehicle file's section, as TOML."""
+
+    @abstractmethod
+    def report(self) -> Iterator[str]:
+        """Yield what was fitted, and how well."""
+
+    def lines(self) -> Iterator[str]:
+        """Yield the report, and the section unless it was written."""
+        yield from self.report()
+        yield self.section if self.path is None else f"written to {self.path}"
+
+
+def new_file(output: Path | str | None, *, overwrite: bool) -> Path | None:
+    """Return the path of an output, after checking that it may be written.
+
+    Raises:
+        OutputError: It exists.
+    """
+    path = None if output is None else Path(output)
+    if path is not None and path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists; give another name or --overwrite")
+    return path
+
+
+def section_text(
+    name: str, values: Mapping[str, Any], comments: Mapping[str, Sequence[str]] | None = None
+) -> str:
+    """Return a section as TOML, with four digits; a list of tables has one inline table a line.
+
+    Args:
+        name: Name of the section.
+        values: Scalars, lists, tables, and lists of tables.
+        comments: Comments on the entries of a table or of a list of tables, by its key.
+    """
+    lines, tables = [f"[{name}]"], list[str]()
+    for key, value in values.items():
+        notes = [f"  # {note}" for note in (comments or {}).get(key, ())]
+        if isinstance(value, Mapping):
+            entries = [f"{_key(one)} = {_inline(item)}" for one, item in value.items()]
+            notes = notes or [""] * len(entries)
+            tables += ["", f"[{name}.{key}]"]
+            tables += [a + b for a, b in zip(entries, notes, strict=True)]
+        elif isinstance(value, list | tuple) and value and isinstance(value[0], Mapping):
+            notes = notes or [""] * len(value)
+            rows = [f"  {_inline(one)},{note}" for one, note in zip(value, notes, strict=True)]
+            lines += [f"{key} = [", *rows, "]"]
+        elif value is not None:
+            lines.append(f"{key} = {_inline(value)}")
+    return "\n".join([*lines, *tables]) + "\n"
+
+
+def _key(name: str) -> str:
+    return name if name.replace("_", "").isalnum() else json.dumps(name)
+
+
+def _inline(value: Any) -> str:
+    if isinstance(value, Mapping):
+        known = {key: item for key, item in value.items() if item not in (None, ())}
+        return f"{{ {', '.join(f'{key} = {_inline(item)}' for key, item in known.items())} }}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_inline, value))}]"
+    return str(float(f"{value:.4g}")) if isinstance(value, float) else json.dumps(value)
+
+
+def with_section(text: str, name: str, values: Mapping[str, object]) -> str:
+    """Return a vehicle file's text with values of a section replaced and comments kept."""
+    document = toml_document(text)
+    document.setdefault(name, tomlkit.table()).update(values)
+    return tomlkit.dumps(document)
 
 
 def check_output(
@@ -31,8 +126,7 @@ def check_output(
         )
     path = Path(output)
     is_itself = vehicle is not None and path.exists() and path.samefile(vehicle)
-    if path.exists() and not is_itself and not overwrite:
-        raise OutputError(f"{path}: exists; give another name or --overwrite")
+    new_file(path, overwrite=overwrite or is_itself)
 
 
 def write_fit(

@@ -192,9 +192,10 @@ def _steps(drive: AnnotatedDrive, about: Temporal) -> np.typing.NDArray[np.bool_
 
 
 def _counted(drives: Sequence[AnnotatedDrive], graph: FactorGraph) -> Temporal:
-    ahead = {one.place: bool(one.features.get(PRESENCE)) for one in drives}
+    # A place counts once ahead of its intersection, and once on a part of the road without one.
+    ahead = {(one.place, bool(one.features.get(PRESENCE))) for one in drives}
     empty = Temporal(
-        ahead=round((sum(ahead.values()) + 1.0) / (len(ahead) + 2.0), 4),
+        ahead=round((sum(there for _, there in ahead) + 1.0) / (len(ahead) + 2.0), 4),
         ways=_ways(drives, graph),
         edges_m=EDGES_M,
         chains=(),

@@ -18,7 +18,6 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from .combined import Combined
 from .cue_table import CUES
 from .section import NotNegative, Positive, Section
 from .temporal import Temporal
@@ -176,18 +175,16 @@ class Calibrated(Section):
 class Fusion(Section):
     """Belief over the features of an intersection (eq. 18)."""
 
-    kind: Literal["source", "calibrated", "persistent", "temporal", "combined"] | None = None
+    kind: Literal["source", "calibrated", "persistent", "temporal"] | None = None
     """``source`` multiplies all messages (eq. 18). ``calibrated`` uses learned likelihood ratios,
     discounted for correlation. ``persistent`` uses the published messages of cues that are positive
     in several frames and near enough, and discounts correlated frames. ``temporal`` filters a
-    learned hidden Markov model along the drive; ``combined`` averages its log odds with those of a
-    learned regression over running sums of evidence. Default: ``source`` in a simulated vehicle's
-    file, else ``persistent``."""
+    learned hidden Markov model along the drive. Default: ``source`` in a simulated vehicle's file,
+    else ``persistent``."""
     established: Probability = 0.9
     """Probability of a feature above which it establishes the presence of an intersection."""
     withdrawn: Probability = 0.5
-    """With ``temporal`` and ``combined``: presence is withdrawn if no such feature is more
-    probable."""
+    """With ``temporal``: presence is withdrawn if no such feature is more probable."""
     dissent: Probability = 0.49
     """Message strength of an undetected cue with ``absence_counts``, near the intersection."""
     dissent_within_m: NotNegative = 20.0
@@ -219,7 +216,6 @@ class Fusion(Section):
 
     calibrated: Calibrated | None = None
     temporal: Temporal | None = None
-    combined: Combined | None = None
 
     def with_openings(self) -> Self:
         """Return the settings in which a road to a side, as the road area shows it, says more.
@@ -328,22 +324,12 @@ class Fusion(Section):
             for name in (*one.there, *one.missing):
                 if name not in self.features:
                     raise _refused(f"temporal: no feature {name!r}{_near(name, self.features)}")
-        if self.kind not in ("temporal", "combined"):
+        if self.kind != "temporal":
             return self
         if self.temporal is None:
             raise _refused(
-                f"kind {self.kind} needs [fusion.temporal]; make it with: crosscue fit temporal"
+                "kind temporal needs [fusion.temporal]; make it with: crosscue fit temporal"
             )
-        if self.kind == "combined" and self.combined is None:
-            raise _refused(
-                "kind combined needs [fusion.combined]; make it with: fit temporal --combined"
-            )
-        combined = self.combined if self.kind == "combined" else None
-        for name in self.features:
-            if combined is not None and not {name} <= combined.intercepts.keys() & combined.weights:
-                raise _refused(
-                    f"combined: no feature {name!r}; fit it: crosscue fit temporal --combined"
-                )
         if self.withdrawn >= self.established:
             raise _refused(
                 f"withdrawn {self.withdrawn:g}, established {self.established:g}: "

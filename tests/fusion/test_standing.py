@@ -14,7 +14,6 @@ from crosscue.fusion.approaches import Approaches, Step
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior, SignRange
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
-from crosscue.replay.vehicle.combined import Combined
 from crosscue.replay.vehicle.fusion import Calibrated, Fusion, RangeFilter, Rates
 from crosscue.replay.vehicle.temporal import CueChain, Temporal
 from support.fusion import NONE_SEEN
@@ -47,20 +46,10 @@ CALIBRATED: Final = Calibrated(
         for near in (False, True)
     )
 )
-COMBINED: Final = Combined(
-    intercepts=dict.fromkeys(("intersection", "left", "right", "straight"), -0.5),
-    weights={
-        "intersection": {"intersection": 0.6, "left": 0.2},
-        "left": {"left": 0.8, "intersection": 0.1},
-        "right": {"right": 0.8},
-        "straight": {"straight": 0.8},
-    },
-)
 KINDS: Final = {
     "persistent": Fusion(kind="persistent"),
     "calibrated": Fusion(kind="calibrated", calibrated=CALIBRATED),
     "temporal": Fusion(kind="temporal", temporal=TEMPORAL),
-    "combined": Fusion(kind="combined", temporal=TEMPORAL, combined=COMBINED),
 }
 LIGHT: Final = {**dict.fromkeys(STATIC, 0), "traffic_light": 1}
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from crosscue.eval.fit.landmarks.database import metres, pictures_with, read_poses
-from crosscue.eval.fit.landmarks.pairs import landmark_pairs, pairs_of_drive, with_min_score
-from crosscue.eval.fit.vehicle_output import check_output, write_fit
+from crosscue.eval.fit.landmarks.pairs import landmark_pairs, pairs_of_drive
+from crosscue.eval.fit.vehicle_output import check_output, with_section, write_fit
 from crosscue.eval.logs.log import DriveIfGiven, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.landmarks.fit import LandmarkFit, Rate
@@ -173,5 +173,9 @@ def fit_landmarks(log: DriveIfGiven, settings: LandmarkFitSettings) -> FittedLan
         fitted = fit_threshold(scored, settings.false_match_rate)
     except ValueError as error:
         raise SchemaError(f"fit landmarks: {error}; use more labelled pictures") from None
-    path = write_fit(vehicle, output, lambda text: with_min_score(text, fitted.min_score))
+    path = write_fit(
+        vehicle,
+        output,
+        lambda text: with_section(text, "landmarks", {"min_score": fitted.min_score}),
+    )
     return FittedLandmarks(fitted, comparing.kind, path)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import tomlkit
 
 from crosscue.eval.fit.landmarks.database import PosedPictures, drop_picture, place_at
 from crosscue.localization.angles import wrap
@@ -21,7 +20,6 @@ from crosscue.localization.landmarks.fit import ScoredPairs
 from crosscue.localization.landmarks.images import grey_of, read_encoded
 from crosscue.replay.errors import AnnotationError, LogError
 from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.tree_text import toml_document
 from crosscue.replay.limits import MIB
 
 MAX_PAIRS: Final = 1_000_000
@@ -139,11 +137,3 @@ def _columns(rows: list[tuple[float, bool, int]]) -> ScoredPairs:
         np.array([is_same for _, is_same, _ in rows], np.bool_),
         np.array([query for _, _, query in rows], np.int64),
     )
-
-
-def with_min_score(text: str, min_score: float) -> str:
-    """Return a vehicle file's text with ``landmarks.min_score`` replaced and comments kept."""
-    document = toml_document(text)
-    section = document.setdefault("landmarks", tomlkit.table())
-    section["min_score"] = min_score
-    return tomlkit.dumps(document)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.datasets.truth.truth import FILE
-from crosscue.eval.fit.annotated_runs import AnnotatedRuns, add_approaches, graph_of_runs
+from crosscue.eval.fit.annotated_runs import annotated_approaches, graph_of_runs
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.drives import ScoreSettings, pool_scores, score_drive
 from crosscue.eval.scoring.runs import RunScored, judge_run
@@ -90,10 +90,12 @@ def _place(one: RunScored) -> str:
 
 def _learned(scored: Sequence[RunScored]) -> Calibrated:
     graph, vehicle = graph_of_runs([one.run for one in scored])
-    found = AnnotatedRuns([], Counter())
-    for one in scored:
-        add_approaches(one.run, one.truth.truth, vehicle, found)
-    return fit_messages(found.approaches, graph).calibrated
+    found = [
+        approach
+        for one in scored
+        for approach in annotated_approaches(one.run, one.truth, vehicle, Counter())
+    ]
+    return fit_messages(found, graph).calibrated
 
 
 def _with_messages(one: RunScored, learned: Calibrated) -> Vehicle:

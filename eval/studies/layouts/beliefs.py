@@ -18,14 +18,7 @@ from .score import FEATURES, THRESHOLD, DriveBelief
 
 # Kinds of beliefs that are compared. The fourth is the third with the training layouts' frequencies
 # as priors, which ``temporal`` also learns.
-KINDS: Final = (
-    "source",
-    "persistent",
-    "calibrated",
-    "calibrated, base rates",
-    "temporal",
-    "combined",
-)
+KINDS: Final = ("source", "persistent", "calibrated", "calibrated, base rates", "temporal")
 # The belief over time, also outside approaches, where the other kinds have no belief.
 EVERYWHERE: Final = "temporal, every picture"
 # The rules for real roads, by section of the vehicle file.

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from crosscue.eval.fit.annotated_runs import (
-    AnnotatedRuns,
-    add_approaches,
+    annotated_approaches,
     annotated_drives,
     graph_of_runs,
 )
-from crosscue.fusion.fit.combined_fit import fit_combined
 from crosscue.fusion.fit.message_fit import fit_messages
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit, fit_temporal
 
@@ -48,17 +46,13 @@ class Lessons:
 
 
 def lessons_of(drives: Sequence[LayoutDrive]) -> Lessons:
-    """Read annotated approaches and drives, by drive; all drives of a layout are one place."""
+    """Read annotated approaches and drives, by drive; the place of a drive is its layout."""
     approaches, parts = {}, {}
     for drive in drives:
         vehicle = drive.run.drive_manifest().settings
-        found = AnnotatedRuns([], Counter())
-        add_approaches(drive.run, drive.truth.truth, vehicle, found)
-        approaches[drive.name] = [replace(one, place=drive.layout) for one in found.approaches]
-        parts[drive.name] = [
-            replace(one, place=drive.layout)
-            for one in annotated_drives(drive.run, drive.truth, vehicle)
-        ]
+        found = annotated_approaches(drive.run, drive.truth, vehicle, Counter())
+        approaches[drive.name] = list(found)
+        parts[drive.name] = list(annotated_drives(drive.run, drive.truth, vehicle))
     return Lessons(approaches, parts)
 
 
@@ -70,7 +64,6 @@ def fit_beliefs(drives: Sequence[LayoutDrive], lessons: Lessons) -> FoldFits:
     ).calibrated
     parts = [part for one in drives for part in lessons.drives[one.name]]
     fitted = fit_temporal(parts, graph)
-    combined = fit_combined(parts, graph, fitted)
     by_layout = {one.layout: one.features for one in drives}
     rates = {
         name: float(np.mean([known[name] for known in by_layout.values() if name in known]))
@@ -87,6 +80,5 @@ def fit_beliefs(drives: Sequence[LayoutDrive], lessons: Lessons) -> FoldFits:
         "calibrated": learned,
         "calibrated, base rates": {**learned, "features": priors},
         "temporal": {"kind": "temporal", "temporal": fitted.temporal},
-        "combined": {"kind": "combined", "temporal": fitted.temporal, "combined": combined},
     }
     return FoldFits(fusions, rates, fitted)

@@ -65,7 +65,7 @@ def score_layout_study(drives: Sequence[LayoutDrive], *, ablation: bool = True) 
         {kind: score_layouts(some) for kind, some in kinds.items()},
         {
             f"{name} less {kind}": score_difference(kinds[kind], kinds[name])
-            for name in ("combined", "temporal", EVERYWHERE)
+            for name in ("temporal", EVERYWHERE)
             for kind in KINDS
             if kind != name
         },

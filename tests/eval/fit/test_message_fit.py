@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.datasets.truth.truth import read_truth
 from crosscue.eval.cli import run as crosscue
-from crosscue.eval.fit.annotated_runs import AnnotatedRuns, add_approaches
+from crosscue.eval.fit.annotated_runs import annotated_approaches
 from crosscue.eval.runs.folder import RunFolder, open_run
+from crosscue.eval.scoring.truth import read_scored_truth
+from crosscue.fusion.fit.annotated_approach import AnnotatedApproach
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from support.fusion_runs import (
     made_up_drive,
@@ -38,18 +39,16 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], list[P
     return runs, truths
 
 
-def annotated_run(run: RunFolder, truth: Path) -> AnnotatedRuns:
-    found = AnnotatedRuns([], Counter())
-    add_approaches(run, read_truth(truth), Vehicle(version=1), found)
-    return found
+def annotated_run(run: RunFolder, truth: Path) -> tuple[list[AnnotatedApproach], Counter[str]]:
+    known, used = read_scored_truth(truth, "drive"), Counter[str]()
+    return list(annotated_approaches(run, known, Vehicle(version=1), used)), used
 
 
 def test_approach_has_features_of_truth_and_ends_at_intersection(
     drives: tuple[list[Path], list[Path]],
 ) -> None:
-    found = annotated_run(open_run(drives[0][0]), drives[1][0])
+    (one,), used = annotated_run(open_run(drives[0][0]), drives[1][0])
 
-    (one,) = found.approaches
     assert one.features == {"intersection": True, "left": True, "right": True, "straight": True}
     assert len(one.way_m) == 59
     assert one.way_m.tolist() == pytest.approx(list(range(59)))
@@ -59,19 +58,19 @@ def test_approach_has_features_of_truth_and_ends_at_intersection(
     assert one.is_near[-15:].all()
     assert one.counts["stop_sign"].tolist() == [1] * 59
     assert (one.counts["parked_left"] == 0).all()
-    assert found.used == {"to an intersection": 1}
+    assert used == {"to an intersection": 1}
 
 
 def test_drive_without_intersection_is_annotated_as_negative(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     run = write_run(tmp_path / "run", made_up_drive(rng, left=False, signed=False))
 
-    found = annotated_run(run, write_empty_truth(tmp_path / "truth"))
+    found, _ = annotated_run(run, write_empty_truth(tmp_path / "truth"))
 
-    assert {tuple(one.features.items()) for one in found.approaches} == {
+    assert {tuple(one.features.items()) for one in found} == {
         (("intersection", False), ("left", False), ("right", False))
     }
-    assert not found.approaches[0].is_near.any()
+    assert not found[0].is_near.any()
 
 
 def test_approach_that_begins_in_an_intersection_is_left_out(tmp_path: Path) -> None:
@@ -79,10 +78,11 @@ def test_approach_that_begins_in_an_intersection_is_left_out(tmp_path: Path) -> 
     late = [one for one in made_up_drive(rng, left=True, signed=True) if one.t_ns >= 3_000_000_000]
     run = write_run(tmp_path / "run", late)
 
-    found = annotated_run(run, write_truth(tmp_path / "truth", left=True, enter_ns=2_000_000_000))
+    truth = write_truth(tmp_path / "truth", left=True, enter_ns=2_000_000_000)
+    found, used = annotated_run(run, truth)
 
-    assert not found.approaches
-    assert found.used == {"in an intersection, left out": 1}
+    assert not found
+    assert used == {"in an intersection, left out": 1}
 
 
 def test_approach_with_unknown_roads_is_left_out(tmp_path: Path) -> None:
@@ -90,10 +90,10 @@ def test_approach_with_unknown_roads_is_left_out(tmp_path: Path) -> None:
         tmp_path / "run", made_up_drive(np.random.default_rng(0), left=True, signed=True)
     )
 
-    found = annotated_run(run, write_truth(tmp_path / "truth", left=None))
+    found, used = annotated_run(run, write_truth(tmp_path / "truth", left=None))
 
-    assert not found.approaches
-    assert found.used == {"to an intersection with unknown roads, left out": 1}
+    assert not found
+    assert used == {"to an intersection with unknown roads, left out": 1}
 
 
 def test_command_writes_a_section_for_the_vehicle_file(

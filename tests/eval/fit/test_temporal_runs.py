@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from crosscue.datasets.truth.truth import read_truth, save
 from crosscue.eval.cli import run as crosscue
 from crosscue.eval.fit.annotated_runs import annotated_drives
 from crosscue.eval.runs.folder import open_run
@@ -66,21 +67,38 @@ def test_command_writes_a_section_for_the_vehicle_file(
     assert learned.model_dump(mode="json") == reported["temporal"]
 
 
-def test_combined_belief_and_threshold_for_a_rate_are_fitted_on_request(
+def test_threshold_for_a_rate_is_fitted_on_request(
     drives: Drives, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs, truths = drives
-    section = tmp_path / "combined.toml"
+    section = tmp_path / "fusion.toml"
     command = ["fit", "temporal", *map(str, runs), "--truth", *map(str, truths)]
 
-    options = ["--combined", "--false-features", "0.1", "-o", str(section), "--json"]
-    assert crosscue([*command, *options]) == 0
+    assert crosscue([*command, "--false-features", "0.1", "-o", str(section), "--json"]) == 0
 
     reported = json.loads(capsys.readouterr().out)
     fusion = parse("version = 1\n" + section.read_text(), "car.toml").fusion
-    assert fusion.kind == "combined"
-    assert fusion.combined is not None
-    assert {*fusion.combined.intercepts} == {*fusion.features}
+    assert fusion.kind == "temporal"
     assert fusion.established >= min(reported["threshold"]["threshold"], 0.9999)
     assert reported["threshold"]["false_features"] <= reported["threshold"]["wanted"] == 0.1
     assert crosscue([*command, "--false-features", "-1"]) == 2
+
+
+def test_drives_are_grouped_by_place_as_in_scores(
+    drives: Drives, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Positions within 50 m are one place, whatever the names of their intersections."""
+    runs, truths = drives
+    placed = []
+    for i, truth in enumerate(truths):
+        north = ("52.0000", "52.0003", "52.1000")[i % 3]
+        known = read_truth(truth).model_copy(update={"place": f"geo:{north},13.0"})
+        folder = tmp_path / f"truth{i}"
+        folder.mkdir()
+        placed.append(str(save(known, folder)))
+
+    assert crosscue(["fit", "temporal", *map(str, runs), "--truth", *placed, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["places"] == 2
+    messages = ["fit", "messages", *map(str, runs), "--truth", *placed]
+    assert crosscue(messages) == 1
+    assert "too few to learn from" in capsys.readouterr().err
