@@ -6,8 +6,9 @@ Every picture counts, so that all beliefs are scored on the same pictures.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,10 @@ class DriveBelief:
     probabilities: Floats
     established: Flags
     is_silent: Flags
+
+
+# Values of one drive, by picture or one for the drive; flags are fractions.
+Metric = Callable[[DriveBelief], Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,24 +115,13 @@ class LayoutScores:
 
 def score_layouts(beliefs: Sequence[DriveBelief]) -> LayoutScore:
     """Score one kind of belief."""
-    rows = _Rows.of(beliefs)
-    drives = _clusters([one.layout for one in beliefs])
-    full = [_full_m(one) for one in beliefs if one.features["intersection"]]
-    at = _clusters([one.layout for one in beliefs if one.features["intersection"]])
-    found_m = np.array([np.nan if one is None else one for one in full], np.float64)
     return LayoutScore(
-        brier=mean(rows.brier, rows.cluster),
-        log_score=mean(rows.log_score, rows.cluster),
+        **{name: _over_layouts(beliefs, of) for name, of in METRICS.items()},
         brier_by_feature={
-            name: mean(rows.brier[rows.feature == i], rows.cluster[rows.feature == i])
-            for i, name in enumerate(FEATURES)
+            name: _over_layouts(beliefs, partial(_of_features, brier, only=name))
+            for name in FEATURES
         },
-        false_features=mean(_false_features(beliefs), drives),
-        full=_fraction(np.isfinite(found_m), at),
-        full_m=mean(found_m, at),
-        full_before_detected=_of_pictures(beliefs, _ways_first),
-        silent=_of_pictures(beliefs, lambda one: one.is_silent),
-        trade=trade_off([_reached(one) for one in beliefs], drives),
+        trade=trade_off([_reached(one) for one in beliefs], _clusters(beliefs)),
     )
 
 
@@ -141,63 +135,57 @@ def score_difference(
     """
     if [one.drive for one in first] != [one.drive for one in second]:
         raise ValueError("difference: expected beliefs about the same drives, in the same order")
-    before, after = _Rows.of(first), _Rows.of(second)
-    return LayoutDifference(
-        mean(after.brier - before.brier, before.cluster),
-        mean(after.log_score - before.log_score, before.cluster),
-        mean(
-            _false_features(second) - _false_features(first),
-            _clusters([one.layout for one in first]),
-        ),
-    )
+    pairs = list(zip(first, second, strict=True))
+
+    def less(of: Metric) -> Mean:
+        return _mean(first, [of(after) - of(before) for before, after in pairs])
+
+    return LayoutDifference(*(less(METRICS[one.name]) for one in fields(LayoutDifference)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
-    """Columns with one row per picture and known feature."""
-
-    brier: Floats
-    log_score: Floats
-    feature: Int64s
-    cluster: Int64s
-
-    @classmethod
-    def of(cls, beliefs: Sequence[DriveBelief]) -> _Rows:
-        clusters = _clusters([one.layout for one in beliefs])
-        probabilities, is_there, feature, cluster = [], [], [], []
-        for one, number in zip(beliefs, clusters.tolist(), strict=True):
-            for i, name in enumerate(FEATURES):
-                if name in one.features:
-                    n = len(one.probabilities)
-                    probabilities.append(one.probabilities[:, i])
-                    is_there.append(np.full(n, one.features[name]))
-                    feature.append(np.full(n, i))
-                    cluster.append(np.full(n, number))
-        p, so = np.concatenate(probabilities), np.concatenate(is_there)
-        return cls(brier(p, so), log_score(p, so), np.concatenate(feature), np.concatenate(cluster))
+def _over_layouts(beliefs: Sequence[DriveBelief], of: Metric) -> Mean:
+    return _mean(beliefs, [of(one) for one in beliefs])
 
 
-def _clusters(layouts: Sequence[str]) -> Int64s:
-    numbers = {name: i for i, name in enumerate(dict.fromkeys(layouts))}
-    return np.array([numbers[name] for name in layouts], np.int64)
+def _mean(beliefs: Sequence[DriveBelief], values: Sequence[Any]) -> Mean:
+    """Return the mean with its interval over layouts, for flags limited to 0 to 1."""
+    clusters = np.repeat(_clusters(beliefs), [len(some) for some in values])
+    every = np.concatenate(values)
+    if every.dtype != np.bool_:
+        return mean(every, clusters)
+    found = fraction(every.astype(np.bool_), clusters)
+    return Mean(found.value, found.clusters_low, found.clusters_high, found.of, found.clusters)
 
 
-def _false_features(beliefs: Sequence[DriveBelief]) -> Floats:
-    return np.array(
-        [
-            sum(
-                bool((one.probabilities[~one.is_silent, i] > THRESHOLD).any())
-                for i, name in enumerate(FEATURES)
-                if one.features.get(name) is False
-            )
-            for one in beliefs
-        ],
-        np.float64,
-    )
+def _clusters(beliefs: Sequence[DriveBelief]) -> Int64s:
+    numbers = {name: i for i, name in enumerate(dict.fromkeys(one.layout for one in beliefs))}
+    return np.array([numbers[one.layout] for one in beliefs], np.int64)
 
 
-def _full_m(one: DriveBelief) -> float | None:
-    """Return the distance where all present features are believed for several pictures."""
+def _of_features(
+    score: Callable[[Floats, Flags], Floats], one: DriveBelief, only: str | None = None
+) -> Floats:
+    """Return the scores of pictures, feature after feature, where the truth is known."""
+    known = [(i, name) for i, name in enumerate(FEATURES) if name in one.features]
+    n = len(one.probabilities)
+    found = [
+        score(one.probabilities[:, i], np.full(n, one.features[name]))
+        for i, name in known
+        if only in (None, name)
+    ]
+    return np.concatenate([np.empty(0), *found])
+
+
+def _false_features(one: DriveBelief) -> Floats:
+    above = (one.probabilities[~one.is_silent] > THRESHOLD).any(axis=0)
+    absent = [i for i, name in enumerate(FEATURES) if one.features.get(name) is False]
+    return np.array([above[absent].sum()], np.float64)
+
+
+def _full_m(one: DriveBelief) -> Floats:
+    """Return where all present features are believed for several pictures; NaN for never."""
+    if not one.features["intersection"]:
+        return np.empty(0)
     is_full = ~one.is_silent
     for i, name in enumerate(FEATURES):
         if one.features.get(name):
@@ -205,7 +193,7 @@ def _full_m(one: DriveBelief) -> float | None:
             # Without a sign or a light, no cue supports the presence of an intersection.
             is_full &= (above | one.established) if name == "intersection" else above
     places = np.flatnonzero(held(is_full & np.isfinite(one.start_m), CONFIRM_FRAMES))
-    return float(one.start_m[places[0]]) if len(places) else None
+    return one.start_m[places[:1]] if len(places) else np.array([np.nan])
 
 
 def _reached(one: DriveBelief) -> Reached:
@@ -223,16 +211,13 @@ def _ways_first(one: DriveBelief) -> Flags:
     return np.asarray(ways & (one.probabilities[:, 0] <= THRESHOLD) & ~one.is_silent)
 
 
-def _of_pictures(beliefs: Sequence[DriveBelief], flags_of: Callable[[DriveBelief], Flags]) -> Mean:
-    clusters = _clusters([one.layout for one in beliefs])
-    flags = [flags_of(one) for one in beliefs]
-    numbers = [
-        np.full(len(one), number) for one, number in zip(flags, clusters.tolist(), strict=True)
-    ]
-    return _fraction(np.concatenate(flags), np.concatenate(numbers))
-
-
-def _fraction(flags: Flags, clusters: Int64s) -> Mean:
-    """Return ``mean`` with its interval limited to 0 to 1."""
-    found = fraction(flags, clusters)
-    return Mean(found.value, found.clusters_low, found.clusters_high, found.of, found.clusters)
+# Value of each picture or drive of one belief, by field of ``LayoutScore``.
+METRICS: Final[Mapping[str, Metric]] = {
+    "brier": partial(_of_features, brier),
+    "log_score": partial(_of_features, log_score),
+    "false_features": _false_features,
+    "full": lambda one: np.isfinite(_full_m(one)),
+    "full_m": _full_m,
+    "full_before_detected": _ways_first,
+    "silent": lambda one: one.is_silent,
+}
