@@ -13,12 +13,15 @@ use the same seeds. It takes about five CPU minutes.
 from __future__ import annotations
 
 import argparse
+import sys
+from pathlib import Path
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.studies.intervals import mean_of
-from crosscue.eval.studies.town.consistency import nees_along_the_arc
 from crosscue.eval.studies.town.landmark_study import comparisons_of
 from crosscue.eval.studies.town.range_study import law_m
 from crosscue.eval.studies.town.settings import UNTIL_LOST, FieldStudy, LandmarkStudy
@@ -33,6 +36,7 @@ from crosscue.localization.town.drive import (
 )
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
+from support.arc_consistency import nees_along_the_arc
 
 NEES = DriveResult._fields.index("nees")
 FINE_M = 1e-4

@@ -1,4 +1,4 @@
-"""Draw and save a study's figures as PNG and SVG; the same rows yield the same bytes."""
+"""Draw and save a study's figures; the same rows yield the same bytes."""
 
 from __future__ import annotations
 
@@ -50,3 +50,16 @@ def save_figure(made: Figure, folder: Path, name: str) -> Path:
                 lambda p, k=kind, o=options: made.savefig(p, format=k, **o),  # type: ignore[misc]
             )
     return folder / f"{name}.png"
+
+
+def save_png(made: Figure, path: Path) -> None:
+    """Write a figure as PNG alone.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    # Without time and version in the file, the same study yields the same bytes.
+    write_whole(
+        path,
+        lambda partial: made.savefig(partial, format="png", dpi=DPI, metadata={"Software": None}),
+    )

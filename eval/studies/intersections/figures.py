@@ -11,11 +11,10 @@ import numpy as np
 from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
 from crosscue.eval.scoring.scene.approaches import ApproachResult, Curve
 from crosscue.eval.scoring.scene.belief import BeliefScore
-from crosscue.replay.files.whole_file import write_whole
+from crosscue.eval.studies.pictures import save_png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 COLOURS: Final[Mapping[str, str]] = {
     "intersection": "#444444", "left": "#1f77b4", "right": "#d62728", "straight": "#2ca02c",
@@ -97,7 +96,7 @@ def draw_beliefs(curves: Sequence[Curve], path: Path) -> None:
     figure.legend(loc="outside upper center", ncols=len(COLOURS), fontsize=8)
     figure.supxlabel("true distance to the intersection, m (simulated)", fontsize=8)
     figure.supylabel("probability", fontsize=8)
-    save_figure(figure, path)
+    save_png(figure, path)
 
 
 def draw_study_reliability(
@@ -128,7 +127,7 @@ def draw_study_reliability(
         axes.tick_params(labelsize=7)
     grid[0, 0].set_ylabel("observed fraction", fontsize=8)
     grid[0, 0].legend(fontsize=7)
-    save_figure(figure, path)
+    save_png(figure, path)
 
 
 def _write(path: Path, size: tuple[float, float], draw: object) -> None:
@@ -137,13 +136,4 @@ def _write(path: Path, size: tuple[float, float], draw: object) -> None:
     figure = Figure(figsize=size, layout="constrained")
     assert callable(draw)
     draw(figure.subplots())
-    save_figure(figure, path)
-
-
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG."""
-    # Without time and version in the file, the same study yields the same bytes.
-    write_whole(
-        path,
-        lambda partial: figure.savefig(partial, format="png", dpi=130, metadata={"Software": None}),
-    )
+    save_png(figure, path)

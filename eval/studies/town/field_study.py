@@ -10,28 +10,24 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Protocol
+from typing import Annotated, ClassVar, Final
 
 import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder, locked
-from crosscue.eval.scoring.pose.score import PoseScore
 from crosscue.eval.studies.intervals import fraction_of, mean_of
-from crosscue.eval.studies.page import PageTable, write_study_page
+from crosscue.eval.studies.page import PageTable
 from crosscue.eval.studies.pictures import figure, save_figure
+from crosscue.eval.studies.study import StudyResult, Written, claim
 from crosscue.eval.studies.words import percent
-from crosscue.localization.town.drive import Traced
 from crosscue.localization.town.random_stream import key_of
-from crosscue.localization.town.settings import TownDrive
-from crosscue.replay.errors import RunError, UsageError
+from crosscue.replay.errors import UsageError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
-from crosscue.results import Result
 from crosscue.verb import Option
 
 from .range_study import implied_m
@@ -39,7 +35,6 @@ from .settings import FieldStudy, study_of
 from .work import workers_of
 
 SUMMARY: Final = "summary.json"
-PAGE: Final = "study.html"
 PUBLISHED_GOAL_M: Final = 6900.0
 NOTES: Final = (
     "Simulated runs, written as log files and processed by crosscue replay; recorded runs can be "
@@ -95,40 +90,6 @@ class FieldRun:
     is_whole: bool
 
 
-class FieldReplay(Protocol):
-    """One drive and its replay; see ``replayed.Replayed``."""
-
-    @property
-    def traced(self) -> Traced:
-        """The simulated drive."""
-        ...
-
-    @property
-    def score(self) -> PoseScore:
-        """Score of the replay."""
-        ...
-
-    @property
-    def is_whole(self) -> bool:
-        """True if the replay dropped nothing of the log."""
-        ...
-
-    @property
-    def landmark_counts(self) -> dict[str, int]:
-        """Numbers of camera frames by result of the landmark match."""
-        ...
-
-
-class ThroughLog(Protocol):
-    """Function that simulates a drive, writes its log, replays and scores it."""
-
-    def __call__(
-        self, folder: Path, settings: TownDrive, seed: int, *, overwrite: bool
-    ) -> FieldReplay:
-        """Simulate, replay and score one drive, in its folder."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class _Job:
     study: FieldStudy
@@ -139,36 +100,22 @@ class _Job:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FieldResult(Result):
+class FieldResult(StudyResult):
     """Results of the simulated field protocol; its repr is tables with the published numbers.
 
     Attributes:
-        folder: Folder of runs, picture and page.
         runs: Outcome of each run.
-        tables: Results as text.
     """
 
-    folder: Path
     runs: tuple[FieldRun, ...]
-    tables: tuple[PageTable, ...]
 
     json_is: ClassVar = "runs"
-
-    @property
-    def page(self) -> Path:
-        """The page with tables and picture."""
-        return self.folder / PAGE
+    files: ClassVar = {SUMMARY: "summary"}
 
     @property
     def exit_status(self) -> int:
         """0, or 3 when something of a run's log was dropped."""
         return 0 if all(one.is_whole for one in self.runs) else 3
-
-    def lines(self) -> Iterator[str]:
-        """Yield the tables, notes on them, and the path of the page."""
-        yield "\n\n".join(table.as_text() for table in self.tables)
-        yield from ("", *NOTES)
-        yield f"\npage       {self.page}"
 
 
 def field_study_of(
@@ -228,23 +175,21 @@ def run_field_study(
         UsageError: A value is out of range, or the study has no runs.
         RunError: The folder contains another study's results.
     """
-    from .replayed import through_log
-
     if not study.range_runs + study.landmark_runs:
         raise UsageError("study field: no runs; set --range-runs or --landmark-runs")
     folder, runs = Path(output), []
-    driven = drive_field(study, folder, workers_of(workers), through_log, overwrite=overwrite)
+    driven = drive_field(study, folder, workers_of(workers), overwrite=overwrite)
     for done, one in driven:
         runs.append(one)
         emit(Progress("driving and replaying", 100.0 * done, 100.0, "percent"))
-    return FieldResult(folder, tuple(runs), finish_field(study, runs, folder))
+    made = finish_field(study, runs, folder)
+    return FieldResult(folder, made.tables, made.notes, tuple(runs))
 
 
 def drive_field(
     study: FieldStudy,
     folder: Path,
     workers: int,
-    through_log: ThroughLog,
     *,
     overwrite: bool = False,
 ) -> Iterator[tuple[float, FieldRun]]:
@@ -256,44 +201,30 @@ def drive_field(
         study: Settings of the study.
         folder: Output folder.
         workers: Number of processes.
-        through_log: Simulates and replays one drive; ``replayed.through_log``.
         overwrite: Replace another study's results.
 
     Raises:
         RunError: The folder contains another study.
         CrosscueError: A run cannot be simulated, replayed or scored.
     """
-    _claim(study, folder, overwrite=overwrite)
+    settings = study.model_dump(mode="json")
+    claim(folder / "study.json", settings, overwrite=overwrite)
+    for kept in folder.glob("*/field_run.json") if overwrite else ():
+        kept.unlink()
+    write_text(folder / "study.json", strict_json(settings) + "\n")
     jobs = [
         _Job(study, folder, f"{kind}_{i:03}", i, kind == "landmarks")
         for kind, runs in (("range", study.range_runs), ("landmarks", study.landmark_runs))
         for i in range(runs)
     ]
     with locked(RunFolder(folder)):
-        for done, run in enumerate(in_processes(partial(_run, through_log), jobs, workers), 1):
+        for done, run in enumerate(in_processes(_run, jobs, workers), 1):
             yield done / len(jobs), run
 
 
-def _claim(study: FieldStudy, folder: Path, *, overwrite: bool) -> None:
-    path = folder / "study.json"
-    wanted = study.model_dump(mode="json")
-    if path.exists() and not overwrite:
-        try:
-            before = json_tree(door.read(path))
-        except (OSError, ValueError):
-            before = None
-        if before != wanted:
-            raise RunError(
-                f"{folder}: contains a study with other settings; use another folder or --overwrite"
-            )
-    folder.mkdir(parents=True, exist_ok=True)
-    if overwrite:
-        for kept in folder.glob("*/field_run.json"):
-            kept.unlink()
-    write_text(path, strict_json(wanted) + "\n")
+def _run(job: _Job) -> FieldRun:
+    from .replayed import through_log
 
-
-def _run(through_log: ThroughLog, job: _Job) -> FieldRun:
     folder = job.folder / job.name
     kept = folder / "field_run.json"
     if kept.exists():
@@ -326,21 +257,21 @@ def _run(through_log: ThroughLog, job: _Job) -> FieldRun:
     return run
 
 
-def finish_field(
-    study: FieldStudy, runs: Sequence[FieldRun], folder: Path
-) -> tuple[PageTable, ...]:
-    """Write summary, picture and page; return the tables."""
-    made = _tables(runs)
-    picture = _draw(study, runs, folder)
+def finish_field(study: FieldStudy, runs: Sequence[FieldRun], folder: Path) -> Written:
+    """Write summary, picture and page."""
     content = {
         "study": study.model_dump(mode="json"),
         "notes": NOTES,
         "runs": [asdict(run) for run in runs],
     }
-    write_study_page(
-        folder / PAGE, "Field protocol: simulated runs through logs", NOTES, made, [picture]
+    made = Written(
+        "Field protocol: simulated runs through logs",
+        NOTES,
+        _tables(runs),
+        content,
+        [_draw(study, runs, folder)],
     )
-    write_text(folder / SUMMARY, strict_json(content) + "\n")
+    made.write(folder, SUMMARY)
     return made
 
 

@@ -28,8 +28,8 @@ from crosscue.eval.studies.words import km, percent
 from crosscue.localization.town.drive import DriveOutcome
 from crosscue.localization.town.settings import TownDrive
 
-from .cases import split
 from .settings import LandmarkStudy
+from .work import split
 
 if TYPE_CHECKING:
     import pyarrow as pa

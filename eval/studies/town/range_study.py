@@ -27,8 +27,8 @@ from crosscue.localization.town.drive import DriveOutcome, DriveResult, drive_ma
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import TownDrive
 
-from .cases import split
 from .settings import UNTIL_LOST, RangeStudy, changed
+from .work import split
 
 if TYPE_CHECKING:
     import pyarrow as pa

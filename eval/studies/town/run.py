@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal, overload
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, overload
 
 from crosscue.eval.runs.folder import RunFolder, locked
-from crosscue.eval.studies.page import PageTable, write_study_page
-from crosscue.eval.studies.result import StoredResult
+from crosscue.eval.studies.page import PageTable
+from crosscue.eval.studies.study import StudyResult, Written, claim
 from crosscue.eval.studies.words import km, percent
 from crosscue.localization.town.drive import DriveResult as DriveResult
 from crosscue.localization.town.drive import drive_traced
-from crosscue.replay.errors import RunError
-from crosscue.replay.files import door
-from crosscue.replay.files.tree_text import json_tree, strict_json
-from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.progress import Progress, emit
-from crosscue.results import Result
+from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option
 
 from . import drive_figure, landmark_figure, landmark_study, range_figure, range_study
-from .cases import split
-from .settings import LandmarkStudy, RangeStudy, study_of
-from .work import DRIVES, assemble, chunks_of, run, workers_of
+from .settings import LandmarkStudy, RangeStudy, drives_of
+from .work import DRIVES, assemble, chunks_of, run, split, workers_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 SUMMARY: Final = "summary.json"
-PAGE: Final = "study.html"
 OURS: Final = (
     "Everything here is simulated. The dissertation specifies the sizes of cities, the compasses "
     "and the limits of 50 and 100 m; every other number is our choice and is in summary.json. One "
@@ -40,47 +34,17 @@ OURS: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Made:
-    """Results of a finished study.
-
-    Attributes:
-        folder: Its folder.
-        tables: Results as text.
-        notes: Notes on the results.
-    """
-
-    folder: Path
-    tables: tuple[PageTable, ...]
-    notes: tuple[str, ...]
-
-
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class StudyResult(StoredResult):
-    """A finished study; its repr is tables with the published numbers.
+class TownResult(StudyResult):
+    """A finished study of chapter 2.
 
     Attributes:
         study: Settings of the study.
-        made: Folder, tables as text, and notes on them.
     """
 
-    study: RangeStudy | LandmarkStudy
-    made: Made
+    study: RangeStudy | LandmarkStudy = field(metadata=HIDDEN)
 
-    @property
-    def folder(self) -> Path:
-        """Folder of drives, figures and page."""
-        return self.made.folder
-
-    @property
-    def stored(self) -> Path:
-        """Its summary."""
-        return self.folder / SUMMARY
-
-    @property
-    def page(self) -> Path:
-        """The page with tables and figures."""
-        return self.folder / PAGE
+    files: ClassVar = {SUMMARY: "summary", f"{DRIVES}.parquet": "drives"}
 
     @property
     def drives(self) -> pa.Table:
@@ -93,12 +57,6 @@ class StudyResult(StoredResult):
         settings = self.study.cases()[drives["case"][row].as_py()].settings
         seed = drives["seed"][row].as_py()
         return drive_figure.draw_drive(settings, drive_traced(settings, seed), seed, self.folder)
-
-    def lines(self) -> Iterator[str]:
-        """Yield the tables, notes on them, and the paths of the page and the drives."""
-        yield "\n\n".join(table.as_text() for table in self.made.tables)
-        yield from ("", *self.made.notes)
-        yield f"\npage       {self.page}\ndrives     {self.folder / 'drives.parquet'}"
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -116,38 +74,6 @@ class Calibration(Result):
         yield f"[drive.sensors]\ncompass_interval_m = {self.compass_interval_m:.4f}"
 
 
-def range_study_of(
-    *,
-    settings: Annotated[Path | None, Option(metavar="X.toml")] = None,
-    seed: int | None = None,
-    drives: int | None = None,
-) -> RangeStudy:
-    """Return the settings of a study of the range.
-
-    Args:
-        settings: Settings of your own study.
-        seed: Random seed.
-        drives: Drives per combination.
-    """
-    return study_of(RangeStudy, settings, seed=seed, drives=drives)
-
-
-def landmark_study_of(
-    *,
-    settings: Annotated[Path | None, Option(metavar="X.toml")] = None,
-    seed: int | None = None,
-    drives: int | None = None,
-) -> LandmarkStudy:
-    """Return the settings of a study of landmarks.
-
-    Args:
-        settings: Settings of your own study.
-        seed: Random seed.
-        drives: Drives per combination.
-    """
-    return study_of(LandmarkStudy, settings, seed=seed, drives=drives)
-
-
 @overload
 def run_range_study(
     study: RangeStudy,
@@ -156,20 +82,20 @@ def run_range_study(
     workers: int | None = None,
     ray: str | None = None,
     overwrite: bool = False,
-) -> StudyResult: ...
+) -> TownResult: ...
 @overload
 def run_range_study(
     study: RangeStudy, *, workers: int | None = None, calibrate: Literal[True]
 ) -> Calibration: ...
 def run_range_study(
-    study: Annotated[RangeStudy, Option(made_by=range_study_of)],
+    study: Annotated[RangeStudy, Option(made_by=drives_of(RangeStudy))],
     output: Path | str = "study-range",
     *,
     workers: int | None = None,
     ray: str | None = None,
     overwrite: bool = False,
     calibrate: bool = False,
-) -> StudyResult | Calibration:
+) -> TownResult | Calibration:
     """Measure the range without landmarks on 4,000 simulated drives.
 
     There are drives with three compasses and with none. Each goes from goal to goal until its
@@ -198,18 +124,17 @@ def run_range_study(
     """
     if calibrate:
         return Calibration(range_study.calibrate(study.drive, workers_of(workers)))
-    folder = _driven(study, Path(output), workers, ray, overwrite=overwrite)
-    return StudyResult(study, finish_range(study, folder))
+    return _finished(study, Path(output), workers, ray, finish_range, overwrite=overwrite)
 
 
 def run_landmark_study(
-    study: Annotated[LandmarkStudy, Option(made_by=landmark_study_of)],
+    study: Annotated[LandmarkStudy, Option(made_by=drives_of(LandmarkStudy))],
     output: Path | str = "study-landmarks",
     *,
     workers: int | None = None,
     ray: str | None = None,
     overwrite: bool = False,
-) -> StudyResult:
+) -> TownResult:
     """Measure the success rate of 3 strategies with landmarks.
 
     The study has 52,500 drives, 700 for each of 5 landmark densities and 5 detection rates. It
@@ -233,21 +158,22 @@ def run_landmark_study(
         UsageError: A value is out of range.
         RunError: The folder contains another study's results.
     """
-    folder = _driven(study, Path(output), workers, ray, overwrite=overwrite)
-    return StudyResult(study, finish_landmarks(study, folder))
+    return _finished(study, Path(output), workers, ray, finish_landmarks, overwrite=overwrite)
 
 
-def _driven(
+def _finished(
     study: RangeStudy | LandmarkStudy,
     folder: Path,
     workers: int | None,
     ray: str | None,
+    finish: Callable[[Any, Path], Written],
     *,
     overwrite: bool,
-) -> Path:
+) -> TownResult:
     for done in drive_study(study, folder, workers_of(workers), ray, overwrite=overwrite):
         emit(Progress("driving", 100.0 * done, 100.0, "percent"))
-    return folder
+    made = finish(study, folder)
+    return TownResult(folder, made.tables, made.notes, study)
 
 
 def drive_study(
@@ -265,8 +191,7 @@ def drive_study(
             another process is writing to it.
         WorkerError: As in ``work.run``.
     """
-    _refuse_another(study, folder, overwrite=overwrite)
-    folder.mkdir(parents=True, exist_ok=True)
+    claim(folder / SUMMARY, study.model_dump(mode="json"), "study", overwrite=overwrite)
     with locked(RunFolder(folder)):
         chunks = chunks_of(study.cases(), study.drives, study.seed)
         for done in run(chunks, folder, workers, ray_address):
@@ -274,7 +199,7 @@ def drive_study(
         assemble(chunks, folder)
 
 
-def finish_range(study: RangeStudy, folder: Path) -> Made:
+def finish_range(study: RangeStudy, folder: Path) -> Written:
     """Write summary, picture and page from ``drives.parquet``."""
     table = RunFolder(folder).table(DRIVES)
     results = range_study.summarise_ranges(study, table)
@@ -294,7 +219,7 @@ def finish_range(study: RangeStudy, folder: Path) -> Made:
     )
 
 
-def finish_landmarks(study: LandmarkStudy, folder: Path) -> Made:
+def finish_landmarks(study: LandmarkStudy, folder: Path) -> Written:
     """Write summary, pictures and page from ``drives.parquet``."""
     table = RunFolder(folder).table(DRIVES)
     result = landmark_study.summarise_landmarks(study, table)
@@ -413,7 +338,7 @@ def _finish(
     notes: tuple[str, ...],
     pictures: Sequence[Path],
     **more: object,
-) -> Made:
+) -> Written:
     summary = {
         "study": study.model_dump(mode="json"),
         "notes": notes,
@@ -421,20 +346,6 @@ def _finish(
         **more,
         "columns": ["case", "drive", "seed", *DriveResult._fields],
     }
-    write_study_page(folder / PAGE, f"{title}: simulated study", notes, tables, pictures)
-    write_text(folder / SUMMARY, strict_json(summary) + "\n")
-    return Made(folder, tables, notes)
-
-
-def _refuse_another(study: RangeStudy | LandmarkStudy, folder: Path, *, overwrite: bool) -> None:
-    path = folder / SUMMARY
-    if overwrite or not path.exists():
-        return
-    try:
-        before = json_tree(door.read(path))["study"]
-    except (OSError, ValueError, KeyError, TypeError):
-        before = None
-    if before != study.model_dump(mode="json"):
-        raise RunError(
-            f"{folder}: contains a study with other settings; use another folder or --overwrite"
-        )
+    made = Written(f"{title}: simulated study", notes, tables, summary, pictures)
+    made.write(folder, SUMMARY)
+    return made

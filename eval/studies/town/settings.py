@@ -12,6 +12,7 @@ A study file has its ``kind`` and the settings that differ from the published st
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Annotated, ClassVar, Final, Literal, NamedTuple, Self, TypeVar
@@ -25,6 +26,7 @@ from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import toml_tree
 from crosscue.replay.vehicle.section import Section, tuples
 from crosscue.replay.vehicle.validation_errors import explain
+from crosscue.verb import Option
 
 VERSION: Final = 1
 UNTIL_LOST: Final = 1_000_000
@@ -261,6 +263,27 @@ def study_of(kind: type[Study], settings: Path | None, **given: object) -> Study
         first = error.errors()[0]
         name = str(first["loc"][0])
         raise UsageError(f"{name}: {changed.get(name)}, {first['msg'].lower()}") from None
+
+
+def drives_of(kind: type[Study]) -> Callable[..., Study]:
+    """Return a function that makes the settings of a study from the options of its command."""
+
+    def make(
+        *,
+        settings: Annotated[Path | None, Option(metavar="X.toml")] = None,
+        seed: int | None = None,
+        drives: int | None = None,
+    ) -> Study:
+        """Return the settings of a study.
+
+        Args:
+            settings: Settings of your own study.
+            seed: Random seed.
+            drives: Drives per combination.
+        """
+        return study_of(kind, settings, seed=seed, drives=drives)
+
+    return make
 
 
 def _misfit(why: str, given: object, *keys: str) -> ValidationError:

@@ -156,6 +156,15 @@ def assemble(chunks: Sequence[DriveBatch], folder: Path) -> None:
             sink.write(_with_conditions(chunk, rows))
 
 
+def split(table: pa.Table) -> Iterator[dict[str, Floats]]:
+    """Yield the columns of each case, by name."""
+    cases = table["case"].to_numpy()
+    columns = {name: table[name].to_numpy() for name in table.column_names if name != "case"}
+    for case in range(int(cases[-1]) + 1):
+        part = slice(*np.searchsorted(cases, [case, case + 1]).tolist())
+        yield {name: column[part] for name, column in columns.items()}
+
+
 def drives_schema() -> pa.Schema:
     """Return the columns of ``drives.parquet``."""
     import pyarrow as pa

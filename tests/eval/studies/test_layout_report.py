@@ -9,7 +9,7 @@ import pytest
 
 from crosscue.eval.scoring.intervals import Mean
 from crosscue.eval.scoring.truth import FEATURES
-from crosscue.eval.studies.layouts.report import study_tables, verdict, write_layout_study
+from crosscue.eval.studies.layouts.run import study_tables, verdict, write_layout_study
 from crosscue.eval.studies.layouts.score import (
     DriveBelief,
     LayoutScores,
@@ -70,16 +70,17 @@ def test_every_table_row_has_one_entry_per_column() -> None:
 
 
 def test_files_state_that_study_is_simulated_and_command_to_repeat_it(tmp_path: Path) -> None:
-    files = write_layout_study(tmp_path, LayoutStudy(), scores(), {"M3-01": "disk full"})
+    write_layout_study(tmp_path, LayoutStudy(), scores(), {"M3-01": "disk full"})
 
-    tree = json.loads(files.tables.read_text(encoding="utf-8"))
+    tree = json.loads((tmp_path / "study.json").read_text(encoding="utf-8"))
     assert tree["is_simulated"]
     assert tree["command"].startswith("crosscue study layouts --perception pixels --blocks 8")
     assert tree["failures"] == {"M3-01": "disk full"}
     assert tree["kinds"]["source"]["brier"]["value"] == 0.25
     assert tree["perception"] == "pixels"
-    page = files.page.read_text(encoding="utf-8")
+    page = (tmp_path / "study.html").read_text(encoding="utf-8")
     assert "networks saw rendered photographs" in page
+    assert "failed M3-01: disk full" in page
 
-    files = write_layout_study(tmp_path, LayoutStudy("faults"), scores(), {})
-    assert "No network saw a picture" in files.page.read_text(encoding="utf-8")
+    write_layout_study(tmp_path, LayoutStudy("faults"), scores(), {})
+    assert "No network saw a picture" in (tmp_path / "study.html").read_text(encoding="utf-8")

@@ -297,9 +297,9 @@ def test_default_compass_interval_equals_calibrated_one() -> None:
 @pytest.mark.slow
 def test_field_runs_are_reused(tmp_path: Path) -> None:
     study = FieldStudy(range_runs=1, landmark_runs=1, minutes=2.0)
-    first = [run for _, run in drive_field(study, tmp_path, 1, through_log)]
+    first = [run for _, run in drive_field(study, tmp_path, 1)]
     logs = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/drive.mcap")}
-    again = [run for _, run in drive_field(study, tmp_path, 1, through_log)]
+    again = [run for _, run in drive_field(study, tmp_path, 1)]
     finish_field(study, again, tmp_path)
 
     assert first == again
@@ -307,7 +307,7 @@ def test_field_runs_are_reused(tmp_path: Path) -> None:
     assert [run.has_landmarks for run in first] == [False, True]
     assert all(run.is_whole and run.minutes == pytest.approx(2.0, abs=0.01) for run in first)
     with pytest.raises(RunError, match="other settings"):
-        list(drive_field(FieldStudy(minutes=3.0), tmp_path, 1, through_log))
+        list(drive_field(FieldStudy(minutes=3.0), tmp_path, 1))
 
 
 def test_damaged_chunk_is_simulated_again(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from crosscue.eval.scoring.consistency import mean_band
-from crosscue.eval.studies.town.consistency import nees_along_the_arc
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.town.drive import (
     DriveResult,
@@ -20,6 +19,7 @@ from crosscue.localization.town.drive import (
 )
 from crosscue.localization.town.settings import Sensors, TownDrive
 from crosscue.replay.columns import Floats
+from support.arc_consistency import nees_along_the_arc
 
 NEES = DriveResult._fields.index("nees")
 FINE_M = 1e-4
