@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,9 +15,11 @@ from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.report.html import write_page
 from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
 from crosscue.eval.scoring.files import write_scores
-from crosscue.eval.scoring.intervals import TOO_FEW
+from crosscue.eval.scoring.intervals import TOO_FEW, Proportion
 from crosscue.eval.scoring.runs import RunScored, metrics_of
 from crosscue.eval.scoring.scene.approaches import ApproachScore
+from crosscue.eval.studies.page import PageTable
+from crosscue.eval.studies.study import PAGE
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
@@ -36,26 +38,16 @@ from .tables import (
     quoted_rows,
 )
 
-PAGE: Final = "study.html"
 TEMPLATE: Final = "intersections.html.j2"
 TABLES: Final = "study.json"
 SHEET: Final = "detections.jpg"
-
-
-@dataclass(frozen=True, slots=True)
-class StudyFiles:
-    """The written files."""
-
-    page: Path
-    tables: Path
-    metrics: Path
-    sheet: Path
+CUES: Final = ("precision (Wilson 95 %)", "positives", "recall")
 
 
 def write_study(
     out: Path, settings: IntersectionStudy, done: Sequence[JobOutcome[Outcome]], scored: StudyScores
-) -> StudyFiles:
-    """Write metrics, tables, figures and page to ``out``.
+) -> list[PageTable]:
+    """Write metrics, tables, figures and page to ``out``; return the tables for a terminal.
 
     Raises:
         OutputError: A file cannot be written.
@@ -85,7 +77,7 @@ def write_study(
         {"number": _number, "signed": _signed, "between": _between},
     )
     write_sheet(scored.scored, out / SHEET)
-    return StudyFiles(out / PAGE, out / TABLES, folder / "metrics.json", out / SHEET)
+    return _text_tables(tables, approaches)
 
 
 def _tables(
@@ -116,7 +108,7 @@ def _tables(
         "causes": by_cause(found),
         "conditions": [asdict(one) for one in condition_costs(approaches.results)],
         "quoted": quoted_rows(scored),
-        "cues": cue_rows(scored.scores.cues),
+        "cues": cue_rows(scored.scores.cues, scored.tracked),
         "attribution": attribution_rows(scored),
         "calibrated_less_source": {
             feature: asdict(difference) for feature, difference in scored.difference.items()
@@ -150,49 +142,65 @@ def _signed(value: float | None, digits: int = 0) -> str:
     return "-" if value is None or math.isnan(value) else f"{value:+.{digits}f}"
 
 
-def study_text(
-    done: Sequence[JobOutcome[Outcome]], scored: StudyScores, written: StudyFiles
-) -> str:
-    """Return a text summary of the study, within 80 columns."""
-    approaches = scored.scores.approaches
-    assert approaches is not None
-    failed = [one for one in done if one.error is not None]
-    wrong = approaches.false_features
-    lines = [
-        f"simulated drives   {len(scored.scored)} of {len(done)} done, {len(failed)} failed",
-        *(f"  failed           {one.job.name}: {one.error}" for one in failed),
-        f"detected           {_of(approaches.detected.right, approaches.detected.of)} at "
-        f"{mean_text(approaches.detected_m)}; published 34.4 m",
-        f"full intersection  {_of(approaches.full.right, approaches.full.of)} at "
-        f"{mean_text(approaches.full_m)}; published 16.2 m, 76 of 80",
-        f"false features     in {_of(wrong.right, wrong.of)}",
-        "",
-        f"{'intersection':<14}{'detected':>12}{'mean':>9}{'full':>12}{'mean':>9}",
+def _text_tables(tables: Mapping[str, Any], approaches: ApproachScore) -> list[PageTable]:
+    """Return the tables of the study for a terminal."""
+    rows, wrong = tables["intersections"], approaches.false_features
+    return [
+        PageTable(
+            f"Simulated drives: {tables['done']} of {tables['wanted']} done",
+            ("", "approaches", "at", "published"),
+            (
+                ("detected", _of(approaches.detected), tables["detected_m"], "34.4 m"),
+                ("full intersection", _of(approaches.full), tables["full_m"], "16.2 m, 76 of 80"),
+                ("with false features", _of(wrong), "", ""),
+                *((f"failed {one}", "", "", "") for one in tables["failures"]),
+            ),
+        ),
+        PageTable(
+            "By intersection",
+            ("intersection", "detected", "mean, m", "full", "mean, m"),
+            tuple(
+                (
+                    row["intersection"],
+                    f"{row['detected']} of {row['approaches']}",
+                    _number(row["detected_m"]),
+                    f"{row['full']} of {row['approaches']}",
+                    _number(row["full_m"]),
+                )
+                for row in rows
+            ),
+        ),
+        PageTable(
+            "Late, missing or invented",
+            ("cause", "drives at each intersection"),
+            tuple(
+                (cause, ", ".join(f"{place} {drives}" for place, drives in places.items()))
+                for cause, places in tables["causes"].items()
+            ),
+        ),
+        PageTable(
+            "Cues, with the published rules and with tracked cars",
+            ("cue", *CUES, "published", *(f"tracks: {name}" for name in CUES)),
+            tuple(
+                (
+                    row["cue"],
+                    *_cue_cells(row),
+                    f"{row['published']:.2f}",
+                    *([""] * len(CUES) if row["tracks"] is None else _cue_cells(row["tracks"])),
+                )
+                for row in tables["cues"]
+            ),
+        ),
     ]
-    for row in intersection_rows(approaches.results):
-        lines.append(
-            f"{row['intersection']:<14}{_of(row['detected'], row['approaches']):>12}"
-            f"{_number(row['detected_m']):>9}{_of(row['full'], row['approaches']):>12}"
-            f"{_number(row['full_m']):>9}"
-        )
-    lines += ["", "late, missing or invented (drives):"]
-    for cause, places in by_cause(_findings(scored.scored)).items():
-        reported_places = ", ".join(f"{place} {drives}" for place, drives in places.items())
-        lines.append(f"  {cause:<20} {reported_places}")
-    lines += ["", f"{'cue':<20}{'precision':>10}{'95 %':>16}{'positives':>11}{'published':>11}"]
-    for row in cue_rows(scored.scores.cues):
-        ends = f"{_number(row['wilson_low'], 2)} to {_number(row['wilson_high'], 2)}"
-        lines.append(
-            f"{row['cue']:<20}{_number(row['precision'], 2):>10}{ends:>16}"
-            f"{row['positives']:>11,}{row['published']:>11.2f}"
-        )
-    lines += [
-        "",
-        f"page       {written.page}",
-        f"tables     {written.tables}",
-        f"pictures   {written.sheet}: a frame of each drive, with detections",
-    ]
-    return "\n".join(lines)
+
+
+def _cue_cells(row: Mapping[str, Any]) -> tuple[str, ...]:
+    ends = f"{_number(row['wilson_low'], 2)} to {_number(row['wilson_high'], 2)}"
+    return (
+        f"{_number(row['precision'], 2)} ({ends})",
+        f"{row['positives']:,}",
+        _number(row["recall"], 2),
+    )
 
 
 def _between(mean: Mapping[str, Any], digits: int = 1) -> str:
@@ -205,8 +213,8 @@ def _between(mean: Mapping[str, Any], digits: int = 1) -> str:
     return f"{value:+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
 
 
-def _of(some: int, of: int) -> str:
-    return f"{some} of {of}"
+def _of(some: Proportion) -> str:
+    return f"{some.right} of {some.of}"
 
 
 def _findings(scored: Sequence[RunScored]) -> tuple[Finding, ...]:

@@ -2,55 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from crosscue.detectors.registry import check, chosen
 from crosscue.eval.batch.jobs import JobOutcome, exit_status_of
 from crosscue.eval.batch.ray_jobs import engine_of
 from crosscue.eval.pipeline.detect import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
-from crosscue.eval.studies.result import StoredResult
 from crosscue.eval.studies.simulated_drives import run_drives
+from crosscue.eval.studies.study import StudyResult
 from crosscue.replay.errors import RunError
 from crosscue.replay.vehicle.vehicle import vehicle_given
+from crosscue.results import HIDDEN
 from crosscue.verb import Option
 
-from .report import StudyFiles, study_text, write_study
+from .report import SHEET, TABLES, write_study
 from .settings import IntersectionStudy
 from .study import score_intersection_study
 from .tables import StudyScores
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class IntersectionResult(StoredResult):
+class IntersectionResult(StudyResult):
     """Results of the simulated experiment; its repr is tables with the published numbers.
 
     Attributes:
         drives: Outcome of each drive.
         scored: Scores of distances, cues and beliefs, and of the ablation of each cue.
-        files: The page, its tables as JSON, the metrics and a contact sheet.
     """
 
-    drives: tuple[JobOutcome[Outcome], ...]
-    scored: StudyScores
-    files: StudyFiles
+    drives: tuple[JobOutcome[Outcome], ...] = field(metadata=HIDDEN)
+    scored: StudyScores = field(metadata=HIDDEN)
+
+    files: ClassVar = {TABLES: "tables", SHEET: "pictures: a frame of each drive, with detections"}
 
     @property
     def exit_status(self) -> int:
         """0 if all drives are complete; 3 if a drive failed or something was dropped."""
         return exit_status_of(self.drives)
-
-    @property
-    def stored(self) -> Path:
-        """Its tables as JSON."""
-        return self.files.tables
-
-    def lines(self) -> Iterator[str]:
-        """Yield the tables."""
-        yield study_text(self.drives, self.scored, self.files)
 
 
 def run_intersection_study(
@@ -98,4 +89,5 @@ def run_intersection_study(
     if not names:
         raise RunError(f"{folder}: every drive failed; the first: {done[0].error}")
     scored = score_intersection_study(folder, names, attribution=attribution)
-    return IntersectionResult(done, scored, write_study(folder, study, done, scored))
+    tables = write_study(folder, study, done, scored)
+    return IntersectionResult(folder, tables, (), done, scored)

@@ -10,7 +10,7 @@ from typing import Final
 from crosscue.datasets.truth.truth import FILE
 from crosscue.eval.fit.annotated_runs import annotated_approaches, graph_of_runs
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.scoring.drives import ScoreSettings, pool_scores, score_drive
+from crosscue.eval.scoring.drives import DriveJudged, ScoreSettings, pool_scores, score_drive
 from crosscue.eval.scoring.runs import RunScored, judge_run
 from crosscue.eval.scoring.scene.belief import compare_belief
 from crosscue.eval.studies.attribution import AttributedDrive, attribute
@@ -47,23 +47,33 @@ def score_intersection_study(
         drives = [AttributedDrive(one.judged, one.truth, estimate_of(one.run)) for one in scored]
         worth = attribute(drives, settings=AS_PUBLISHED)
     first = [one.judged for one in scored]
+    tracked = pool_scores([_again(one, _with_tracks(one)) for one in scored], AS_PUBLISHED).cues
     learned = calibrated_vehicles(scored)
     if learned is None:
-        return StudyScores(scored, pool_scores(first, AS_PUBLISHED), worth, None, {})
-    second = [
-        score_drive(estimate_of(one.run, vehicle)(frozenset()), one.truth, AS_PUBLISHED)
-        for one, vehicle in zip(scored, learned, strict=True)
-    ]
+        return StudyScores(scored, pool_scores(first, AS_PUBLISHED), worth, tracked, None, {})
+    second = [_again(one, vehicle) for one, vehicle in zip(scored, learned, strict=True)]
     return StudyScores(
         scored,
         pool_scores(first, AS_PUBLISHED),
         worth,
+        tracked,
         pool_scores(second, AS_PUBLISHED),
         compare_belief(
             [part for one in first for part in one.belief],
             [part for one in second for part in one.belief],
         ),
     )
+
+
+def _again(one: RunScored, vehicle: Vehicle) -> DriveJudged:
+    """Judge a drive estimated again with other settings."""
+    return score_drive(estimate_of(one.run, vehicle)(frozenset()), one.truth, AS_PUBLISHED)
+
+
+def _with_tracks(one: RunScored) -> Vehicle:
+    vehicle = one.run.drive_manifest().settings
+    cars = vehicle.cars.model_copy(update={"kind": "tracks"})
+    return vehicle.model_copy(update={"cars": cars})
 
 
 def calibrated_vehicles(scored: Sequence[RunScored]) -> list[Vehicle] | None:

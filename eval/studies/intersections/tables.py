@@ -25,6 +25,7 @@ class StudyScores:
         scored: Every drive, compared with its truth.
         scores: Scores of all drives together.
         worth: Effect of each of the nine cues; empty if not requested.
+        tracked: Scores of the cues with ``cars.kind = "tracks"``.
         calibrated: Scores with messages learned at the other intersections; None if there are too
             few intersections.
         difference: Belief of the calibrated minus the published messages, by feature.
@@ -33,6 +34,7 @@ class StudyScores:
     scored: tuple[RunScored, ...]
     scores: PooledScores
     worth: dict[str, Attribution]
+    tracked: Mapping[str, CueScore]
     calibrated: PooledScores | None
     difference: dict[str, BeliefDifference]
 
@@ -44,43 +46,54 @@ PUBLISHED_RUNS: Final[Mapping[str, tuple[float, float]]] = {
 }  # fmt: skip
 
 Row = dict[str, Any]
+# Cues of cars at the intersection, which both rules count.
+CARS: Final = ("cross_traffic", "parked")
 
 
-def cue_rows(cues: Mapping[str, CueScore]) -> list[Row]:
+def cue_rows(cues: Mapping[str, CueScore], tracked: Mapping[str, CueScore]) -> list[Row]:
     """Return one row per cue of Table 5, pooled over its columns.
 
     ``precision`` compares with objects (lane lines and vehicles past the intersection: with the
     continuation of the road), and ``feature_precision`` with the cue's feature of the intersection.
+    Cues of cars also have a row of the rule that tracks them, under ``tracks``.
     """
     rows: list[Row] = []
     for group in groups().values():
         published = group[0]
         some = [cues[cue.name] for cue in group if cue.name in cues]
-        right = sum(one.precision.right for one in some)
-        of = sum(one.precision.of for one in some)
-        # Clusters are known only per column, so the widest interval over clusters is used.
-        low, high = wilson(right, of)
-        lows = [one.precision.clusters_low for one in some if one.precision.of]
-        highs = [one.precision.clusters_high for one in some if one.precision.of]
-        recalls = [one.recall for one in some if one.recall is not None]
+        others = [tracked[cue.name] for cue in group if cue.name in tracked]
         ways = [one.readings["feature"].precision for one in some if "feature" in one.readings]
         rows.append(
             {
                 "cue": published.title,
                 "published": published.precision,
                 "published_is_bound": published.precision_is_lower_bound,
-                "precision": right / of if of else math.nan,
-                "wilson_low": low,
-                "wilson_high": high,
-                "clusters_low": min(lows, default=math.nan),
-                "clusters_high": max(highs, default=math.nan),
-                "positives": of,
+                **_cue_row(some),
                 "feature_precision": _pooled(ways),
-                "recall": _pooled(recalls),
-                "recall_of": sum(one.of for one in recalls),
+                "tracks": _cue_row(others) if group[0].name.startswith(CARS) else None,
             }
         )
     return rows
+
+
+def _cue_row(some: Sequence[CueScore]) -> Row:
+    right = sum(one.precision.right for one in some)
+    of = sum(one.precision.of for one in some)
+    recalls = [one.recall for one in some if one.recall is not None]
+    # Clusters are known only per column, so the widest interval over clusters is used.
+    low, high = wilson(right, of)
+    lows = [one.precision.clusters_low for one in some if one.precision.of]
+    highs = [one.precision.clusters_high for one in some if one.precision.of]
+    return {
+        "precision": right / of if of else math.nan,
+        "wilson_low": low,
+        "wilson_high": high,
+        "clusters_low": min(lows, default=math.nan),
+        "clusters_high": max(highs, default=math.nan),
+        "positives": of,
+        "recall": _pooled(recalls),
+        "recall_of": sum(one.of for one in recalls),
+    }
 
 
 def _pooled(fractions: Sequence[Proportion]) -> float:

@@ -177,7 +177,7 @@ def _of_features(
 
 
 def _false_features(one: DriveBelief) -> Floats:
-    above = (one.probabilities[~one.is_silent] > THRESHOLD).any(axis=0)
+    above = np.any(one.probabilities[~one.is_silent] > THRESHOLD, axis=0)
     absent = [i for i, name in enumerate(FEATURES) if one.features.get(name) is False]
     return np.array([above[absent].sum()], np.float64)
 

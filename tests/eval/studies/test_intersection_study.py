@@ -79,6 +79,9 @@ def test_true_objects_as_detections_yield_right_cues(study: Path) -> None:
     assert rows["stop sign"]["precision"] == rows["traffic light"]["precision"] == 1.0
     assert rows["stop sign"]["positives"] > 20
     assert rows["road"]["positives"] == 0
+    assert rows["cross traffic"]["tracks"].keys() >= {"precision", "recall", "positives"}
+    assert rows["cross traffic"]["tracks"]["recall_of"] == rows["cross traffic"]["recall_of"] > 0
+    assert rows["road"]["tracks"] is None
 
 
 def test_attribution_shows_intersection_lost_without_stop_signs(study: Path) -> None:
