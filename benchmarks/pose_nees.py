@@ -35,9 +35,8 @@ from crosscue.datasets.simulated.drive import (
     sense,
     true_motion,
 )
-from crosscue.eval.fit.log_signals import read_signals, signal_plan
+from crosscue.eval.fit.log_signals import read_signals, signal_plan, turn_samples, wheel_speeds
 from crosscue.eval.fit.reference import ReferencePositions, of_gnss, of_truth
-from crosscue.eval.fit.turns import turn_samples, wheel_speeds
 from crosscue.eval.logs.log import opened
 from crosscue.eval.pipeline.pose import odometry_settings, turn_signal_of
 from crosscue.eval.scoring.consistency import mean_band

@@ -21,12 +21,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from crosscue.eval.scoring.consistency import mean_band
-from crosscue.eval.studies.intervals import mean_of
+from crosscue.eval.studies.intervals import km, mean_of, percent
 from crosscue.eval.studies.town.landmark_study import comparisons_of
 from crosscue.eval.studies.town.range_study import law_m
 from crosscue.eval.studies.town.settings import UNTIL_LOST, FieldStudy, LandmarkStudy
 from crosscue.eval.studies.town.work import chunks_of
-from crosscue.eval.studies.words import km, percent
 from crosscue.localization.town.drive import (
     DriveOutcome,
     DriveResult,

@@ -40,8 +40,8 @@ from crosscue.eval.studies.attribution import (
     attribute,
     attribution_lines,
     attribution_tree,
+    estimate_of,
 )
-from crosscue.eval.studies.estimated_again import estimate_of
 from crosscue.replay.errors import CrosscueError, UsageError, one_line
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.progress import Progress, emit

@@ -22,9 +22,8 @@ from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.vehicle.pose import GnssUse, Start
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .log_signals import read_signals, signal_plan
+from .log_signals import read_signals, signal_plan, turn_samples, wheel_speeds
 from .reference import GeodeticOrigin, ReferencePositions, of_gnss, of_truth
-from .turns import turn_samples, wheel_speeds
 
 # Time read from the start of a drive, seconds; receivers and buses start at different times.
 READ_S: Final = START_S + 10.0

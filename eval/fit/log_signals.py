@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from crosscue.localization.odometry import TurnKind, TurnSignal, WheelSamples
 from crosscue.replay.base import Log, Selection, name_of
 from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.signals.extractor import SampleExtractor, probe_clocks
@@ -65,3 +66,18 @@ def _joined(parts: Sequence[Samples]) -> Samples:
     later = np.diff(t_ns, prepend=t_ns[0] - 1) > 0
     values = np.concatenate([part.values for part in parts])
     return Samples(parts[0].signal, t_ns[later], values[later])
+
+
+def wheel_speeds(samples: Samples) -> WheelSamples:
+    """Return the speeds of all four wheels, or of the rear two if the front ones are unknown."""
+    speeds = samples.values
+    has_front = not np.isnan(speeds[:, :2]).all()
+    return WheelSamples(samples.t_ns, speeds if has_front else speeds[:, 2:])
+
+
+def turn_samples(signal: Signal | None, found: Mapping[Signal, Samples]) -> TurnSignal | None:
+    """Return the samples of a source of turns; None for the difference of the wheel speeds."""
+    if signal is None:
+        return None
+    kind: TurnKind = "yaw rate" if signal is Signal.YAW_RATE else "steering"
+    return TurnSignal(found[signal].t_ns, found[signal].values, kind)

@@ -31,9 +31,8 @@ from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option
 
-from .log_signals import read_signals, signal_plan
+from .log_signals import read_signals, signal_plan, turn_samples, wheel_speeds
 from .reference import ReferencePositions, of_gnss, of_truth
-from .turns import turn_samples, wheel_speeds
 from .vehicle_output import check_output, write_fit
 
 SHARED: Final = (

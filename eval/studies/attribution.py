@@ -13,6 +13,8 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
+from crosscue.eval.pipeline.scene.variants import scene_tables
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.columns import RunTables
 from crosscue.eval.scoring.drives import (
     DEFAULTS,
@@ -25,11 +27,13 @@ from crosscue.eval.scoring.drives import (
 )
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.metric_values import metric_values
+from crosscue.eval.scoring.run_tables import in_log_time
 from crosscue.eval.scoring.scene.approaches import ApproachResult, places_of_results
 from crosscue.eval.scoring.scene.belief import BeliefDifference, compare_belief
 from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.replay.columns import Int64s
 from crosscue.replay.vehicle import cue_table
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 SHOWN: Final = ("approaches", "belief", "range")
 PASSED_OVER: Final = frozenset(
@@ -198,3 +202,24 @@ def attribution_lines(found: Mapping[str, Attribution]) -> list[str]:
 
 def _signed(value: float, digits: int = 3) -> str:
     return "-" if math.isnan(value) else f"{value:+.{digits}f}"
+
+
+def estimate_of(run: RunFolder, vehicle: Vehicle | None = None) -> EstimateWithout:
+    """Return a function that estimates from a run's detections and pose, without pictures.
+
+    Args:
+        run: Run with a finished detect stage.
+        vehicle: Other settings; default: those of the run.
+
+    Raises (when called):
+        RunError: No detector ran on the run's camera.
+    """
+
+    def estimate(cues: frozenset[str], /) -> RunTables:
+        timeline = run.drive_manifest().timeline
+        again = scene_tables(run, vehicle, cues)
+        tables = {name: again[name] for name in ("cues", "range", "belief")}
+        frames = run.table("frames", ["t_ns", "segment", "log_t_ns"])
+        return in_log_time(str(run.path), {"frames": frames, **tables}, timeline)
+
+    return estimate

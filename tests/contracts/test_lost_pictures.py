@@ -56,7 +56,7 @@ LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
         "truth import": "truth import {coco} --log {log} -o {out}.json --vehicle {car}",
         "check of truth": "check {labelled} {log} {car}",
     },
-    "eval/fit/signs/scores.py": {
+    "eval/fit/signs/labels.py": {
         "fit signs": "fit signs {drive} --label stop/sign --threshold 0.5"
     },
     "eval/fit/landmarks/database.py": {

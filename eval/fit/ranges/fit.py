@@ -201,7 +201,7 @@ def fit_ranges(
             raise EmptyResultError(f"test: the drives contain no {cue}; use others")
         found = replace(found, tested=residuals(*tested, found.best.curve, bin_m))
     if picture is not None:
-        from crosscue.eval.fit.ranges.figure import draw_range_fits
+        from crosscue.eval.fit.ranges.pairs import draw_range_fits
 
         draw_range_fits(picture, cue, pairs, list(found.fits), found.tested)
     return found

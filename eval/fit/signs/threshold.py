@@ -18,7 +18,7 @@ from crosscue.detectors.training.operating_point import (
     rates_at,
     threshold_at_precision,
 )
-from crosscue.eval.fit.signs.scores import ScoringRules, judged_pictures
+from crosscue.eval.fit.signs.labels import ScoringRules, judged_pictures
 from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, fraction
 from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven

@@ -25,13 +25,13 @@ from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.versions import versions
 
-from .conditions import condition_costs
 from .contact_sheet import write_sheet
 from .figures import draw_beliefs, draw_study_distances, draw_study_reliability
 from .settings import IntersectionStudy
 from .tables import (
     StudyScores,
     attribution_rows,
+    condition_costs,
     cue_rows,
     intersection_rows,
     mean_text,

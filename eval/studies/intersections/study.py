@@ -13,8 +13,7 @@ from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.drives import DriveJudged, ScoreSettings, pool_scores, score_drive
 from crosscue.eval.scoring.runs import RunScored, judge_run
 from crosscue.eval.scoring.scene.belief import compare_belief
-from crosscue.eval.studies.attribution import AttributedDrive, attribute
-from crosscue.eval.studies.estimated_again import estimate_of
+from crosscue.eval.studies.attribution import AttributedDrive, attribute, estimate_of
 from crosscue.fusion.fit.message_fit import fit_messages
 from crosscue.replay.errors import RunError
 from crosscue.replay.vehicle.fusion import Calibrated

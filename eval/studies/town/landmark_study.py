@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from crosscue.eval.studies.intervals import (
     ValueInterval,
     fraction_of,
+    km,
     mean_of,
+    percent,
     range_at,
     ratio_of,
     ratio_of_means,
 )
 from crosscue.eval.studies.page import PageTable
-from crosscue.eval.studies.words import km, percent
 from crosscue.localization.town.drive import DriveOutcome
 from crosscue.localization.town.settings import TownDrive
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, overload
 
 from crosscue.eval.runs.folder import RunFolder, locked
+from crosscue.eval.studies.intervals import km, percent
 from crosscue.eval.studies.page import PageTable
 from crosscue.eval.studies.study import StudyResult, Written, claim
-from crosscue.eval.studies.words import km, percent
 from crosscue.localization.town.drive import DriveResult as DriveResult
 from crosscue.localization.town.drive import drive_traced
 from crosscue.replay.progress import Progress, emit

@@ -15,9 +15,9 @@ import crosscue
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval import cli
+from crosscue.eval.fit.log_signals import turn_samples, wheel_speeds
 from crosscue.eval.fit.odometry import FittedOdometry
 from crosscue.eval.fit.reference import ReferencePositions, of_truth
-from crosscue.eval.fit.turns import turn_samples, wheel_speeds
 from crosscue.eval.pipeline.pose import odometry_constants
 from crosscue.localization.odometry import TurnSignal, WheelSamples
 from crosscue.replay.errors import FitError
