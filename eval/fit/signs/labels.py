@@ -155,7 +155,7 @@ def _box(row: dict[str, str], where: str) -> tuple[float, float, float, float]:
     return x0, y0, x1, y1
 
 
-MAX_BYTES: Final = 512 * MIB
+MAX_OBJECTS_BYTES: Final = 512 * MIB
 
 
 def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[SignPicture]:
@@ -174,7 +174,7 @@ def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[Si
 
 def _boxes(path: Path) -> dict[int, Boxes]:
     found: dict[int, Boxes] = {}
-    for image, boxes in coco_boxes(read_text(path, MAX_BYTES), path):
+    for image, boxes in coco_boxes(read_text(path, MAX_OBJECTS_BYTES), path):
         if not isinstance(image.get("t_ns"), int):
             raise AnnotationError(f"{path}: images without t_ns; crosscue truth import adds them")
         found[image["t_ns"]] = boxes
