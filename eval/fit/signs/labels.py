@@ -1,4 +1,4 @@
-"""Labelled pictures of signs, from a CSV file of boxes or a COCO file."""
+"""Labelled pictures of signs, from files of boxes or drives, and a detector scored on them."""
 
 from __future__ import annotations
 
