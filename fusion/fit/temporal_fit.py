@@ -34,7 +34,7 @@ from crosscue.fusion.temporal import (
 )
 from crosscue.replay.vehicle.temporal import CueChain, Temporal
 
-from .annotated_approach import NOT_EVALUATED
+from .annotated_approach import NOT_EVALUATED, Bools
 
 EDGES_M: Final = (0.0, 10.0, 20.0, 35.0, 50.0, 80.0)
 # Number of additional steps; about that of a drive, so the effect is that of one more place.
@@ -71,22 +71,8 @@ class AnnotatedDrive:
     place: str
 
 
-class ChainState(NamedTuple):
-    """State on which a cue's chain depends; ``bin`` is None for all distances."""
-
-    there: tuple[str, ...]
-    missing: tuple[str, ...]
-    bin: int | None
-
-    @property
-    def is_ahead(self) -> bool:
-        """Whether an intersection is ahead."""
-        return bool(self.there or self.missing)
-
-
-NOWHERE: Final = ChainState((), (), None)
-# Number of steps by state, previous step (``first``, ``stays``, ``appears``) and current value.
-Tally = Counter[tuple[ChainState, str, bool]]
+# What a step of a chain is: after none, a positive and a negative one, as in ``CueChain``.
+WHAT: Final = ("first", "stays", "appears")
 
 
 class TemporalFit(NamedTuple):
@@ -180,7 +166,7 @@ def frames_of(drive: AnnotatedDrive) -> Iterator[dict[str, int]]:
         yield {name: column[i] for name, column in columns.items() if column[i] != NOT_EVALUATED}
 
 
-def _steps(drive: AnnotatedDrive, about: Temporal) -> np.typing.NDArray[np.bool_]:
+def _steps(drive: AnnotatedDrive, about: Temporal) -> Bools:
     """Mark the frames in which the filter evaluates all cues."""
     is_step = np.zeros(len(drive.start_m), np.bool_)
     since_m = np.inf
@@ -201,12 +187,8 @@ def _counted(drives: Sequence[AnnotatedDrive], graph: FactorGraph) -> Temporal:
         chains=(),
         stray=_stray(drives),
     )
-    steps = [_steps(one, empty) for one in drives]
-    chains = tuple(
-        chain
-        for cue in graph.cues
-        for chain in _chains(cue, graph, _tally(cue, graph, drives, steps))
-    )
+    steps = [(one, _steps(one, empty)) for one in drives]
+    chains = tuple(chain for cue in graph.cues for chain in _chains(cue, graph, steps))
     return empty.model_copy(update={"chains": chains})
 
 
@@ -239,105 +221,65 @@ def _stray(drives: Sequence[AnnotatedDrive]) -> float:
     return round((far + 1.0) / (total + 2.0), 4)
 
 
-def _tally(
-    cue: CueNode,
-    graph: FactorGraph,
-    drives: Sequence[AnnotatedDrive],
-    steps: Sequence[np.typing.NDArray[np.bool_]],
-) -> Tally:
-    tally: Tally = Counter()
-    features = _features_of(cue, graph)
-    for drive, is_step in zip(drives, steps, strict=True):
-        count = drive.counts.get(cue.name)
-        if count is None:
-            continue
-        at = np.searchsorted(EDGES_M[1:-1], drive.start_m, side="right").tolist()
-        is_ahead = (np.isfinite(drive.start_m) & (drive.start_m < EDGES_M[-1])).tolist()
-        before: bool | None = None
-        for i in np.flatnonzero(is_step).tolist():
-            now = int(count[i])
-            if now == NOT_EVALUATED:
-                before = None
-                continue
-            state = _state(drive, features, at[i]) if is_ahead[i] else NOWHERE
-            # The initial probability is counted over all steps, because few are first ones.
-            tally[state, "first", now > 0] += 1
-            if before is not None:
-                tally[state, "stays" if before else "appears", now > 0] += 1
-            before = now > 0
-    return tally
+def _chains(
+    cue: CueNode, graph: FactorGraph, drives: Sequence[tuple[AnnotatedDrive, Bools]]
+) -> Iterator[CueChain]:
+    """Yield a chain for no intersection, and one for each combination of the cue's features.
 
-
-def _features_of(cue: CueNode, graph: FactorGraph) -> tuple[str, ...]:
-    """Features other than presence that a cue affects, in the graph's order."""
-    mine = {edge.feature for edge in graph.edges if edge.cue == cue.name}
-    return tuple(name for name in graph.feature_names if name in mine and name != PRESENCE)
-
-
-def _state(drive: AnnotatedDrive, features: tuple[str, ...], at: int) -> ChainState:
-    there = tuple(name for name in features if drive.features.get(name))
-    missing = tuple(name for name in features if drive.features.get(name) is False)
-    return ChainState((PRESENCE, *there), missing, at)
-
-
-def _chains(cue: CueNode, graph: FactorGraph, tally: Tally) -> Iterator[CueChain]:
-    """Yield a chain for no intersection, and one for each combination of the cue's features."""
-    if not tally:
+    The features are those other than presence that the cue affects, in the graph's order.
+    """
+    mine = {edge.feature for edge in graph.edges if edge.cue == cue.name} - {PRESENCE}
+    features = [name for name in graph.feature_names if name in mine]
+    ways = list(product((True, False), repeat=len(features)))
+    # Steps by kind, value, way (none, each combination, not known) and distance.
+    counts = np.zeros((len(WHAT), 2, len(ways) + 2, len(EDGES_M) - 1))
+    for drive, is_step in drives:
+        known = tuple(drive.features.get(name) for name in features)
+        way = ways.index(known) + 1 if known in ways else -1
+        _count(counts, cue.name, drive, is_step, way)
+    if not counts.any():
         return
-    features = _features_of(cue, graph)
-    usual = {what: _rate(tally, what, 0.5) for what in ("first", "stays", "appears")}
-    nowhere = {
-        what: (_rate(_in(tally, NOWHERE), what, usual[what]),)
-        for what in ("first", "stays", "appears")
-    }
-    yield CueChain(
-        cue=cue.name,
-        first=nowhere["first"],
-        stays=nowhere["stays"],
-        appears=nowhere["appears"],
-    )
-    for is_there in product((True, False), repeat=len(features)):
-        there = (
-            PRESENCE,
-            *(name for name, there in zip(features, is_there, strict=True) if there),
-        )
-        missing = tuple(name for name, there in zip(features, is_there, strict=True) if not there)
-        state = ChainState(there, missing, None)
-        by_distance = {
-            what: tuple(
-                _rate(
-                    _in(tally, state._replace(bin=number)),
-                    what,
-                    _rate(_in(tally, state), what, usual[what]),
-                )
-                for number in range(len(EDGES_M) - 1)
-            )
-            for what in ("first", "stays", "appears")
-        }
+    usual = _rates(counts.sum(axis=(2, 3)), np.full(len(WHAT), 0.5))
+    nowhere = _rates(counts[:, :, 0].sum(axis=2), usual)
+    yield CueChain(cue=cue.name, **{what: (nowhere[k],) for k, what in enumerate(WHAT)})
+    for row, is_there in enumerate(ways, 1):
+        here = _rates(counts[:, :, row].sum(axis=2), usual)
+        found = _rates(counts[:, :, row], here[:, None]).tolist()
+        sides = [
+            tuple(name for name, is_so in zip(features, is_there, strict=True) if is_so == side)
+            for side in (True, False)
+        ]
         yield CueChain(
             cue=cue.name,
-            there=there,
-            missing=missing,
-            first=by_distance["first"],
-            stays=by_distance["stays"],
-            appears=by_distance["appears"],
+            there=(PRESENCE, *sides[0]),
+            missing=sides[1],
+            **{what: tuple(rates) for what, rates in zip(WHAT, found, strict=True)},
         )
 
 
-def _in(tally: Tally, state: ChainState) -> Tally:
-    """Counts of one state, or of all its distances."""
-    return Counter(
-        {
-            key: count
-            for key, count in tally.items()
-            if key[0] == state
-            or (state.bin is None and state.is_ahead and key[0]._replace(bin=None) == state)
-        }
-    )
+def _count(
+    counts: NDArray[np.float64], cue: str, drive: AnnotatedDrive, is_step: Bools, way: int
+) -> None:
+    count = drive.counts.get(cue)
+    if count is None:
+        return
+    at = np.searchsorted(EDGES_M[1:-1], drive.start_m, side="right").tolist()
+    is_ahead = (np.isfinite(drive.start_m) & (drive.start_m < EDGES_M[-1])).tolist()
+    before: bool | None = None
+    for i in np.flatnonzero(is_step).tolist():
+        if count[i] == NOT_EVALUATED:
+            before = None
+            continue
+        now = bool(count[i] > 0)
+        where = (int(now), way, at[i]) if is_ahead[i] else (int(now), 0, 0)
+        # The initial probability is counted over all steps, because few are first ones.
+        counts[(WHAT.index("first"), *where)] += 1.0
+        if before is not None:
+            counts[(WHAT.index("stays" if before else "appears"), *where)] += 1.0
+        before = now
 
 
-def _rate(tally: Tally, what: str, usual: float) -> float:
-    hits = sum(count for (_, when, now), count in tally.items() if when == what and now)
-    of = sum(count for (_, when, _), count in tally.items() if when == what)
-    rate = (hits + PULL_STEPS * usual) / (of + PULL_STEPS)
-    return round(min(max(rate, MIN_RATE), 1.0 - MIN_RATE), 4)
+def _rates(counts: NDArray[np.float64], usual: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return frequencies of positive steps; ``counts`` has the kind of step and the value first."""
+    rates = (counts[:, 1] + PULL_STEPS * usual) / (counts.sum(axis=1) + PULL_STEPS)
+    return np.round(np.clip(rates, MIN_RATE, 1.0 - MIN_RATE), 4)

@@ -18,7 +18,7 @@ from crosscue.replay.progress import Progress, emit
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option
 
-from . import drive_figure, landmark_figure, landmark_study, range_figure, range_study
+from . import drive_figure, landmark_study, range_study
 from .settings import LandmarkStudy, RangeStudy, drives_of
 from .work import DRIVES, assemble, chunks_of, run, split, workers_of
 
@@ -203,7 +203,7 @@ def finish_range(study: RangeStudy, folder: Path) -> Written:
     """Write summary, picture and page from ``drives.parquet``."""
     table = RunFolder(folder).table(DRIVES)
     results = range_study.summarise_ranges(study, table)
-    picture = range_figure.draw_range_study(
+    picture = range_study.draw_range_study(
         results, list(split(table)), study.drive.navigation.lost_above_m, folder
     )
     others = range_study.drive_choices(study)
@@ -214,7 +214,7 @@ def finish_range(study: RangeStudy, folder: Path) -> Written:
         [asdict(r) for r in results],
         (*range_tables(results), choices_table(others)),
         (OURS, *RANGE_NOTES),
-        [picture, range_figure.draw_choices(others, folder)],
+        [picture, range_study.draw_choices(others, folder)],
         choices=[range_study.choice_tree(one) for one in others],
     )
 
@@ -223,7 +223,7 @@ def finish_landmarks(study: LandmarkStudy, folder: Path) -> Written:
     """Write summary, pictures and page from ``drives.parquet``."""
     table = RunFolder(folder).table(DRIVES)
     result = landmark_study.summarise_landmarks(study, table)
-    pictures = landmark_figure.draw_landmark_study(study, result, list(split(table)), folder)
+    pictures = landmark_study.draw_landmark_study(study, result, list(split(table)), folder)
     tables = landmark_study.tables(study, result)
     return _finish(
         study,
@@ -277,7 +277,7 @@ def range_tables(results: Sequence[range_study.CompassResult]) -> tuple[PageTabl
             ),
             tuple(
                 (
-                    range_figure.compass_name(r),
+                    range_study.compass_name(r),
                     str(r.drives),
                     percent(r.fraction_lost),
                     km(r.lost_after_m) if r.lost else "never lost",
