@@ -62,7 +62,7 @@ LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
     "eval/fit/landmarks/database.py": {
         "landmarks add": "landmarks add {out}.db {log} --poses {truth} --vehicle {car}",
     },
-    "eval/fit/landmarks/pairs.py": {
+    "eval/fit/landmarks/fit.py": {
         "fit landmarks": "fit landmarks {log} --database {db} --poses {truth} --vehicle {car} "
         "--different-beyond 10 --every 1",
     },

@@ -22,7 +22,8 @@ from crosscue.eval.fit.ranges.pairs import (
     pairs_of_truth,
     range_pairs,
 )
-from crosscue.replay.errors import EmptyResultError, OutputError, UsageError
+from crosscue.eval.fit.vehicle_output import new_file
+from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
 
@@ -186,9 +187,7 @@ def fit_ranges(
         OutputError: The figure exists, or cannot be written.
     """
     bin_m = settings.bin_m
-    picture = None if settings.figure is None else Path(settings.figure)
-    if picture is not None and picture.exists() and not settings.overwrite:
-        raise OutputError(f"{picture}: exists; give another name or --overwrite")
+    picture = new_file(settings.figure, overwrite=settings.overwrite)
     if cue not in PUBLISHED_SD_M:
         raise UsageError(f"cue: {cue}, expected one of {', '.join(PUBLISHED_SD_M)}")
     pairs = _pairs(cue, settings)
