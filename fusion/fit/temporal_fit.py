@@ -282,4 +282,6 @@ def _count(
 def _rates(counts: NDArray[np.float64], usual: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return frequencies of positive steps; ``counts`` has the kind of step and the value first."""
     rates = (counts[:, 1] + PULL_STEPS * usual) / (counts.sum(axis=1) + PULL_STEPS)
-    return np.round(np.clip(rates, MIN_RATE, 1.0 - MIN_RATE), 4)
+    kept = np.clip(rates, MIN_RATE, 1.0 - MIN_RATE)
+    # NumPy's function rounds some ties of decimal numbers the other way.
+    return np.array([round(rate, 4) for rate in kept.ravel().tolist()]).reshape(kept.shape)
