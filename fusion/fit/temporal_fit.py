@@ -230,7 +230,7 @@ def _chains(
     """
     mine = {edge.feature for edge in graph.edges if edge.cue == cue.name} - {PRESENCE}
     features = [name for name in graph.feature_names if name in mine]
-    ways = list(product((True, False), repeat=len(features)))
+    ways: list[tuple[bool | None, ...]] = list(product((True, False), repeat=len(features)))
     # Steps by kind, value, way (none, each combination, not known) and distance.
     counts = np.zeros((len(WHAT), 2, len(ways) + 2, len(EDGES_M) - 1))
     for drive, is_step in drives:
