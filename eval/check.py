@@ -7,8 +7,8 @@ against each other: a vehicle file and a truth against the log.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final
 
@@ -16,21 +16,26 @@ from crosscue.datasets.truth import truth as truth_file
 from crosscue.detectors.catalog.architectures import WEIGHTS_SUFFIXES
 from crosscue.detectors.catalog.cards import check_card
 from crosscue.eval.fit.truth_check import check_truth
-from crosscue.eval.logs.log import UnopenedLog
+from crosscue.eval.logs.log import UnopenedLog, vehicle_of
 from crosscue.eval.logs.seals import check_seal
 from crosscue.eval.pipeline.run import open_run
+from crosscue.eval.quality.checks import PURPOSES, Purpose
+from crosscue.eval.quality.spec import read_spec
+from crosscue.eval.quality.verdict import LogCheck, LogCheckSettings, check_log
+from crosscue.eval.report.junit import cases_text
 from crosscue.eval.runs.folder import MANIFEST
 from crosscue.eval.runs.logs import log_location
 from crosscue.eval.vehicle.drive_check import check_vehicle
 from crosscue.replay.errors import CrosscueError, LogError, UnknownFormatError, UsageError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import json_tree, toml_tree
-from crosscue.replay.formats import format_of
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, MIB, Limits, LimitsGiven
+from crosscue.replay.logs.opening import log_within
 from crosscue.replay.progress import emit
 from crosscue.replay.remote.address import is_remote
 from crosscue.replay.seal.seal import SUFFIX, seal_over
-from crosscue.replay.vehicle.vehicle import Vehicle, load
+from crosscue.replay.vehicle.vehicle import Vehicle, load, vehicle_given
 from crosscue.results import Listing, Result
 from crosscue.verb import Option
 
@@ -51,6 +56,7 @@ class Together:
         seconds: Number of seconds to examine.
         overwrite: True to replace an existing output.
         limits: Limits for reading logs.
+        drive: How a log is judged.
     """
 
     files: tuple[tuple[str, Kind], ...]
@@ -60,10 +66,15 @@ class Together:
     seconds: float
     overwrite: bool
     limits: Limits
+    drive: LogCheckSettings = field(default_factory=LogCheckSettings)
 
     def of_kind(self, *names: str) -> tuple[str, ...]:
         """Return the files of some kinds."""
         return tuple(file for file, kind in self.files if kind.name in names)
+
+    def has_others(self) -> bool:
+        """Return whether there are files that are compared with the logs."""
+        return bool(self.of_kind("vehicle file", "truth"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,20 +185,32 @@ def check(
     *files: Annotated[str | Path, Option(metavar="FILE")],
     picture: Path | str | None = None,
     output: Annotated[Path | str | None, Option(metavar="FILE")] = None,
+    purposes: Annotated[Sequence[Purpose], Option("--for")] = PURPOSES,
+    vehicle: Vehicle | Path | str | None = None,
+    spec: Annotated[Path | str | None, Option(metavar="FILE")] = None,
+    init: bool = False,
+    junit: Path | str | None = None,
     start_s: float = 0.0,
     seconds: Annotated[float, Option(metavar="S")] = 10.0,
     overwrite: bool = False,
     limits: LimitsGiven = DEFAULT_LIMITS,
 ) -> Checks:
-    """Check a vehicle file, truth, model, sealed log or run.
+    """Say whether a log is good enough; check a vehicle file, truth, model, seal or run.
+
+    A log is judged for each purpose: pose, cues, range and landmarks. A purpose is good, limited
+    (exit status 3), or not possible (1); the report says what is missing, slow, late, damaged or
+    wrong, and what would help. Logs that are named together are one drive. A sealed log is
+    compared with its seal, too.
 
     Each file is recognised by its content. Name the files of a drive together: a vehicle file is
     then checked on seconds of the log (its signals must not contradict each other), and truth must
     fit the log in its times, pictures and hash. A model is a card, the weights beside it, or a name
-    of the catalog; its network is run. A log is compared with its seal, and a run with its
-    checksums and its logs. The exit status is the highest of all files.
+    of the catalog; its network is run. A run is compared with its checksums and its logs. The exit
+    status is the highest of all files.
 
     Examples:
+        crosscue check drive.mcap --vehicle car.toml --for pose cues
+        crosscue check drive.mcap --spec fleet.toml --junit check.xml
         crosscue check car.toml drive.mcap -o check.html    signals, horizon, regions
         crosscue check truth.json drive.mcap
         crosscue check my.toml --picture street.jpg         a model card
@@ -197,16 +220,33 @@ def check(
         files: Files, folders, or names of models.
         picture: JPEG, PNG or WebP file that a network is run on.
         output: Page (.html) or picture of a vehicle file's check, or detections in --picture.
+        purposes: Purposes for which a log must do: pose, cues, range, landmarks (default: all).
+        vehicle: Vehicle file for a log's signals (default: the vehicle.toml beside it).
+        spec: Topics, rates, gaps and delays that must hold in a log (TOML).
+        init: Write --spec from the log, with margins.
+        junit: File for the results as JUnit XML, one test case for each check.
         start_s: Examine signals from this many seconds after the first message.
         seconds: Seconds of the log to examine.
-        overwrite: Replace an existing output.
+        overwrite: Replace an existing output or specification.
         limits: Limits for reading the logs.
 
     Raises:
         UsageError: A setting is out of range, or applies to none of the files.
+        OutputError: The JUnit file cannot be written.
     """
+    if unknown := [one for one in purposes if one not in PURPOSES]:
+        raise UsageError(f"purposes: {unknown[0]}: expected {', '.join(PURPOSES)}")
+    if init and spec is None:
+        raise UsageError("init: needs a file to write; name it with spec")
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise UsageError(f"seconds: {seconds:g}, expected more than 0")
+    drive = LogCheckSettings(
+        purposes,
+        vehicle_given(vehicle),
+        None if spec is None or init else read_spec(spec),
+        Path(spec) if spec is not None and init else None,
+        overwrite,
+    )
     kinds: dict[str, Kind | CrosscueError] = {}
     for file in map(str, files):
         try:
@@ -214,7 +254,10 @@ def check(
         except CrosscueError as error:
             kinds[file] = error
     known = tuple((file, kind) for file, kind in kinds.items() if isinstance(kind, Kind))
-    together = Together(known, picture, output, start_s, seconds, overwrite, limits)
+    together = Together(known, picture, output, start_s, seconds, overwrite, limits, drive)
+    if vehicle is None and (logs := together.of_kind("log")) and not together.has_others():
+        beside = vehicle_of(UnopenedLog(logs), None)
+        together = replace(together, drive=replace(drive, vehicle=beside))
     _check_settings(together)
     rows = []
     for file, kind in kinds.items():
@@ -224,7 +267,19 @@ def check(
             rows.append(_checked(file, kind, together))
         if rows and rows[-1].file == file and rows[-1].error is not None:
             emit(rows[-1].error)
+    if junit is not None:
+        cases = [case for row in rows for case in _cases(row)]
+        write_text(Path(junit), cases_text(cases, "crosscue check", "check"))
     return Checks(rows)
+
+
+def _cases(row: FileCheck) -> Iterator[tuple[str, str]]:
+    if isinstance(row.result, LogCheck):
+        yield from ((f"{row.file}: {name}", why) for name, why in row.result.cases())
+    else:
+        failed = row.exit_status != 0
+        why = str(row.error or "; ".join(row.result.lines() if row.result else ()))
+        yield f"{row.file}: {row.kind}", why if failed else ""
 
 
 def _checked(file: str, kind: Kind, together: Together) -> FileCheck:
@@ -255,9 +310,7 @@ def _check_settings(together: Together) -> None:
 
 def _is_only_compared(log: str, together: Together) -> bool:
     """Return whether a log is only what other files are compared with."""
-    return bool(together.of_kind("vehicle file", "truth")) and (
-        is_remote(log) or seal_over(Path(log)) is None
-    )
+    return together.has_others() and (is_remote(log) or seal_over(Path(log)) is None)
 
 
 def _kind_of(file: str) -> Kind:
@@ -293,7 +346,7 @@ def _tree_of(path: Path) -> Mapping[str, Any]:
 
 def _is_log(file: str, tree: Mapping[str, Any]) -> bool:
     try:
-        return is_remote(file) or bool(format_of(Path(file)))
+        return is_remote(file) or log_within(Path(file)).exists()
     except LogError:
         return False
 
@@ -316,6 +369,18 @@ def _is_vehicle(file: str, tree: Mapping[str, Any]) -> bool:
 
 def _check_seal(file: str, together: Together) -> Result:
     return check_seal(file.removesuffix(SUFFIX))
+
+
+def _check_drive(file: str, together: Together) -> Result:
+    """Judge the drive of all logs, in the row of the first; a log with others only by its seal."""
+    logs = together.of_kind("log")
+    sealed = None if is_remote(file) or seal_over(Path(file)) is None else check_seal(file)
+    if sealed is not None and (together.has_others() or not sealed.is_whole):
+        return sealed
+    if file != logs[0]:
+        return sealed or Sound(f"a log of the same drive as {logs[0]}")
+    found = check_log(UnopenedLog(logs, limits=together.limits), together.drive)
+    return replace(found, seal=sealed)
 
 
 def _check_run(file: str, together: Together) -> CheckedRun:
@@ -366,5 +431,5 @@ KINDS: Final = (
     Kind("model card", lambda file, tree: "weights" in tree, _check_model),
     Kind("model", _is_model, _check_model),
     Kind("vehicle file", _is_vehicle, _check_vehicle),
-    Kind("log", _is_log, _check_seal),
+    Kind("log", _is_log, _check_drive),
 )

@@ -105,7 +105,7 @@ MOVED: Final = {
     "vehicle check": "check V.toml LOG",
     "truth check": "check T.json LOG",
     "model check": "check MODEL",
-    "seal --check": "check LOG",
+    "seal --check": "check LOG.seal",
 }
 
 EXIT_STATUS: Final = """\

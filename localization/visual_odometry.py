@@ -62,6 +62,8 @@ DIRECTION_SD: Final = 0.01
 SLOPE_SD: Final = 0.004
 # Min shift from which the ground tells the pitch.
 LEAST_M: Final = 0.1
+# Min tangent of the angle from the direction of travel at which the scene's growth is measured.
+AWAY: Final = 0.05
 # S.d. of the direction of travel to either side, and of a corner that is followed, in pixels.
 ASIDE_SD: Final = 0.1
 FOLLOWED_PX: Final = 0.2
@@ -117,6 +119,8 @@ class VisualOdometry:
 
     Attributes:
         camera: Focal length, centre, height and mounting of the camera.
+        expansion: Median growth of the static scene in the last pair, in proportion to the distance
+            and without noise's bias at a standstill; NaN with few corners.
     """
 
     camera: Mounted
@@ -125,6 +129,7 @@ class VisualOdometry:
     _pitch_var: float = PITCH_SD**2
     _speed_mps: float = 0.0
     _seen_ns: int = -KEPT_NS
+    expansion: float = math.nan
 
     def __post_init__(self) -> None:
         self._pitch = self.camera.pitch_rad
@@ -162,25 +167,31 @@ class VisualOdometry:
             before.t_ns, now.t_ns, math.nan, math.nan, math.nan, math.nan, self._pitch, False,
             len(first), 0,
         )  # fmt: skip
+        self.expansion = math.nan
         if len(first) < MIN_CORNERS:
             return nothing
         moved_px = np.linalg.norm(second - first, axis=1)
-        if np.quantile(moved_px, 0.75) < STANDS_PX:
-            return nothing._replace(
-                distance_m=0.0,
-                distance_sd_m=STANDS_SD_M,
-                turn_rad=0.0,
-                turn_sd_rad=0.1 * TURN_SD_RAD,
-                is_standing=True,
-            )
+        is_standing = bool(np.quantile(moved_px, 0.75) < STANDS_PX)
+        standing = nothing._replace(
+            distance_m=0.0,
+            distance_sd_m=STANDS_SD_M,
+            turn_rad=0.0,
+            turn_sd_rad=0.1 * TURN_SD_RAD,
+            is_standing=True,
+        )
         if not math.isfinite(focal_px):
-            return nothing
+            return standing if is_standing else nothing
         to_body = [
             np.column_stack([(points - np.array(center_px)) / focal_px, np.ones(len(points))])
             @ BODY.T
             for points in (first, second)
         ]
+        ahead = self._attitude().T @ np.array([1.0, 0.0, 0.0])
+        if is_standing:
+            self.expansion = _expansion(to_body[0], to_body[1], ahead)
+            return standing
         rotation, direction = _rotation(to_body[0], to_body[1], focal_px, self._attitude())
+        self.expansion = _expansion(to_body[0] @ rotation.T, to_body[1], rotation @ ahead)
         self._pitch_var += PITCH_CHANGE_SD**2
         if direction is not None:
             self._learn_pitch(math.atan2(direction[2], direction[0]), DIRECTION_SD)
@@ -331,6 +342,17 @@ def _fitted(
         if np.linalg.norm(change) < 1e-7:
             break
     return rotation, rotation.T @ along
+
+
+def _expansion(first: Floats, second: Floats, ahead: Floats) -> float:
+    """Median growth of the rays' distances from the direction of travel; rotation is removed."""
+    center = ahead[1:] / ahead[0]
+    away = first[:, 1:] / first[:, :1] - center
+    moved = second[:, 1:] / second[:, :1] - center - away
+    far = np.linalg.norm(away, axis=1) > AWAY
+    if far.sum() < MIN_CORNERS:
+        return math.nan
+    return float(np.median((moved * away).sum(axis=1)[far] / (away**2).sum(axis=1)[far]))
 
 
 def _rotated(vector: Floats) -> Floats:

@@ -338,4 +338,4 @@ def write_truth(
         OutputError: The files cannot be written.
     """
     with open_log(log, limits) as opened:
-        return WrittenTruth(write_carried(opened.format, Path(log), Path(output)))
+        return WrittenTruth(write_carried(opened.format, Path(opened.path), Path(output)))

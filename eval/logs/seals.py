@@ -126,8 +126,8 @@ def seal(*logs: str | Path, overwrite: bool = False) -> Seals:
     ROS 1 bags, .db3, candump, ASC and TRC logs, videos and .npy data sets contain no checksum, so a
     flipped payload byte goes unnoticed. Seal a log once it is known to be good. Every later command
     verifies the parts of the log that it reads, and reports damaged byte ranges. A seal that no
-    longer matches its log is replaced only with --overwrite; run crosscue check LOG first, which
-    verifies the entire log. URLs cannot be sealed.
+    longer matches its log is replaced only with --overwrite; run crosscue check LOG.seal first,
+    which verifies the entire log. URLs cannot be sealed.
 
     Examples:
         crosscue seal drive.bag can0.log        writes drive.bag.seal and can0.log.seal

@@ -39,11 +39,13 @@ class DriveSummary(Result):
         logs: One summary per log.
         together: Comparison of the logs; None for a single log or a quick summary.
         timeline: Time segments of the drive; None for a quick summary.
+        camera_delay_s: Delay of the pictures' stamps that the vehicle file states.
     """
 
     logs: tuple[LogSummary, ...]
     together: Together | None
     timeline: Timeline | None = field(default=None, metadata=HIDDEN)
+    camera_delay_s: float = 0.0
 
     also: ClassVar = {"time": "time"}
 
@@ -76,6 +78,8 @@ class DriveSummary(Result):
             yield from _lines_together(self.together, width)
         if self.timeline is not None and self.has_gaps:
             yield from _segments(self.timeline, width)
+        if self.camera_delay_s:
+            yield f"pictures   stamped {self.camera_delay_s * 1e3:+.0f} ms late (camera.delay_s)"
 
 
 def info(
@@ -93,7 +97,7 @@ def info(
 
     Args:
         log: The drive.
-        vehicle: Vehicle file: topic of wheel speeds, to find gaps.
+        vehicle: Vehicle file: topic of wheel speeds, to find gaps, and delay of the pictures.
         quick: Print what the log declares, and whether its end is missing, without reading its
             messages.
     """
@@ -118,7 +122,8 @@ def summary_of(drive: Drive, *, quick: bool) -> DriveSummary:
         summarise_log(log, selection, watch.add) for log, watch in zip(logs, watches, strict=True)
     )
     timeline = timeline_from(watches, planned, vehicle)
-    return DriveSummary(found, common_span(found) if len(found) > 1 else None, timeline)
+    together = common_span(found) if len(found) > 1 else None
+    return DriveSummary(found, together, timeline, vehicle.camera.delay_s)
 
 
 def lines_of(summary: LogSummary, width: int) -> Iterator[str]:

@@ -13,13 +13,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 from crosscue.eval.runs.candidates import CandidateRow, candidate_lines, not_looked_lines
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest
+from crosscue.eval.runs.moments import span_ns
 from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.drives import PooledScores
 from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.runs import RunScored
+from crosscue.localization.camera_watch import steps_of, windows_of
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import spelled, strict_json
 from crosscue.replay.time.dates import is_date
@@ -44,6 +48,8 @@ POSE_FIGURES: Final = {
     "it if the filter is consistent.",
     "pose_major_axis.png": "Length of the 2-sigma ellipse against distance travelled.",
 }
+# Rows of the visual odometry over which its pitch is filtered.
+FILTERED: Final = 4
 # Max number of approaches with their own chart.
 BELIEFS: Final = 12
 
@@ -57,6 +63,8 @@ class _Run:
     candidates: Mapping[str, CandidateRow]
     ranged: Mapping[str, CandidateRow]
     skips: Sequence[str]
+    pitch: Sequence[str]
+    steps: Sequence[str]
     settings: str
     versions: str
 
@@ -239,6 +247,7 @@ def _run(run: RunFolder) -> _Run:
     scene = manifest.scene if isinstance(manifest, EstimateManifest) else None
     candidates, ranged = ({}, {}) if scene is None else (scene.candidates, scene.ranged)
     not_looked_for = {} if scene is None else scene.not_looked_for
+    pitch, steps = _pitch(run)
     return _Run(
         name=_name(run),
         path=spelled(str(run.path)),
@@ -247,9 +256,31 @@ def _run(run: RunFolder) -> _Run:
         candidates=candidates,
         ranged=ranged,
         skips=[*candidate_lines(candidates, ranged), *not_looked_lines(not_looked_for)],
+        pitch=pitch,
+        steps=steps,
         settings=strict_json(reported["settings"]),
         versions=strict_json({"versions": reported["versions"], "logs": reported["logs"]}),
     )
+
+
+def _pitch(run: RunFolder) -> tuple[list[str], list[str]]:
+    """Return the camera's pitch in every ten seconds, and its steps, where pictures show them."""
+    if not run.file("visual_odometry.parquet").exists():
+        return [], []
+    table = run.table("visual_odometry", ["t_ns", "pitch_rad", "is_standing"])
+    # The pitch is filtered, so that only every few rows are another measurement.
+    rows = [row for row in table.to_pylist() if not row["is_standing"]][::FILTERED]
+    t_ns = np.array([row["t_ns"] for row in rows], np.int64)
+    pitch = np.array([row["pitch_rad"] for row in rows], np.float64)
+    start_ns = span_ns(run)[0]
+    windows = [
+        f"{(one.start_ns - start_ns) * 1e-9:.0f} to {(one.end_ns - start_ns) * 1e-9:.0f} s: {one}"
+        for one in windows_of("pitch", t_ns, pitch)
+    ]
+    steps = [
+        f"{one} at {(one.t_ns - start_ns) * 1e-9:.0f} s" for one in steps_of("pitch", t_ns, pitch)
+    ]
+    return windows, steps
 
 
 def _name(run: RunFolder) -> str:

@@ -113,8 +113,8 @@ def check_drive_signals(logs: Sequence[Log], vehicle: Vehicle, selection: Select
     topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
     planned = plan(topics, vehicle)
     camera = chosen_camera(topics, vehicle)
-    samples = _samples(logs, vehicle, planned, selection)
-    rows, contradictions = _judged(samples, planned, vehicle)
+    samples = read_samples(logs, vehicle, planned, selection)
+    rows, contradictions = judge_signals(samples, planned, vehicle)
     picture = None
     if camera is not None:
         picture = _picture(logs[camera[0]], *camera, vehicle, selection)
@@ -130,10 +130,17 @@ def check_drive_signals(logs: Sequence[Log], vehicle: Vehicle, selection: Select
     return Checked(tuple(rows), missing, tuple(contradictions), picture)
 
 
-def _samples(
+def read_samples(
     logs: Sequence[Log], vehicle: Vehicle, planned: SignalPlan, selection: Selection
 ) -> dict[Signal, Samples]:
-    """Return all readings in order of time, by signal."""
+    """Return all readings in order of time, by signal.
+
+    Args:
+        logs: Open logs of one drive.
+        vehicle: The vehicle file.
+        planned: Topics of the signals.
+        selection: The part to read; its topics are ignored.
+    """
     ledgers = [Ledger(name_of(log)) for log in logs]
     extractors = [SampleExtractor(planned, vehicle, i, ledger) for i, ledger in enumerate(ledgers)]
     wanted = [
@@ -156,9 +163,14 @@ def _samples(
     }
 
 
-def _judged(
+def judge_signals(
     samples: Mapping[Signal, Samples], planned: SignalPlan, vehicle: Vehicle
 ) -> tuple[list[SignalRow], list[str]]:
+    """Compare the signals with each other.
+
+    Returns:
+        A row for each signal, and the contradictions in sentences.
+    """
     times = [one.t_ns for one in samples.values() if len(one.t_ns)]
     if not times:
         return [], []

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -24,6 +24,7 @@ from crosscue.replay.clocks.reports import ClockReport, ClockWatch
 from crosscue.replay.columns import Block, CanFrames, Messages, Topic
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Detail, Ledger, TopicAccount
+from crosscue.replay.logs.copies import copies
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.seal.log import sealed_sentence
 from crosscue.replay.vehicle.roles import Role, role_of
@@ -73,6 +74,7 @@ class TopicSummary:
         clocks: Clocks of the topic, or None where no row was read.
         can_ids: Most frequent identifiers of a CAN bus.
         can_id_count: Number of different identifiers on a CAN bus.
+        duplicates: Number of rows with the stamp and the content of the row before.
     """
 
     name: str
@@ -89,6 +91,7 @@ class TopicSummary:
     clocks: ClockReport | None
     can_ids: tuple[CanIdCount, ...]
     can_id_count: int
+    duplicates: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +174,7 @@ def quick_summary(log: Log) -> LogSummary:
     for topic in log.topics:
         ledger.declare(topic.name, topic.declared)
     report_missing(log, ledger)
-    return _summary(log, ledger, ClockWatch(), {}, is_quick=True)
+    return _summary(log, ledger, ClockWatch(), {}, Counter(), is_quick=True)
 
 
 def summarise_log(
@@ -187,13 +190,15 @@ def summarise_log(
         watch: Called with each block as it is read.
     """
     ledger, clocks, can_ids = Ledger(name_of(log)), ClockWatch(), dict[str, _CanIds]()
+    duplicates: Counter[str] = Counter()
     blocks = _watched(ledger.handing_on(log.read(ledger, selection)), log, ledger, watch)
     for block in _decoded(log, blocks, ledger):
         clocks.see(block)
+        duplicates[block.topic] += copies(block)
         if isinstance(block.rows, CanFrames):
             can_ids.setdefault(block.topic, _CanIds()).see(block.rows)
     ledger.check()
-    return _summary(log, ledger, clocks, can_ids, is_quick=False)
+    return _summary(log, ledger, clocks, can_ids, duplicates, is_quick=False)
 
 
 def _watched(
@@ -270,12 +275,16 @@ def _summary(
     ledger: Ledger,
     clocks: ClockWatch,
     can_ids: Mapping[str, _CanIds],
+    duplicates: Mapping[str, int],
     *,
     is_quick: bool,
 ) -> LogSummary:
     reports = clocks.reports()
     topics = tuple(
-        _topic_summary(topic, ledger.topic(topic.name), reports.get(topic.name), can_ids)
+        replace(
+            _topic_summary(topic, ledger.topic(topic.name), reports.get(topic.name), can_ids),
+            duplicates=duplicates.get(topic.name, 0),
+        )
         for topic in sorted(log.topics, key=lambda t: t.name)
     )
     log_clocks = [r.log for r in reports.values() if r.log.rows]
@@ -344,6 +353,13 @@ def _of_account(topics: Iterable[TopicSummary], *, is_quick: bool) -> Iterator[s
             at_least = "at least " if topic.dropped_unknown else ""
             why = ", ".join(dict.fromkeys([*topic.dropped, *topic.dropped_unknown]))
             yield f"{topic.name}: {at_least}{count} of {topic.found + count} rows dropped: {why}"
+        if topic.duplicates:
+            rows = (
+                "1 row is an exact copy"
+                if topic.duplicates == 1
+                else (f"{topic.duplicates} rows are exact copies")
+            )
+            yield f"{topic.name}: {rows} of the row before: same stamp, same content"
         if topic.used == 0 and topic.found:
             why = ", ".join(topic.skipped)
             yield f"{topic.name}: none of its {topic.found} rows can be used: {why}"

@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
-from typing import cast
+from typing import Final, cast
 
 from crosscue.replay.base import Log, name_of
-from crosscue.replay.errors import CrosscueError, LogError, MissingTopicError
+from crosscue.replay.errors import CrosscueError, LogError, MissingTopicError, UnknownFormatError
 from crosscue.replay.files.identity import link_of_log
 from crosscue.replay.formats import FORMATS, format_of, known_formats
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
+
+# Folders that are searched below one that is not a log, and logs that an error names.
+DEPTH: Final = 4
+MAX_NAMED: Final = 3
 
 
 def open_log(path: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:
@@ -33,8 +38,43 @@ def open_log(path: Path | str, limits: Limits = DEFAULT_LIMITS) -> Log:
         return open_remote(path, lambda fetched: open_log(fetched, limits), limits)
     from crosscue.replay.seal.log import with_seal
 
-    place = Path(path)
+    place = log_within(Path(path))
     return with_seal(place, lambda: open_unsealed(place, limits))
+
+
+def log_within(path: Path) -> Path:
+    """Return a log, or the only log in the folders below: a data set is one folder or several.
+
+    Raises:
+        UnknownFormatError: It contains no log, or several, which the message names.
+        LogError: It does not exist, or may not be read.
+    """
+    try:
+        format_of(path)
+    except UnknownFormatError:
+        found = [*islice(_logs_below(path, DEPTH), MAX_NAMED + 1)] if path.is_dir() else []
+        if not found:
+            raise
+        if len(found) > 1:
+            named = ", ".join(str(one) for one in found[:MAX_NAMED])
+            more = ", ..." if len(found) > MAX_NAMED else ""
+            raise UnknownFormatError(
+                f"{path}: a folder of several logs; did you mean one of {named}{more}?"
+            ) from None
+        return found[0]
+    return path
+
+
+def _logs_below(folder: Path, depth: int) -> Iterator[Path]:
+    """Yield the logs in the folders below, without following links."""
+    for entry in sorted(folder.iterdir()) if depth else ():
+        if entry.name.startswith(".") or entry.is_symlink() or not entry.is_dir():
+            continue
+        try:
+            format_of(entry)
+            yield entry
+        except UnknownFormatError:
+            yield from _logs_below(entry, depth - 1)
 
 
 def open_unsealed(path: Path, limits: Limits = DEFAULT_LIMITS) -> Log:

@@ -234,7 +234,7 @@ def write_seal(log: Path, seal: Seal, *, overwrite: bool) -> bool:
             return False
         raise OutputError(
             f"{path}: the log differs from its seal of {kept.sealed_at}; see "
-            f"'crosscue check {log}', and use --overwrite only if the log is correct"
+            f"'crosscue check {log}{SUFFIX}', and use --overwrite only if the log is correct"
         )
     from crosscue.replay.files.whole_file import write_text
 

@@ -113,7 +113,8 @@ class SampleExtractor:
                 yield from self._can_signals(source)(block)
             return
         if isinstance(block.rows, Images):
-            self._show(block, block.rows)
+            delay_ns = round(self.vehicle.camera.delay_s * 1e9)
+            self._show(replace(block, log_ns=block.log_ns - delay_ns), block.rows)
         for signal in source.signals:
             if signal not in MOBILEYE_SIGNALS:
                 yield from FROM_TABLE[signal](block, self.ledger)

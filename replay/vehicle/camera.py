@@ -42,6 +42,9 @@ class Camera(Section):
     pitch_sd_rad: NotNegative = 0.01
     """Standard deviation of the pitch in a frame: a vehicle pitches by about half a degree when it
     brakes."""
+    delay_s: Annotated[Finite, Field(ge=-5.0, le=5.0)] = 0.0
+    """Delay of the pictures' time stamps relative to those of the vehicle's signals; it is
+    subtracted. ``vehicle init`` estimates it."""
     depth_bits: Annotated[int, Field(ge=8, le=16)] = 16
     """Number of bits used in 16-bit images; 12 for many cameras."""
 

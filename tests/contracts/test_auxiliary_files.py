@@ -142,6 +142,8 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("truth import", "--vehicle"): ("{coco} --log {log} -o {out}.json --vehicle {gone}", SETTINGS),
     ("model init", "--class-names"): ("{onnx} -o {there}/new.toml --class-names {gone}", SETTINGS),
     ("model init", "--picture"): ("{onnx} -o {there}/new.toml --picture {gone}", INPUT),
+    ("check", "--vehicle"): ("{log} --vehicle {gone}", SETTINGS),
+    ("check", "--spec"): ("{log} --spec {gone}", SETTINGS),
     ("check", "--picture"): ("{card} --picture {gone} -o {out}.jpg", INPUT),
     ("model fetch", "--from"): ("yolox-nano --from {gone}", SETTINGS),
     ("fetch", "--data"): ("pandaset_002 --data {gone} -o {out}", INPUT),

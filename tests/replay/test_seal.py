@@ -83,7 +83,7 @@ def test_unchanged_sealed_log_is_complete(tmp_path: Path, kind: str) -> None:
     assert "sealed at" in ledger.integrity
     assert "none differs" in ledger.integrity
     assert [len(block) for block in after] == [len(block) for block in before]
-    assert run(["check", str(log)]) == 0
+    assert run(["check", f"{log}.seal"]) == 0
 
 
 @pytest.mark.slow
@@ -107,7 +107,7 @@ def test_changed_byte_is_reported_with_its_block(
     status = run(["info", str(log)])
     assert status in (3, 4)
     assert "the seal" in "".join(capsys.readouterr()) or status == 4
-    assert run(["check", str(log)]) == 3
+    assert run(["check", f"{log}.seal"]) == 3
     assert f"{name}: bytes 0 to {size} differ from the seal" in capsys.readouterr().out
 
 
@@ -142,7 +142,7 @@ def test_seal_of_changed_log_is_replaced_only_with_overwrite(
     assert seal_path(long_log).read_bytes() == before
 
     assert run(["seal", "--overwrite", str(long_log)]) == 0
-    assert run(["check", str(long_log)]) == 0
+    assert run(["check", f"{long_log}.seal"]) == 0
 
 
 @pytest.mark.parametrize("suffix", ["-wal", "-journal"])
@@ -155,7 +155,7 @@ def test_journal_of_sqlite_log_is_sealed(
     assert run(["seal", str(log)]) == 0
     assert set(read_seal(seal_path(log)).files) == {".", journal.name}
     _flip(journal, 30)
-    assert run(["check", str(log)]) == 3
+    assert run(["check", f"{log}.seal"]) == 3
     assert f"{journal.name}: bytes 0 to 100 differ from the seal" in capsys.readouterr().out
 
 
@@ -200,8 +200,8 @@ def test_damaged_seal_is_refused_in_one_line(
     log = EVERY_FORMAT["candump"](tmp_path)
     seal_path(log).write_bytes(content)
 
-    for command in (["info"], ["check"]):
-        assert run([*command, str(log)]) == 4
+    for argv in (["info", str(log)], ["check", f"{log}.seal"]):
+        assert run(argv) == 4
         reported = capsys.readouterr().err
         assert why in reported
         assert reported.count("\n") == 1
@@ -230,7 +230,7 @@ def test_seal_of_invalid_log_is_refused(
 def test_check_of_log_without_seal_fails(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(["check", str(EVERY_FORMAT["asc"](tmp_path))]) == 1
+    assert run(["check", f"{EVERY_FORMAT['asc'](tmp_path)}.seal"]) == 1
     assert "not sealed" in capsys.readouterr().err
 
 
@@ -260,7 +260,7 @@ def test_file_of_sealed_folder_is_checked_against_folder_seal(
 
     _flip(database, database.stat().st_size - 5)
     assert f"{database.name}: bytes 0 to {database.stat().st_size}" in _losses_text(database)
-    assert run(["check", str(database)]) == 3
+    assert run(["check", f"{database}.seal"]) == 3
     # Read as a part of its folder, it is reported once.
     details = [drop.detail for drop in read(place)[1].drops() if drop.reason == DIFFERS]
     assert details == [f"{database.name}: bytes 0 to {database.stat().st_size}"]
@@ -292,7 +292,7 @@ def test_interrupted_seal_leaves_files_unchanged(
             yield digest
 
     monkeypatch.setattr(sealing, "digests_of", interrupted)
-    for argv in (["seal", "--overwrite", str(long_log)], ["check", str(long_log)]):
+    for argv in (["seal", "--overwrite", str(long_log)], ["check", f"{long_log}.seal"]):
         hashed = 0
         assert run(argv) == 130
         assert "Traceback" not in capsys.readouterr().err

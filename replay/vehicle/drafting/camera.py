@@ -23,10 +23,11 @@ class Intrinsics(NamedTuple):
 
 
 class MountingParameter(NamedTuple):
-    """A parameter of the mounting, and its source."""
+    """A parameter of the camera, its source, and whether it differs from the default."""
 
     value: float
     source: str
+    is_set: bool = True
 
 
 class CameraMounting(NamedTuple):
@@ -38,6 +39,8 @@ class CameraMounting(NamedTuple):
         z_m: Height above the road.
         pitch_rad: Angle of the optical axis below the horizon.
         yaw_rad: Angle of the optical axis to the left.
+        focal_px: Focal length, where the log publishes none.
+        delay_s: Delay of the pictures' time stamps.
         notes: Remarks on known or unknown parameters, one sentence each.
     """
 
@@ -46,6 +49,8 @@ class CameraMounting(NamedTuple):
     z_m: MountingParameter | None = None
     pitch_rad: MountingParameter | None = None
     yaw_rad: MountingParameter | None = None
+    focal_px: MountingParameter | None = None
+    delay_s: MountingParameter | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -65,7 +70,8 @@ class KnowsItsCameras(Protocol):
 MEASURE: Final = {
     "x_m": "ahead of the rear axle: measure it, then pass --camera-x-m",
     "y_m": "left of the car's middle: measure it, then pass --camera-y-m",
-    "z_m": "above the road: measure it, then pass --camera-height-m",
+    "z_m": "above the road: measure it, then pass --camera-height-m; or a drive on a textured road "
+    "with images, speed and focal_px",
     "yaw_rad": "to the left: estimated as pitch_rad is, or pass --camera-yaw-deg",
     "pitch_rad": "below the horizon: estimated from a drive with images, speed and focal_px, or "
     "pass --camera-pitch-deg",
@@ -97,7 +103,9 @@ def camera_lines(logs: Sequence[Log], mounting: CameraMounting) -> Iterator[str]
         return
     _, _, found = camera
     yield "[camera]"
-    if found is None:
+    if found is None and mounting.focal_px is not None:
+        yield f"focal_px = {mounting.focal_px.value:.5g}  # {mounting.focal_px.source}"
+    elif found is None:
         yield "# No calibration in the log; without it there are no ranges from motion."
         yield "# focal_px = 1000.0"
         yield "# center_px = [640.0, 360.0]"
@@ -118,6 +126,9 @@ def camera_lines(logs: Sequence[Log], mounting: CameraMounting) -> Iterator[str]
             yield f"# {name} = {default}  # {MEASURE[name]}"
         else:
             yield f"{name} = {given.value:.5g}  # {given.source}"
+    if mounting.delay_s is not None:
+        mark = "" if mounting.delay_s.is_set else "# "
+        yield f"{mark}delay_s = {mounting.delay_s.value:.3f}  # {mounting.delay_s.source}"
     yield from (f"# {note}" for note in mounting.notes)
     yield ""
 

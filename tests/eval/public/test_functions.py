@@ -32,7 +32,7 @@ def test_seal_check_finds_changed_log(drive: Path, tmp_path: Path) -> None:
     content = bytearray(drive.read_bytes())
     content[100] ^= 1
     logs[1].write_bytes(content)
-    checked = crosscue.check(*logs)
+    checked = crosscue.check(*(f"{log}.seal" for log in logs))
 
     assert [one.exit_status for one in checked] == [0, 3]
     assert repr(checked[1].result) == (

@@ -1,0 +1,135 @@
+"""Checks that need pictures of a scene: delay, sign, standstill, and a camera that moves."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from crosscue.eval.quality.drive import QualityDrive
+from crosscue.eval.quality.verdict import judge
+from crosscue.localization.camera_watch import steps_of, windows_of
+from crosscue.replay.columns import Bytes, Floats
+from crosscue.replay.vehicle.vehicle import Vehicle
+from support.plane_pictures import CAMERA, picture
+from support.quality_logs import Stream, Streams, examined
+
+HZ = 8.0
+CAR = Vehicle(version=1, camera=CAMERA, start={"x_m": 0.0})  # type: ignore[arg-type]
+
+
+@cache
+def scenes(kind: str) -> tuple[Floats, Floats, Floats, Bytes]:
+    """Times, speed, yaw rate and pictures of a drive between walls."""
+    t_s = np.arange(0.0, 5.0, 1.0 / HZ)
+    fine_s = np.arange(0.0, 5.0, 0.005)
+    speed = np.full(len(fine_s), 5.0)
+    rate = np.zeros(len(fine_s))
+    if kind == "turn":
+        rate = 0.25 * np.sin(1.6 * fine_s)
+    if kind == "stop":
+        speed = np.clip(3.0 * np.abs(fine_s - 2.5) - 2.0, 0.0, 5.0)
+    heading = np.cumsum(rate) * 0.005
+    x, y = (np.cumsum(speed * f(heading)) * 0.005 for f in (np.cos, np.sin))
+    poses = [np.interp(t_s, fine_s, one) for one in (x, y, heading)]
+    shown = np.stack([picture(*map(float, pose)) for pose in zip(*poses, strict=True)])
+    return fine_s, speed, rate, shown
+
+
+def drive_of(
+    kind: str, *, late_s: float = 0.0, sign: float = 1.0, gain: float = 1.0
+) -> QualityDrive:
+    """The drive as logged, with pictures late, and a wrong sign or unit."""
+    fine_s, speed, rate, shown = scenes(kind)
+    noise = np.random.default_rng(1).normal(size=(2, len(fine_s)))
+    speeds = gain * speed + 0.01 * noise[0] * (speed > 0.0)
+    names = ("front_left_mps", "front_right_mps", "rear_left_mps", "rear_right_mps")
+    streams: Streams = {
+        "wheels": Stream(fine_s[::4], dict.fromkeys(names, speeds[::4])),
+        "gyro": Stream(fine_s[::2], {"gyro_z_radps": (sign * rate + 0.001 * noise[1])[::2]}),
+        "camera": Stream(np.arange(0.0, 5.0, 1.0 / HZ) + late_s, pictures=shown),
+    }
+    return examined(streams, CAR)
+
+
+def found_by(drive: QualityDrive) -> dict[str, str]:
+    """Findings by check, without those of the missing GNSS."""
+    return {one.check: one.text for one in judge(drive)}
+
+
+def test_pictures_of_a_sound_drive_are_not_blamed() -> None:
+    assert found_by(drive_of("turn")) == {}
+
+
+@pytest.mark.parametrize("late_s", [-0.15, 0.2])
+def test_late_pictures_are_found_with_the_delay_to_set(late_s: float) -> None:
+    drive = drive_of("turn", late_s=late_s)
+
+    assert "camera delay" in found_by(drive)
+    assert drive.delays[0].delay_s == pytest.approx(late_s, abs=0.02)
+    (advice,) = [one.help for one in judge(drive) if one.check == "camera delay"]
+    assert float(advice.rpartition(" ")[2]) == pytest.approx(late_s, abs=0.02)
+
+
+def test_yaw_rate_of_the_other_sign_than_the_pictures_is_found() -> None:
+    assert "other side than the pictures" in found_by(drive_of("turn", sign=-1.0))["camera delay"]
+
+
+def test_speed_that_is_not_that_of_the_pictures_is_found() -> None:
+    assert "above the road" in found_by(drive_of("turn", gain=3.6))["mounting"]
+
+
+def test_standing_pictures_of_a_moving_car_are_found() -> None:
+    fine_s, speed, rate, shown = scenes("stop")
+    still = np.repeat(shown[:1], len(shown), axis=0).copy()
+    still[:, 0, 0] = np.arange(len(still))
+    names = ("front_left_mps", "front_right_mps", "rear_left_mps", "rear_right_mps")
+    noise = 0.01 * np.random.default_rng(2).normal(size=len(fine_s))
+    streams: Streams = {
+        "wheels": Stream(fine_s[::4], dict.fromkeys(names, (5.0 + noise)[::4])),
+        "gyro": Stream(fine_s[::2], {"gyro_z_radps": (rate + 0.1 * noise)[::2]}),
+        "camera": Stream(np.arange(0.0, 5.0, 1.0 / HZ), pictures=still),
+    }
+    assert speed.min() == 0.0
+    assert "stands in" in found_by(examined(streams, CAR))["standstill"]
+
+
+def measured(seed: int, step_rad: float, seconds: float = 40.0) -> tuple[Floats, Floats]:
+    """Direction of travel at 8 Hz, with errors as on real roads, and a step at 20 s."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(0.0, seconds, 1.0 / 8.0)
+    slow = np.convolve(rng.normal(size=len(t_s) + 7), np.ones(8) / 8.0**0.5, "valid")
+    angle = 0.02 + np.radians(0.15) * rng.normal(size=len(t_s)) + np.radians(0.05) * slow
+    return t_s, angle + step_rad * (t_s >= 20.0)
+
+
+@pytest.mark.parametrize("value", ["pitch", "yaw"])
+@pytest.mark.parametrize("step_deg", [0.5, -0.5])
+def test_step_of_half_a_degree_is_found_within_ten_seconds(value: str, step_deg: float) -> None:
+    for seed in range(20):
+        t_s, angle = measured(seed, math.radians(step_deg), 30.0)
+        t_ns = np.round(t_s * 1e9).astype(np.int64)
+
+        (step,) = steps_of(value, t_ns, angle)
+
+        assert step.t_ns * 1e-9 == pytest.approx(20.0, abs=2.0)
+        assert abs(step.by - math.radians(step_deg)) < 4.0 * step.sd
+
+
+def test_no_step_is_reported_where_there_is_none() -> None:
+    for seed in range(60):
+        t_s, angle = measured(seed, 0.0)
+        assert steps_of("pitch", np.round(t_s * 1e9).astype(np.int64), angle) == []
+
+
+def test_windows_of_ten_seconds_have_intervals_that_hold_the_truth() -> None:
+    inside = []
+    for seed in range(40):
+        t_s, angle = measured(seed, 0.0)
+        windows = windows_of("pitch", np.round(t_s * 1e9).astype(np.int64), angle)
+        assert len(windows) == 4
+        inside += [abs(one.mean - 0.02) < 1.96 * one.sd for one in windows]
+
+    assert np.mean(inside) > 0.93

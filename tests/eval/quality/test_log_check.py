@@ -1,0 +1,317 @@
+"""``crosscue check LOG``: awkward logs are found out, good logs are not blamed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from crosscue.eval.quality.checks import CHECKS, PURPOSES
+from crosscue.eval.quality.verdict import judge
+from crosscue.replay.columns import Floats
+from crosscue.replay.vehicle.vehicle import Vehicle, parse
+from support.quality_logs import CAR, Drive, Stream, Streams, examined, streams_of
+
+Fault = Callable[[Streams], None]
+Mask = NDArray[np.bool_]
+
+
+def without(name: str) -> Fault:
+    """Leave out a topic."""
+
+    def change(streams: Streams) -> None:
+        del streams[name]
+
+    return change
+
+
+def rows(name: str, keep: Callable[[Floats], Mask]) -> Fault:
+    """Keep the rows of a topic whose times fulfil a condition."""
+
+    def change(streams: Streams) -> None:
+        streams[name] = streams[name].take(np.flatnonzero(keep(streams[name].t_s)))
+
+    return change
+
+
+def thinned(name: str, step: int, since_s: float = 0.0) -> Fault:
+    """Keep every n-th row of a topic, from a time on."""
+
+    def change(streams: Streams) -> None:
+        t_s = streams[name].t_s
+        keep = (t_s < since_s) | (np.arange(len(t_s)) % step == 0)
+        streams[name] = streams[name].take(np.flatnonzero(keep))
+
+    return change
+
+
+def column(name: str, column: str, edit: Callable[[Floats, Floats], Floats]) -> Fault:
+    """Change a column by its times and values; ``*`` is every column of wheels."""
+
+    def change(streams: Streams) -> None:
+        stream = streams[name]
+        for one in stream.columns if column == "*" else (column,):
+            stream = stream.with_column(one, edit(stream.t_s, stream.columns[one]))
+        streams[name] = stream
+
+    return change
+
+
+def late(name: str, by_s: float) -> Fault:
+    """Move the time stamps of a topic."""
+
+    def change(streams: Streams) -> None:
+        stream = streams[name]
+        moved = None if stream.header_s is None else stream.header_s + by_s
+        streams[name] = replace(stream, t_s=stream.t_s + by_s, header_s=moved)
+
+    return change
+
+
+def stamps(name: str, edit: Callable[[Floats], Floats]) -> Fault:
+    """Change the sensor's stamps of a topic."""
+
+    def change(streams: Streams) -> None:
+        streams[name] = replace(streams[name], header_s=edit(streams[name].t_s))
+
+    return change
+
+
+def pictures(since_s: float, edit: Callable[[Stream, int], None]) -> Fault:
+    """Change the pictures from a time on."""
+
+    def change(streams: Streams) -> None:
+        camera = streams["camera"]
+        for i in np.flatnonzero(camera.t_s >= since_s).tolist():
+            edit(camera, i)
+
+    return change
+
+
+def painted(value: int) -> Callable[[Stream, int], None]:
+    """Paint a picture in one brightness."""
+
+    def edit(camera: Stream, i: int) -> None:
+        assert camera.pictures is not None
+        camera.pictures[i] = value
+
+    return edit
+
+
+def repeated(camera: Stream, i: int) -> None:
+    """Show the picture before once more."""
+    assert camera.pictures is not None
+    camera.pictures[i] = camera.pictures[i - 1]
+
+
+def swapped(streams: Streams) -> None:
+    """Exchange the rear wheels."""
+    wheels = streams["wheels"]
+    columns = {**wheels.columns}
+    columns["rear_left_mps"], columns["rear_right_mps"] = (
+        columns["rear_right_mps"],
+        columns["rear_left_mps"],
+    )
+    streams["wheels"] = replace(wheels, columns=columns)
+
+
+def twice(name: str) -> Fault:
+    """Store each row twice."""
+
+    def change(streams: Streams) -> None:
+        streams[name] = streams[name].take(np.repeat(np.arange(len(streams[name].t_s)), 2))
+
+    return change
+
+
+def clock_set_back(streams: Streams) -> None:
+    """Set the stamps of the gyro back in the middle of the drive."""
+    stream = streams["gyro"]
+    header_s = stream.t_s - np.where(stream.t_s > 12.0, 3.0, 0.0)
+    streams["gyro"] = replace(stream, header_s=header_s)
+
+
+def still_camera(streams: Streams) -> None:
+    """Show one picture throughout."""
+    pictures = streams["camera"].pictures
+    assert pictures is not None
+    pictures[:] = pictures[0]
+
+
+def in_middle(t_s: Floats, since_s: float = 5.0, until_s: float = 9.0) -> Mask:
+    """Whether times are in a part of the drive."""
+    return (t_s > since_s) & (t_s < until_s)
+
+
+def frozen(t_s: Floats, values: Floats) -> Floats:
+    """The same value for four seconds of motion."""
+    return np.where(in_middle(t_s), values[np.argmax(in_middle(t_s))], values)
+
+
+def spiked(by: float) -> Callable[[Floats, Floats], Floats]:
+    """One reading that no car can produce."""
+    return lambda t_s, values: values + by * (np.arange(len(values)) == len(values) // 3)
+
+
+def lost(t_s: Floats, values: Floats) -> Floats:
+    """Not a number in every tenth reading."""
+    return np.where(np.arange(len(values)) % 10 == 0, np.nan, values)
+
+
+NO_FOCAL: Final = parse("version = 1\n[start]\nx_m = 0.0\n", "test")
+NO_START: Final = parse("version = 1\n[camera]\nfocal_px = 40.0\n", "test")
+SMALLER: Final = parse(
+    "version = 1\n[camera]\nfocal_px = 40.0\nsize_px = [24, 18]\n[start]\nx_m = 0.0\n", "test"
+)
+TWO: Final = parse('version = 1\n[topics]\nimu = "other"\n', "test")
+
+# Name, check that must find it, fault, vehicle file.
+AWKWARD: Final[tuple[tuple[str, str, Fault, Vehicle], ...]] = (
+    ("no wheels", "speed", without("wheels"), CAR),
+    ("no gyro and one wheel for both", "turning", lambda s: _one_wheel(s), CAR),
+    ("no GNSS", "position", without("gnss"), NO_START),
+    ("no camera", "camera", without("camera"), CAR),
+    ("no focal length", "calibration", lambda s: None, NO_FOCAL),
+    ("focal length of another size", "calibration", lambda s: None, SMALLER),
+    ("a named topic is missing", "topics", lambda s: None, TWO),
+    ("wheels at a quarter of the rate", "rate", thinned("wheels", 5), CAR),
+    ("gyro at 4 Hz", "rate", thinned("gyro", 12), CAR),
+    ("camera at half the rate", "rate", thinned("camera", 2), CAR),
+    ("GNSS every four seconds", "rate", thinned("gnss", 8), CAR),
+    ("wheels halved from the middle on", "rate", thinned("wheels", 2, 15.0), CAR),
+    ("gyro halved from the middle on", "rate", thinned("gyro", 2, 15.0), CAR),
+    ("camera dropped to a third", "rate", thinned("camera", 3, 15.0), CAR),
+    ("gap of the wheels", "gaps", rows("wheels", lambda t: ~in_middle(t, 5.0, 6.0)), CAR),
+    ("gap of the gyro", "gaps", rows("gyro", lambda t: ~in_middle(t, 5.0, 6.0)), CAR),
+    ("gap of the camera", "gaps", rows("camera", lambda t: ~in_middle(t, 5.0, 7.0)), CAR),
+    ("gap of GNSS", "gaps", rows("gnss", lambda t: ~in_middle(t, 5.0, 11.0)), CAR),
+    ("wheels begin late", "gaps", rows("wheels", lambda t: t > 5.0), CAR),
+    ("camera ends early", "gaps", rows("camera", lambda t: t < 18.0), CAR),
+    ("gyro stamps 0.4 s ahead", "clocks", stamps("gyro", lambda t: t + 0.4), CAR),
+    ("gyro stamps drift", "clocks", stamps("gyro", lambda t: t * 1.003), CAR),
+    ("gyro stamps do not move", "clocks", stamps("gyro", lambda t: 0.0 * t + 1.0), CAR),
+    ("gyro stamps set back", "clocks", clock_set_back, CAR),
+    ("gyro 0.35 s late", "lag", late("gyro", 0.35), CAR),
+    ("wheels 0.5 s late", "lag", late("wheels", 0.5), CAR),
+    ("all wheels frozen", "frozen", column("wheels", "*", frozen), CAR),
+    ("rear left wheel frozen", "frozen", column("wheels", "rear_left_mps", frozen), CAR),
+    ("gyro frozen", "frozen", column("gyro", "gyro_z_radps", frozen), CAR),
+    ("position frozen", "frozen", column("gnss", "latitude_deg", frozen), CAR),
+    ("wheels not numbers", "invalid", column("wheels", "rear_left_mps", lost), CAR),
+    ("gyro not numbers", "invalid", column("gyro", "gyro_z_radps", lost), CAR),
+    ("a spike of the speed", "jumps", column("wheels", "*", spiked(30.0)), CAR),
+    ("a spike of the gyro", "jumps", column("gyro", "gyro_z_radps", spiked(3.0)), CAR),
+    ("position jumps", "jumps", column("gnss", "latitude_deg", spiked(0.01)), CAR),
+    ("position at zero", "jumps", column("gnss", "*", lambda t, v: 0.0 * v), CAR),
+    ("rear wheels swapped", "agreement", swapped, CAR),
+    (
+        "yaw rate of the wrong sign",
+        "agreement",
+        column("gyro", "gyro_z_radps", lambda t, v: -v),
+        CAR,
+    ),
+    (
+        "yaw rate in degrees",
+        "agreement",
+        column("gyro", "gyro_z_radps", lambda t, v: 57.3 * v),
+        CAR,
+    ),
+    ("speed in km/h", "agreement", column("wheels", "*", lambda t, v: 3.6 * v), CAR),
+    ("a wheel in km/h", "agreement", column("wheels", "rear_left_mps", lambda t, v: 3.6 * v), CAR),
+    (
+        "gyro with a large bias",
+        "agreement",
+        column("gyro", "gyro_z_radps", lambda t, v: v + 0.1),
+        CAR,
+    ),
+    ("black pictures", "pictures", pictures(12.0, painted(0)), CAR),
+    ("white pictures", "pictures", pictures(12.0, painted(255)), CAR),
+    ("grey pictures", "pictures", pictures(12.0, painted(90)), CAR),
+    ("repeated pictures", "pictures", pictures(15.0, repeated), CAR),
+    ("one picture throughout", "pictures", still_camera, CAR),
+    ("wheels stored twice", "duplicates", twice("wheels"), CAR),
+    ("pictures stored twice", "duplicates", twice("camera"), CAR),
+    ("two seconds", "length", lambda s: _cut(s, 2.0), CAR),
+)
+
+
+def _one_wheel(streams: Streams) -> None:
+    without("gyro")(streams)
+    wheels = streams["wheels"]
+    columns = {**wheels.columns, "rear_right_mps": wheels.columns["rear_left_mps"]}
+    streams["wheels"] = replace(wheels, columns=columns)
+
+
+def _cut(streams: Streams, seconds: float) -> None:
+    for name in streams:
+        rows(name, lambda t: t < seconds)(streams)
+
+
+GOOD: Final = (
+    *(Drive(seed=seed) for seed in range(6)),
+    *(Drive(seed=10 + seed, stops=False) for seed in range(4)),
+    *(Drive(seed=20 + seed, turn_rad=0.0) for seed in range(3)),
+    *(Drive(seed=30 + seed, turn_rad=0.0, stops=False) for seed in range(3)),
+    *(Drive(seed=40 + seed, turn_rad=-1.5) for seed in range(3)),
+    Drive(seed=50, wheels_hz=100.0),
+    Drive(seed=51, wheels_hz=10.0, gyro_hz=10.0),
+    Drive(seed=52, gyro_hz=200.0),
+    Drive(seed=53, gnss_hz=1.0),
+    Drive(seed=54, gnss_hz=10.0),
+    Drive(seed=55, camera_hz=15.0, seconds=12.0),
+    Drive(seed=56, speed_mps=33.0, turn_rad=0.3),
+    Drive(seed=57, speed_mps=4.0),
+    Drive(seed=58, noise=3.0),
+    Drive(seed=59, noise=0.3),
+    Drive(seed=60, seconds=6.0, stops=False),
+    Drive(seed=61, seconds=60.0),
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "check", "fault", "vehicle"), AWKWARD, ids=[a[0] for a in AWKWARD]
+)
+def test_awkward_log_is_found_out_by_the_check_for_it(
+    name: str, check: str, fault: Fault, vehicle: Vehicle
+) -> None:
+    streams = streams_of(Drive())
+    fault(streams)
+
+    found = judge(examined(streams, vehicle))
+
+    assert check in {one.check for one in found}, [one.text for one in found]
+
+
+@pytest.mark.parametrize("drive", GOOD, ids=[str(one.seed) for one in GOOD])
+def test_good_log_is_not_blamed(drive: Drive) -> None:
+    found = judge(examined(streams_of(drive)))
+
+    assert [f"{one.check}: {one.text}" for one in found] == []
+
+
+def test_there_are_forty_awkward_logs_and_thirty_good_ones() -> None:
+    assert len(AWKWARD) >= 40
+    assert len(GOOD) >= 30
+
+
+# Checks that other files test: lost rows by the readers, the camera by rendered pictures.
+ELSEWHERE: Final = {"damage", "camera delay", "standstill", "mounting"}
+
+
+@pytest.mark.parametrize("name", [one.name for one in CHECKS])
+def test_every_row_of_the_table_finds_something(name: str) -> None:
+    assert name in {one[1] for one in AWKWARD} | ELSEWHERE
+
+
+def test_names_of_checks_are_unique_and_purposes_known() -> None:
+    assert len({one.name for one in CHECKS}) == len(CHECKS)
+    streams = streams_of(Drive())
+    for name in ("wheels", "gyro", "camera"):
+        del streams[name]
+    for finding in judge(examined(streams)):
+        assert set(finding.purposes) <= set(PURPOSES)
+        assert finding.help

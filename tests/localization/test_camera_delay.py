@@ -1,0 +1,161 @@
+"""Delay of pictures against signals of a car, on motions that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from crosscue.localization.camera_delay import (
+    CameraDelay,
+    PictureMotion,
+    delay_by_speed,
+    delay_by_yaw_rate,
+    mean_delay,
+)
+from crosscue.replay.columns import Floats, Int64s
+
+RATE_HZ = 10.0
+
+
+def ns(seconds: Floats) -> Int64s:
+    """Seconds as integer nanoseconds."""
+    return np.round(seconds * 1e9).astype(np.int64)
+
+
+def turn_rad(seconds: Floats) -> Floats:
+    """Heading of a car that turns at a crossing, and then changes a lane."""
+    first = 1.5 / (1.0 + np.exp(-(seconds - 12.0) / 1.2))
+    lane = 0.05 * np.exp(-(((seconds - 24.0) / 1.5) ** 2))
+    return np.asarray(first + lane, np.float64)
+
+
+def travelled_m(seconds: Floats) -> Floats:
+    """Distance of a car that brakes to a stop at 10 s and moves off at 14 s."""
+    grid = np.linspace(-5.0, 65.0, 14_001)
+    speed = np.clip(np.maximum(2.0 * (10.0 - grid), 1.5 * (grid - 14.0)), 0.0, 10.0)
+    steps = 0.5 * (speed[1:] + speed[:-1]) * np.diff(grid)
+    return np.asarray(np.interp(seconds, grid, np.concatenate([[0.0], np.cumsum(steps)])))
+
+
+def pictures(
+    seed: int, delay_s: float, *, drift_ppm: float = 0.0, noise: float = 1.0, length_s: float = 30.0
+) -> PictureMotion:
+    """Motion by pictures whose stamps are late; errors as on the real drives."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(0.0, length_s, 1.0 / RATE_HZ) + rng.uniform(0.0, 0.1)
+    late_s = delay_s + drift_ppm * 1e-6 * (t_s - 0.5 * length_s)
+    turned = np.diff(turn_rad(t_s)) * 1.03
+    slow = np.convolve(rng.normal(size=len(turned) + 9), np.ones(10) / 10.0**0.5, "valid")
+    turned += noise * (np.radians(0.01) * rng.normal(size=len(turned)) + np.radians(0.003) * slow)
+    moved = np.diff(travelled_m(t_s))
+    scene = 0.02 * np.exp(0.1 * slow * noise)
+    grown = scene * moved + noise * 2e-4 * rng.normal(size=len(moved))
+    stamps = ns(t_s + late_s)
+    return PictureMotion(stamps[:-1], stamps[1:], turned, grown, moved < 1e-3)
+
+
+def yaw_rate(seed: int, rate_hz: float = 100.0, length_s: float = 30.0) -> tuple[Int64s, Floats]:
+    """Readings of a gyro with noise and bias."""
+    rng = np.random.default_rng(seed + 1000)
+    t_s = np.arange(-1.5, length_s + 1.5, 1.0 / rate_hz)
+    rate = np.gradient(turn_rad(t_s), t_s) + 0.003
+    return ns(t_s), rate + np.radians(0.1) * rng.normal(size=len(t_s))
+
+
+def speed(seed: int) -> tuple[Int64s, Floats]:
+    """Readings of a speed with noise."""
+    rng = np.random.default_rng(seed + 2000)
+    t_s = np.arange(-1.5, 31.5, 0.02)
+    return ns(t_s), np.gradient(travelled_m(t_s), t_s) + 0.03 * rng.normal(size=len(t_s))
+
+
+@pytest.mark.parametrize("delay_s", [-0.25, -0.04, 0.0, 0.1, 0.25])
+def test_injected_delay_is_found_in_a_turn(delay_s: float) -> None:
+    found = delay_by_yaw_rate(pictures(1, delay_s), *yaw_rate(1))
+
+    assert found.delay_s == pytest.approx(delay_s, abs=0.015)
+    assert abs(found.delay_s - delay_s) < 3.0 * found.sd_s
+    assert found.is_observable
+    assert found.scale == pytest.approx(1.03, abs=0.02)
+
+
+@pytest.mark.parametrize("delay_s", [-0.25, 0.0, 0.25])
+def test_injected_delay_is_found_at_a_stop(delay_s: float) -> None:
+    found = delay_by_speed(pictures(2, delay_s), *speed(2))
+
+    assert found.is_observable
+    assert abs(found.delay_s - delay_s) < 3.0 * found.sd_s
+
+
+def test_without_noise_the_delay_is_exact() -> None:
+    t_ns, _ = yaw_rate(3)
+    t_s = np.asarray(t_ns * 1e-9, np.float64)
+    exact = np.gradient(turn_rad(t_s), t_s)
+
+    found = delay_by_yaw_rate(pictures(3, 0.123, noise=0.0), t_ns, exact)
+
+    assert found.delay_s == pytest.approx(0.123, abs=2e-4)
+
+
+def test_drift_of_a_long_drive_is_found() -> None:
+    t_ns, _ = yaw_rate(4, length_s=60.0)
+    rate = 0.2 * np.sin(0.9 * t_ns * 1e-9)
+    seen = pictures(4, 0.05, length_s=60.0)
+    late_s = 0.05 + 400e-6 * (seen.t_ns * 1e-9 - 30.0)
+    edge_s = [column * 1e-9 - late_s for column in (seen.start_ns, seen.t_ns)]
+    angle = [-0.2 / 0.9 * np.cos(0.9 * one) for one in edge_s]
+
+    found = delay_by_yaw_rate(seen._replace(turn_rad=angle[1] - angle[0]), t_ns, rate)
+
+    assert found.drift_ppm == pytest.approx(400.0, rel=0.2)
+    assert found.delay_s == pytest.approx(0.05, abs=0.005)
+
+
+def test_straight_and_steady_drive_determines_nothing() -> None:
+    seen = pictures(5, 0.1)
+    steady = seen._replace(
+        turn_rad=np.radians(0.01) * np.random.default_rng(5).normal(size=len(seen.t_ns)),
+        is_standing=np.zeros(len(seen.t_ns), np.bool_),
+    )
+    t_ns, _ = yaw_rate(5)
+    noise = np.radians(0.1) * np.random.default_rng(6).normal(size=len(t_ns))
+
+    found = [delay_by_yaw_rate(steady, t_ns, noise), delay_by_speed(steady, *speed(5))]
+
+    assert not any(one.is_observable for one in found)
+    assert "straight and steady" in str(found[0])
+    assert mean_delay(found) is None
+
+
+def test_shift_of_the_clock_shifts_the_delay() -> None:
+    seen, (t_ns, rate) = pictures(7, 0.02), yaw_rate(7)
+
+    here = delay_by_yaw_rate(seen, t_ns, rate)
+    later = delay_by_yaw_rate(seen, t_ns - 70_000_000, rate)
+
+    assert later.delay_s - here.delay_s == pytest.approx(0.07, abs=1e-3)
+
+
+def test_intervals_cover_injected_delays() -> None:
+    """In 120 drives, seeds 100 to 219; the benchmark has more, and the real drives."""
+    rng = np.random.default_rng(8)
+    inside = []
+    for seed in range(100, 220):
+        delay_s = float(rng.uniform(-0.25, 0.25))
+        found = delay_by_yaw_rate(pictures(seed, delay_s), *yaw_rate(seed, 25.0))
+        inside.append(abs(found.delay_s - delay_s) < 1.96 * found.sd_s)
+
+    assert 0.9 <= np.mean(inside) <= 1.0
+
+
+def test_signals_that_contradict_each_other_widen_the_mean() -> None:
+    near = [CameraDelay("yaw rate", 0.10, 0.01), CameraDelay("speed", 0.11, 0.02)]
+    far = [near[0], CameraDelay("speed", 0.40, 0.02)]
+
+    one, other = mean_delay(near), mean_delay(far)
+
+    assert one is not None
+    assert other is not None
+    assert one.sd_s < 0.01
+    assert other.sd_s > 0.05
+    assert 0.1 < other.delay_s < 0.4
