@@ -16,6 +16,7 @@ from crosscue.replay.vehicle.vehicle import CUES
 from .approach_level import flips_without_truth, of_approaches
 from .frame_level import Detected, failing_times, missed_and_false, wrong_ranges
 from .record import About, Failure
+from .unlabelled import suspects
 
 
 def failures_beside_truth(
@@ -45,15 +46,30 @@ def failures_without_truth(run: RunFolder, threshold: float) -> tuple[Failure, .
     Raises:
         RunError: A table is missing or damaged.
     """
+    return _placed(run, _flips(run, threshold))
+
+
+def _flips(run: RunFolder, threshold: float) -> list[Failure]:
     tables = read_run_tables(run)
     if tables.belief is None:
-        return ()
+        return []
     positives = {}
     if tables.cues is not None:
         is_found = tables.cues.count > 0
         for cue in np.unique(tables.cues.cue).tolist():
             positives[cue] = tables.cues.t_ns[is_found & (tables.cues.cue == cue)]
-    return _placed(run, flips_without_truth(tables.belief, positives, str(run.path), threshold))
+    return flips_without_truth(tables.belief, positives, str(run.path), threshold)
+
+
+def failures_unlabelled(run: RunFolder, threshold: float) -> tuple[Failure, ...]:
+    """Return the moments that look wrong without truth: flipped beliefs, and contradictions.
+
+    Raises:
+        RunError: A table is missing or damaged.
+    """
+    # A flip is looked at in the last frame of the answer that was given up.
+    flips = [replace(one, t_ns=one.start_ns) for one in _flips(run, threshold)]
+    return _placed(run, [*flips, *suspects(run)])
 
 
 def _of_frames(run: RunFolder, scene: SceneJudged, abouts: Mapping[int, About]) -> list[Failure]:

@@ -13,10 +13,8 @@ from crosscue.eval.scoring.scene.approaches import NEAR_M
 from crosscue.eval.scoring.scene.cues import SEEN, CueFrames, is_wrong
 from crosscue.eval.scoring.scene.ranges import RangeJudged, sds_off
 
-from .record import About, Failure, Kind
+from .record import APART_NS, About, Failure, Kind
 
-# Failures of one cue that are closer in time than this are merged.
-APART_NS: Final = 2_000_000_000
 # A smaller error, as a fraction of the range, is blamed on the interval, a larger on the range.
 NARROW: Final = 0.1
 MOSTLY: Final = 0.5

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from crosscue.replay.errors import AnnotationError
 from crosscue.replay.files import door
@@ -17,17 +17,19 @@ from crosscue.replay.files.whole_file import write_table, write_text
 if TYPE_CHECKING:
     import pyarrow as pa
 
-Kind = Literal["missed", "late", "false", "range", "flipped"]
+Kind = Literal["missed", "late", "false", "range", "flipped", "suspect"]
 Level = Literal["approach", "frames"]
-KINDS: Final[tuple[Kind, ...]] = ("missed", "late", "false", "range", "flipped")
+KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 FORMAT: Final = 1
+# Frames of one subject that are closer in time than this are one failure.
+APART_NS: Final = 2_000_000_000
 # Max size of a table in JSON.
 MAX_BYTES: Final = 256 << 20
 # Bin edges of the distances by which failures are filtered.
 DISTANCES_M: Final = (0, 10, 20, 40, 80)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
     """One failure.
 
@@ -58,14 +60,14 @@ class Failure:
     cause: str
     reported: str
     t_ns: int
-    at_s: float
+    at_s: float = 0.0
     start_ns: int
     end_ns: int
     frames: int
-    approach: int | None
-    intersection: str
-    conditions: tuple[str, ...]
-    distance_m: float | None
+    approach: int | None = None
+    intersection: str = ""
+    conditions: tuple[str, ...] = ()
+    distance_m: float | None = None
     severity: float
 
     @property

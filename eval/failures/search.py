@@ -9,7 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.catalog.query.catalog import catalog
-from crosscue.eval.failures.find import failures_beside_truth, failures_without_truth
+from crosscue.eval.failures.find import (
+    failures_beside_truth,
+    failures_unlabelled,
+    failures_without_truth,
+)
 from crosscue.eval.failures.order import CauseGroup, cause_groups, diverse, ranked
 from crosscue.eval.failures.record import Failure, failure_table, write_failures
 from crosscue.eval.failures.record import read_failures as read_table
@@ -19,7 +23,7 @@ from crosscue.replay.errors import CrosscueError, EmptyResultError, OutputError,
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.safe_text import visible
-from crosscue.results import Result, json_key, listing
+from crosscue.results import HIDDEN, Result, json_key, listing
 from crosscue.verb import Option, keywords
 
 if TYPE_CHECKING:
@@ -42,6 +46,7 @@ class Failures(Result):
         without_truth: Runs without truth, of which only flipped beliefs are known.
         failed: Errors of the runs that could not be examined.
         output: Table that was written; None without one.
+        is_unlabelled: True if no truth was used.
     """
 
     failures: tuple[Failure, ...]
@@ -51,6 +56,7 @@ class Failures(Result):
     without_truth: tuple[Path, ...]
     failed: Mapping[Path, CrosscueError]
     output: Path | None = field(default=None, metadata=json_key("written"))
+    is_unlabelled: bool = field(default=False, metadata=HIDDEN)
 
     @property
     def table(self) -> pa.Table:
@@ -69,7 +75,12 @@ class Failures(Result):
         """Yield counts, causes, and the worst failures."""
         yield f"failures   {self.found:,} in {self.runs:,} runs"
         if self.without_truth:
-            yield f"no truth   {len(self.without_truth):,} runs: of these, only flipped beliefs"
+            more = (
+                ""
+                if self.is_unlabelled
+                else ": of these, only flipped beliefs (--unlabelled: more)"
+            )
+            yield f"no truth   {len(self.without_truth):,} runs{more}"
         yield from (f"left out   {visible(str(error))}" for error in self.failed.values())
         if self.groups:
             yield from self._tables()
@@ -107,11 +118,14 @@ class FindWork:
     truth: Path | None
     threshold: float
     any_log: bool
+    is_unlabelled: bool
 
     def __call__(self, path: Path) -> tuple[tuple[Failure, ...], bool] | CrosscueError:
         """Return its failures and whether it has truth, or the error if it cannot be examined."""
         try:
             run = open_run(path)
+            if self.is_unlabelled:
+                return failures_unlabelled(run, self.threshold), False
             try:
                 known = remembered_truth(run) if self.truth is None else None
                 truth = find_truth(run, self.truth) if known is None else known.path
@@ -132,6 +146,8 @@ class FailureSettings:
         truth: Truth of all runs (default: that of each run's last score, or truth.json next to
             its log).
         any_log: Accept truth made for another file of the same drive, such as a converted log.
+        unlabelled: Rank what looks wrong without any truth: the belief, the way the car was driven,
+            other cues or other detectors contradict a cue.
         top: Only N failures, from as many causes and runs as possible (default: all).
         threshold: Probability above which a feature counts as believed.
         workers: Number of runs in parallel.
@@ -139,6 +155,7 @@ class FailureSettings:
 
     truth: Path | str | None = None
     any_log: bool = False
+    unlabelled: bool = False
     top: int | None = None
     threshold: float = THRESHOLD
     workers: int = 1
@@ -149,6 +166,8 @@ class FailureSettings:
         Raises:
             UsageError: A number is out of range.
         """
+        if self.unlabelled and self.truth is not None:
+            raise UsageError("unlabelled, truth: expected one of them")
         if self.top is not None and self.top < 1:
             raise UsageError(f"top: {self.top}, expected 1 or more")
         if not 0.5 < self.threshold < 1.0:
@@ -182,14 +201,16 @@ def failures(
     There are five kinds: a feature or cue that exists and was missed; a feature believed only
     within 8 m of the intersection (late); a feature believed, or a cue found, that does not exist
     (false); a range outside its 95 % interval; and a belief that was decided and then flipped.
-    Without truth, only the last kind can be detected. Severity is in bits; docs/howto/failures.md
-    explains it. --top picks the worst failure of every cause and run before a second one of any.
+    Without truth, only the last kind can be detected; --unlabelled ranks moments worth a look.
+    Severity is in bits; docs/howto/failures.md explains it. --top picks the worst failure of every
+    cause and run before a second one of any.
     Nothing is written into the runs. A run that cannot be examined does not stop the others.
 
     Examples:
         crosscue failures runs
         crosscue failures runs --top 20 -o worst.parquet
         crosscue failures runs --where "'dusk' in conditions"
+        crosscue failures runs --unlabelled --top 50 -o to_label.parquet
 
     Args:
         runs: Run folders, or folders of them.
@@ -224,7 +245,7 @@ def search(
     """Find failures of runs, and write them to a table if ``output`` is not None."""
     paths = runs_of([str(one) for one in runs])
     truth = None if settings.truth is None else Path(settings.truth)
-    work = FindWork(truth, settings.threshold, settings.any_log)
+    work = FindWork(truth, settings.threshold, settings.any_log, settings.unlabelled)
     found: list[Failure] = []
     failed: dict[Path, CrosscueError] = {}
     without: list[Path] = []
@@ -243,7 +264,14 @@ def search(
     if output is not None:
         write_failures(chosen, output)
     return Failures(
-        chosen, cause_groups(found), len(found), len(paths), tuple(without), failed, output
+        chosen,
+        cause_groups(found),
+        len(found),
+        len(paths),
+        tuple(without),
+        failed,
+        output,
+        settings.unlabelled,
     )
 
 

@@ -1,0 +1,134 @@
+"""Moments that look wrong without truth: what the run claims against what else it knows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+
+import crosscue
+from crosscue.eval import cli
+from crosscue.eval.failures.record import Failure
+from crosscue.eval.failures.unlabelled import suspects
+from crosscue.eval.runs.folder import RunFolder
+from support.scene_run import detections, poses
+from support.scoring import at, belief_table, cue_table, frame_table, range_table, run_folder
+
+FRAMES = 50
+
+
+def _found(first: int, end: int) -> dict[int, int]:
+    """Return the counts of a cue that is found in a half-open range of frames."""
+    return {frame: int(first <= frame < end) for frame in range(FRAMES)}
+
+
+def _poses(speed_mps: Sequence[float]) -> pa.Table:
+    table = poses(FRAMES)
+    place = table.schema.get_field_index("speed_mps")
+    return table.set_column(place, table.schema.field("speed_mps"), pa.array(speed_mps))
+
+
+def _run(folder: Path, *given: Any, **more: Any) -> list[Failure]:
+    return suspects(_folder(folder, *given, **more))
+
+
+def _folder(
+    folder: Path,
+    cues: Mapping[str, Mapping[int, int]],
+    speed_mps: Sequence[float] = (10.0,) * FRAMES,
+    belief: Mapping[str, Mapping[int, float]] | None = None,
+    **more: pa.Table,
+) -> RunFolder:
+    counts = cue_table(cues)
+    # Cues of a run are numbered by its own approaches.
+    number = pa.array([7] * len(counts), pa.int64())
+    tables = {
+        "frames": frame_table(FRAMES),
+        "cues": counts.set_column(1, "approach", number),
+        "belief": belief_table({"intersection": {10: 0.95}} if belief is None else belief),
+        "range": range_table(8, 45),
+        "pose": _poses(speed_mps),
+        **more,
+    }
+    return run_folder(folder / "run", tables)
+
+
+def _kinds(found: Sequence[Failure]) -> list[tuple[str, str]]:
+    return [(one.what, one.cause) for one in found]
+
+
+def test_sign_without_slowing_is_suspect(tmp_path: Path) -> None:
+    braking = [10.0] * 20 + [4.0] * 30
+    sign = {"stop_sign": _found(10, 30)}
+
+    (one,) = _run(tmp_path / "a", sign)
+
+    assert (one.kind, one.what, one.cause) == ("suspect", "stop_sign", "the car did not slow down")
+    assert (one.frames, one.approach, one.t_ns) == (20, 7, at(20))
+    assert _run(tmp_path / "b", sign, braking) == []
+
+
+def test_stop_without_a_reason_is_suspect(tmp_path: Path) -> None:
+    stopping = [10.0] * 10 + [0.0] * 30 + [5.0] * 10
+
+    (one,) = _run(tmp_path / "a", {}, stopping)
+
+    assert (one.what, one.cause) == ("stop", "stopped, and nothing explains it")
+    assert (one.start_ns, one.end_ns) == (at(10), at(39))
+    assert _run(tmp_path / "b", {"stop_sign": _found(2, 8)}, stopping) == []
+
+
+def test_cue_against_the_final_belief_is_suspect(tmp_path: Path) -> None:
+    cues = {"road_left": _found(5, 10)}
+
+    (one,) = _run(tmp_path / "a", cues, belief={"left": {20: 0.03125}})
+
+    assert (one.what, one.cause) == ("road_left", "the belief ends against it")
+    assert one.severity == pytest.approx(5.0)
+    assert _run(tmp_path / "b", cues, belief={"left": {20: 0.95}}) == []
+
+
+def test_rarer_of_two_cues_that_exclude_each_other_is_suspect(tmp_path: Path) -> None:
+    slowing = [10.0] * 20 + [1.0] * 30
+
+    found = _run(tmp_path, {"stop_sign": _found(5, 40), "traffic_light": _found(12, 17)}, slowing)
+
+    assert _kinds(found) == [("traffic_light", "stop sign excludes it")]
+
+
+def test_object_of_one_frame_is_suspect(tmp_path: Path) -> None:
+    cues = {"cross_traffic_left": _found(20, 21), "road_right": _found(30, 31)}
+
+    found = _run(tmp_path, cues)
+
+    assert _kinds(found) == [("cross_traffic_left", "for a frame or two only")]
+
+
+def test_box_that_one_of_two_detectors_has_is_suspect(tmp_path: Path) -> None:
+    one = detections().to_pylist()
+    cars = [row for row in one if row["label"] == "car"]
+    others = [dict(row, detector="second") for row in cars[:30]]
+    table = pa.Table.from_pylist([*cars, *others], schema=detections().schema)
+
+    found = _run(tmp_path, {}, detections=table)
+
+    assert _kinds(found) == [("car", "detectors disagree")]
+    assert (found[0].start_ns, found[0].frames) == (at(30), 20)
+
+
+def test_command_ranks_moments_without_truth(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = _folder(tmp_path, {"stop_sign": _found(10, 30)}).path
+
+    assert cli.run(["failures", str(run), "--unlabelled", "--truth", str(tmp_path)]) == 2
+    assert "expected one of them" in capsys.readouterr().err
+    found = crosscue.failures(run, unlabelled=True)
+    assert [(one.kind, one.what, one.at_s) for one in found.failures] == [
+        ("suspect", "stop_sign", 2.0)
+    ]
+    assert cli.run(["failures", str(run), "--unlabelled"]) == 0
+    assert "the car did not slow down" in capsys.readouterr().out
