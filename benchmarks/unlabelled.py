@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
 from crosscue.eval.batch.engine import engine_of
+
 from crosscue.eval.failures.find import failures_unlabelled
 from crosscue.eval.failures.order import ranked
 from crosscue.eval.failures.record import APART_NS, Failure

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from types import MappingProxyType
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay import colours
 from crosscue.replay.columns import Bytes
 from crosscue.replay.files.whole_file import write_bytes
 
@@ -17,12 +19,26 @@ from . import rle
 from .base import Detections, Found, RoadMask
 from .images import Encoded, decode
 
-GREEN: Final = (80, 220, 60)
-BLUE: Final = (255, 140, 0)
-AMBER: Final = (90, 190, 255)
+FOUND: Final = colours.bgr(colours.FOUND)
+TRUE: Final = colours.bgr(colours.TRUTH)
 PALE: Final = (230, 230, 230)
 # Margin to the left and right of the line of cues.
 MARGIN_PX: Final = 10
+
+
+class TrueMarks(NamedTuple):
+    """What is true in a picture.
+
+    Attributes:
+        boxes: Labels and boxes (x0, y0, x1, y1) of labelled objects.
+        counts: Number of objects of each cue that is present.
+    """
+
+    boxes: Sequence[tuple[str, tuple[float, float, float, float]]] = ()
+    counts: Mapping[str, int] = MappingProxyType({})
+
+
+NOTHING_TRUE: Final = TrueMarks()
 
 
 @dataclass(slots=True)
@@ -89,10 +105,15 @@ def draw_detections(
     """
     canvas = _drawn(pixels, found, enlarge)
     positive = [f"{cue} {count}" for cue, count in counts.items() if count]
-    text = "  ".join(positive) or "no cue"
-    scale = _fitting(text, canvas.shape[1] - 2 * MARGIN_PX, 0.6 * enlarge)
-    write_label(canvas, text, (MARGIN_PX, canvas.shape[0] - 14), (255, 255, 255), scale)
+    _line_of_text(canvas, "  ".join(positive) or "no cue", 14, (255, 255, 255), enlarge)
     return canvas
+
+
+def _line_of_text(
+    canvas: Bytes, text: str, above_px: int, colour: tuple[int, int, int], enlarge: float
+) -> None:
+    scale = _fitting(text, canvas.shape[1] - 2 * MARGIN_PX, 0.6 * enlarge)
+    write_label(canvas, text, (MARGIN_PX, canvas.shape[0] - above_px), colour, scale)
 
 
 def draw_frame(
@@ -101,8 +122,9 @@ def draw_frame(
     counts: Mapping[str, int],
     regions: Callable[[tuple[int, int]], Iterable[NDArray[np.float64]]],
     width_px: int,
+    truth: TrueMarks = NOTHING_TRUE,
 ) -> Bytes:
-    """Draw all results of one frame: road, masks, boxes, regions and cues.
+    """Draw all results of one frame: road, masks, boxes, regions and cues, and what is true.
 
     Args:
         picture: Encoded picture of the frame.
@@ -111,6 +133,7 @@ def draw_frame(
         regions: Returns the regions' corners, shape (N, 2) each, for a picture of the given width
             and height. They are drawn only if a detector found road.
         width_px: Displayed width of the picture; lines and text are sized to be legible there.
+        truth: Drawn in the colour of the truth.
 
     Raises:
         LogError: The picture cannot be decoded.
@@ -118,17 +141,25 @@ def draw_frame(
     pixels, _ = decode(picture)
     size = (pixels.shape[1], pixels.shape[0])
     enlarge = max(size[0] / width_px, 0.5)
-    if not found:
+    if not found and truth == NOTHING_TRUE:
         return np.asarray(pixels, np.uint8)
     canvas = draw_detections(pixels, found, counts, 0.8 * enlarge)
     for one in found:
         if isinstance(one, Detections):
             for box, mask in zip(one.boxes_px, one.masks, strict=True):
                 for line in rle.outline(mask, one.size_px, box):
-                    _line(canvas, line, AMBER, enlarge)
+                    _line(canvas, line, FOUND, enlarge)
     has_road = any(isinstance(one, RoadMask) for one in found)
     for corners in regions(size) if has_road else ():
         _line(canvas, np.vstack([corners, corners[:1]]), PALE, enlarge)
+    for label, (x0, y0, x1, y1) in truth.boxes:
+        corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
+        _line(canvas, corners, TRUE, 2.0 * enlarge)
+        place = (round(x0), min(round(y1 + 14 * enlarge), size[1] - 4))
+        write_label(canvas, label, place, TRUE, 0.4 * enlarge)
+    if truth.counts:
+        text = "true: " + "  ".join(f"{cue} {count}" for cue, count in truth.counts.items())
+        _line_of_text(canvas, text, round(14 + 26 * enlarge), TRUE, 0.8 * enlarge)
     return canvas
 
 
@@ -179,7 +210,7 @@ def _tint(canvas: Bytes, road: RoadMask) -> None:
     mask = road.pixels().astype(np.uint8)
     size = (canvas.shape[1], canvas.shape[0])
     is_road = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
-    canvas[is_road] = canvas[is_road] // 2 + np.array(BLUE, np.uint8) // 2
+    canvas[is_road] = canvas[is_road] // 2 + np.array(colours.bgr(colours.ROAD), np.uint8) // 2
 
 
 def _boxes(canvas: Bytes, found: Detections, enlarge: float) -> None:
@@ -188,9 +219,9 @@ def _boxes(canvas: Bytes, found: Detections, enlarge: float) -> None:
     for box, score, label in zip(found.boxes_px, found.scores, found.labels, strict=True):
         x0, y0, x1, y1 = (round(float(side)) for side in box)
         place = (x0, max(y0 - 4, round(12 * enlarge)))
-        write_label(canvas, f"{label} {score:.2f}", place, GREEN, 0.5 * enlarge)
+        write_label(canvas, f"{label} {score:.2f}", place, FOUND, 0.5 * enlarge)
         # Drawn after the label: its dark box extends below the letters, in OpenCV 4 over this side.
-        cv2.rectangle(canvas, (x0, y0), (x1, y1), GREEN, round(2 * enlarge))
+        cv2.rectangle(canvas, (x0, y0), (x1, y1), FOUND, round(2 * enlarge))
 
 
 def write_label(

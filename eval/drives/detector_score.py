@@ -7,14 +7,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 import numpy as np
 
 from crosscue.datasets.truth.box_labels import BoxLabels, LabelFormat, Meanings, read_box_labels
 from crosscue.detectors.catalog.class_names import class_names_given
 from crosscue.eval.pipeline.run import Run, open_run
-from crosscue.eval.report.detector_page import write_detector_page
+from crosscue.eval.report.html import write_page
+from crosscue.eval.report.scene_figures import draw_calibration
 from crosscue.eval.report.worst_boxes import worst_pictures
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
@@ -221,7 +222,7 @@ class DetectorScoreSettings:
         draw: Draw the N worst images.
         logs: Folder that the run's logs have moved to; they are recognised by content.
         without_images: Leave out camera images, so the run's logs are not needed.
-        has_figures: Omit the reliability diagram, which needs matplotlib.
+        has_figures: Omit the reliability diagram.
         limits: Limits for reading the logs.
     """
 
@@ -316,26 +317,19 @@ def score_detector(
         place / f"{stem}.html",
     )
     worst = [] if settings.without_images else worst_pictures(of, overlap, settings.draw)
-    content: dict[str, Any] = {
-        "detector": of.detector.name,
-        "run": str(folder.path),
-        "labels": read.where,
-        "format": read.format,
-        "rule": of.rule,
-        "images": len(of.names),
+    place.mkdir(parents=True, exist_ok=True)
+    content = {
+        "title": of.detector.name,
+        "one": found,
+        "of": of,
+        "worst": worst,
         "boxes": int((~of.truth.is_ignored).sum()),
-        "ignored": int(of.truth.is_ignored.sum()),
-        "left_out": of.left_out,
-        "not_judged": of.not_judged,
-        "parts": scores,
         "lowest": float(of.found.scores.min(initial=1.0)),
         "overlap": overlap,
-        "block_s": settings.block_s,
         "seed": SEED,
-        "worst": worst,
+        "figure": draw_calibration(found.calibration) if settings.has_figures else None,
     }
-    place.mkdir(parents=True, exist_ok=True)
-    write_detector_page(found.report, content, found.calibration, has_figures=settings.has_figures)
+    write_page(found.report, "detector.html.j2", content)
     write_text(place / f"{stem}.json", strict_json(found.as_dict()) + "\n")
     return found
 

@@ -7,10 +7,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from crosscue.eval.failures.find import failures_beside_truth
+from crosscue.eval.failures.order import diverse
 from crosscue.eval.pipeline.run import Run, run_given
-from crosscue.eval.report.page import write_report
+from crosscue.eval.report.opening import Mistake
+from crosscue.eval.report.page import MAX_FRAMES, write_report
 from crosscue.eval.report.summary import headline, pose_summary, scores_text
-from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.folder import locked, open_run
 from crosscue.eval.scoring.drives import Definition, PooledScores, ScoreSettings
 from crosscue.eval.scoring.files import FOLDER, curve_table, write_scores
@@ -19,6 +21,7 @@ from crosscue.eval.scoring.pose.score import load_truth
 from crosscue.eval.scoring.pose.smoother import SmootherScore, score_smoother
 from crosscue.eval.scoring.runs import (
     RunScored,
+    SceneJudged,
     find_truth,
     judge_run,
     metrics_of,
@@ -134,11 +137,23 @@ def write_files(
     Returns:
         The report's path.
     """
-    # The pictures are read first: if they are missing, nothing is written.
-    worst = worst_frames(ones)
-    report = write_report(place, ones, scores, metrics, worst, has_figures=has_figures)
+    mistakes = mistakes_of(ones, scores.settings.threshold)
+    report = write_report(place, ones, scores, metrics, mistakes, has_figures=has_figures)
     write_scores(place, ones, metrics)
     return report
+
+
+def mistakes_of(ones: Sequence[RunScored], threshold: float) -> list[Mistake]:
+    """Return the failures that a report shows: the worst of each kind, cause and run."""
+    found = [
+        failure
+        for one in ones
+        for failure in failures_beside_truth(one.run, SceneJudged(one.truth, one.judged), threshold)
+    ]
+    return [
+        Mistake(one.run, one.t_ns, one.at_s, one.kind, one.what, f"{one.cause}: {one.reported}")
+        for one in diverse(found, MAX_FRAMES)
+    ]
 
 
 def settings_given(threshold: float, detection: Definition) -> ScoreSettings:

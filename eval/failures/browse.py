@@ -134,7 +134,8 @@ def browse(
         shutil.rmtree(made, ignore_errors=True)
         for part in ("f", "p", "t", "by", *(["r"] if has_recordings else [])):
             (made / part).mkdir(parents=True)
-        work = RunWork(made, len(entries), moved, has_recordings, settings.limits)
+        truth = None if settings.truth is None else Path(settings.truth)
+        work = RunWork(made, len(entries), moved, has_recordings, settings.limits, truth)
         groups, pictures, reasons = by_run(entries), frozenset[str](), []
         for done, (written, why) in enumerate(in_processes(work, groups, settings.workers), 1):
             pictures |= written
@@ -144,7 +145,7 @@ def browse(
             for one in entries:
                 path = made / "r" / f"{one.number:05d}.rrd"
                 run = open_run(one.failure.run, moved, limits=settings.limits)
-                save_recording(run, path, at=f"{one.failure.t_ns}ns")
+                save_recording(run, path, settings.truth, at=f"{one.failure.t_ns}ns")
         write_lists(made, entries, pictures)
         owned.replace_folder(made, folder, owned.of_list(folder / MARKER))
     except OSError as error:

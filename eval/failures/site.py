@@ -18,10 +18,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
+from crosscue.datasets.truth.truth import FILE
 from crosscue.eval.report.frame_pictures import draw_pictures
-from crosscue.eval.report.html import page_template, template_text
+from crosscue.eval.report.html import page_style, page_template, template_text
 from crosscue.eval.runs import owned
 from crosscue.eval.runs.folder import RunFolder, open_run
+from crosscue.eval.scoring.runs import remembered_truth
 from crosscue.replay.files.whole_file import write_bytes, write_text
 from crosscue.replay.limits import Limits
 
@@ -78,6 +80,7 @@ class RunWork:
         logs: Folder to which the runs' logs have moved, if any.
         has_recordings: True if each failure has a recording next to its page.
         limits: Limits on the declared size of a chunk of a log.
+        truth: Truth of all runs; None for that of each run's last score.
     """
 
     site: Path
@@ -85,6 +88,7 @@ class RunWork:
     logs: Path | None
     has_recordings: bool
     limits: Limits
+    truth: Path | None = None
 
     def __call__(self, entries: Sequence[Entry]) -> tuple[frozenset[str], str]:
         """Write pictures and pages; return the pictures written and why others are missing."""
@@ -97,8 +101,15 @@ class RunWork:
             write_bytes(self.site / "t" / names[t_ns], small)
             written.add(names[t_ns])
 
-        why = draw_pictures(run, names, keep)
-        rows, render = _rows(run), page_template("failure.html.j2", {"number": _number})
+        known = remembered_truth(run) if self.truth is None else None
+        truth = self.truth if known is None else known.path
+        if truth is not None and truth.is_dir():
+            truth = truth / FILE
+        why = draw_pictures(run, names, keep, truth=truth)
+        rows, render = _rows(run), page_template("failure.html.j2")
+        command = f"crosscue view {shlex.quote(entries[0].failure.run)}"
+        if self.truth is not None:
+            command += f" --truth {shlex.quote(str(self.truth))}"
         for one in entries:
             content = {
                 "one": one.failure,
@@ -111,7 +122,8 @@ class RunWork:
                 "after": f"{one.number + 1:05d}.html" if one.number < self.total else None,
                 "recording": f"{one.number:05d}.rrd" if self.has_recordings else None,
                 "viewer": WEB_VIEWER,
-                "command": shlex.quote(one.failure.run),
+                "command": f"{command} --at {one.failure.at_s:.3f}",
+                "has_truth": truth is not None,
             }
             write_text(self.site / "f" / one.page, render(content))
         return frozenset(written), why
@@ -145,8 +157,8 @@ def write_lists(site: Path, entries: Sequence[Entry], pictures: frozenset[str]) 
     Raises:
         OutputError: A file cannot be written.
     """
-    write_text(site / "style.css", template_text("failures.css"))
-    render = page_template("failures.html.j2", {"number": _number})
+    write_text(site / "style.css", page_style())
+    render = page_template("failures.html.j2")
     facets = _facets(entries)
     script = template_text("failures.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -219,7 +231,3 @@ def _rows(run: RunFolder) -> ChartTables:
         return run.table(name).sort_by("t_ns") if run.file(f"{name}.parquet").exists() else None
 
     return ChartTables(table("belief"), table("cues"))
-
-
-def _number(value: float | None, digits: int = 1) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"

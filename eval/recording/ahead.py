@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
 from crosscue.eval.scoring.truth import TrueRanges
+from crosscue.replay.colours import END, FAINT, FOUND, LANE, QUIET, START, TRUTH
 from crosscue.replay.mobileye.geometry import evaluate
 from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .colours import END, ESTIMATE, FAINT, LANE, QUIET, START, TRUTH, VEHICLE
 from .columns import DriveTime, Shapes, boxes, labelled_strips, point_columns, strips
 from .layout import ASIDE_M, BEHIND_M, FAR_M
 from .scene_rows import SceneRows
@@ -75,7 +75,7 @@ def _log_ground(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
     recording.log(
         "ahead/car",
         rr.Boxes2D(
-            centers=[[0.0, 0.9 - length_m / 2]], half_sizes=[[0.9, length_m / 2]], colors=[ESTIMATE]
+            centers=[[0.0, 0.9 - length_m / 2]], half_sizes=[[0.9, length_m / 2]], colors=[FOUND]
         ),
         static=True,
     )
@@ -133,7 +133,7 @@ def _log_mobileye(
         vehicles.begin(t_ns)
         lanes.begin(t_ns)
         for place, label in _vehicles(state.obstacles):
-            vehicles.add(place, VEHICLE, label)
+            vehicles.add(place, FOUND, label)
         for line in _lanes(state.lanes):
             lanes.add(line, LANE)
         if number % FRAMES_HELD == FRAMES_HELD - 1:

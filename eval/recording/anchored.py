@@ -26,13 +26,12 @@ from crosscue.eval.runs.manifest import DriveManifest
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.fusion.approaches import RangeRow
 from crosscue.fusion.intersection_range import Reference
+from crosscue.replay.colours import FEATURES, ROAD, Colour
 from crosscue.replay.vehicle.vehicle import Camera
 
-from .columns import Colour
-from .marks import CROSSING, PARKED, REGION, REGION_WITH_ROAD, ROAD, SIDES, Overlays
+from .marks import CROSSING, PARKED, REGION, SIDES, Overlays
 
 ALONG: Final = (235, 235, 235)
-PAST: Final = (60, 190, 70)
 ARROW_S: Final = 1.0
 NEAREST_M: Final = 1.0
 # Length of a parked car's arrow as a fraction of the picture's width.
@@ -105,12 +104,12 @@ class Anchored:
         for line in () if plan is None else plan_lines(plan):
             self.marks.area.add(line, ROAD)
         for line, text in () if roads.seen is None else opening_lines(roads.seen):
-            self.marks.openings.add(line, REGION_WITH_ROAD, text)
+            self.marks.openings.add(line, ROAD, text)
 
     def _region(self, side: str, corners: NDArray[np.float64], fraction: float) -> None:
         is_road = fraction > self.manifest.settings.cues.road_fraction
         text = "not seen" if np.isnan(fraction) else f"{100.0 * fraction:.0f} %"
-        colour = REGION_WITH_ROAD if is_road else REGION
+        colour = ROAD if is_road else REGION
         self.marks.regions.add(np.vstack([corners, corners[:1]]), colour, f"{side} {text}")
 
     def _car(self, car: CarMotion, size_px: tuple[int, int], place: Place | None) -> None:
@@ -123,7 +122,7 @@ class Anchored:
         elif along([car], cars):
             way = "outgoing" if car.ahead_mps > 0.0 else "oncoming"
             is_beyond = place is not None and is_past(car, camera, place)
-            colour = PAST if is_beyond else ALONG
+            colour = FEATURES["straight"] if is_beyond else ALONG
             self._arrow(
                 car, way_px(car, camera, size_px), colour, f"{way} {abs(car.ahead_mps):.0f} m/s"
             )

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from crosscue.replay.colours import Colour
 from crosscue.replay.time.dates import is_date
-
-Colour: TypeAlias = tuple[int, int, int]
 
 
 @dataclass(slots=True)

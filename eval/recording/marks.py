@@ -26,20 +26,13 @@ from crosscue.detectors.cues.cars import (
 )
 from crosscue.detectors.cues.observed import FrameDetections, RoadFractions
 from crosscue.detectors.cues.road import road_fractions
+from crosscue.replay.colours import FOUND, QUIET, ROAD, Colour
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .columns import Colour, DriveTime, Shapes, arrows, boxes, labelled_strips, strips
+from .columns import DriveTime, Shapes, arrows, boxes, labelled_strips, strips
 
 FRAMES_HELD: Final = 256
-CAR: Final = (80, 170, 255)
-STOP_SIGN: Final = (255, 70, 70)
-TRAFFIC_LIGHT: Final = (255, 200, 40)
-SIGN: Final = (240, 90, 230)
-OWN: Final = (150, 220, 90)
-UNSURE: Final = (150, 150, 150)
-ROAD: Final = (40, 210, 190)
 REGION: Final = (220, 220, 220)
-REGION_WITH_ROAD: Final = (60, 190, 70)
 CROSSING: Final = (255, 130, 30)
 PARKED: Final = (190, 130, 255)
 HATCH_ROWS: Final = 4
@@ -83,7 +76,7 @@ class Overlays:
             self._objects(found)
         for found in frame.signs:
             for box, text, _ in _report_text(found):
-                self.signs.add(box, SIGN, text)
+                self.signs.add(box, FOUND, text)
         if isinstance(frame.road, RoadMask):
             for line in road_lines(frame.road):
                 self.road.add(line, ROAD)
@@ -115,20 +108,19 @@ class Overlays:
         """Return the colour of a detection; grey if its score is too low for a cue."""
         cues, cars = self.vehicle.cues, self.vehicle.cars
         label = found.labels[row]
-        for labels, min_score, colour in (
-            (cars.labels, cars.score, CAR),
-            (cues.stop_sign_labels, cues.stop_sign_score, STOP_SIGN),
-            (cues.traffic_light_labels, cues.traffic_light_score, TRAFFIC_LIGHT),
-        ):
-            if label in labels and found.are_sure(min_score)[row]:
-                return colour
-        is_own = any(
-            label in one.labels and found.are_sure(one.score)[row] for one in cues.own.values()
+        is_sure = any(
+            label in labels and found.are_sure(min_score)[row]
+            for labels, min_score in (
+                (cars.labels, cars.score),
+                (cues.stop_sign_labels, cues.stop_sign_score),
+                (cues.traffic_light_labels, cues.traffic_light_score),
+                *((one.labels, one.score) for one in cues.own.values()),
+            )
         )
-        return OWN if is_own else UNSURE
+        return FOUND if is_sure else QUIET
 
     def _regions(self, road: RoadMask | RoadFractions | None, size_px: tuple[int, int]) -> None:
-        """Draw the regions, green if they contain road; nothing without a detector of road."""
+        """Draw the regions, teal if they contain road; nothing without a detector of road."""
         if road is None:
             return
         fractions = (
@@ -137,7 +129,7 @@ class Overlays:
         positive = fractions.positive(self.vehicle.cues.road_fraction)
         for side, is_road in zip(SIDES, positive, strict=True):
             corners = np.array(getattr(self.vehicle.regions, side)) * size_px
-            colour = REGION_WITH_ROAD if is_road else REGION
+            colour = ROAD if is_road else REGION
             fraction = 100.0 * getattr(fractions, side)
             self.regions.add(np.vstack([corners, corners[:1]]), colour, f"{side} {fraction:.0f} %")
 

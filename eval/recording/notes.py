@@ -12,15 +12,15 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.safe_text import visible
 
 COLOURS: Final = (
-    "- camera: cars blue, stop signs red, traffic lights yellow, sign windows magenta, what is "
-    "too uncertain to be a cue grey; road hatched in teal, regions of interest green while they "
-    "hold road (on the ground only where a detector looks for road; grey ones hold none or are not "
-    "seen); arrows: orange cars cross, violet ones are parked and point to their front, "
-    "white ones go along the road, green ones beyond the intersection; an arrow on the road is the "
-    "way of one second, with the ego vehicle's own motion removed",
+    "- everywhere: blue what was found or estimated, green the truth, orange 2 sigma, grey what is "
+    "too uncertain to be a cue",
+    "- camera: road hatched in teal, regions of interest teal while they hold road (on the ground "
+    "only where a detector looks for road; grey ones hold none or are not seen); arrows: orange "
+    "cars cross, violet ones are parked and point to their front, white ones go along the road, "
+    "pink ones beyond the intersection; an arrow on the road is the way of one second, with the "
+    "ego vehicle's own motion removed",
     "- ahead of the vehicle: red bar the start, yellow bar the end of the intersection with its "
-    "2-sigma band, green the truth; blue dots and white lines are the Mobileye's",
-    "- map: blue the estimated path, orange its 2-sigma ellipse, green the truth",
+    "2-sigma band; white lines are the Mobileye's",
 )
 
 

@@ -10,8 +10,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
+from crosscue.replay.colours import END, FOUND, LANDMARK, SIGMA, START, TRUTH
 
-from .colours import ELLIPSE, END, ESTIMATE, LANDMARK, START, TRUTH
 from .columns import DriveTime, Shapes, strips_above
 from .scene_rows import SceneRows
 
@@ -35,7 +35,7 @@ def log_pose(
     flat = np.stack([pose["x_m"], pose["y_m"], np.zeros(len(t_ns))], axis=1)
     recording.log(
         "plan/estimate",
-        rr.LineStrips3D(_pieces(flat, pose["segment"], thin), colors=[ESTIMATE]),
+        rr.LineStrips3D(_pieces(flat, pose["segment"], thin), colors=[FOUND]),
         static=True,
     )
     some = _every(t_ns, ELLIPSES_PER_S)
@@ -44,7 +44,7 @@ def log_pose(
     recording.send_columns(
         "plan/ellipse", indexes=times, columns=rr.LineStrips3D.columns(strips=list(rings))
     )
-    recording.log("plan/ellipse", rr.LineStrips3D.from_fields(colors=[ELLIPSE]), static=True)
+    recording.log("plan/ellipse", rr.LineStrips3D.from_fields(colors=[SIGMA]), static=True)
     heading = pose["heading_rad"][some]
     ahead = np.stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))], axis=1)
     car_m = max(CAR_M, CAR_SHARE * float(np.ptp(flat, axis=0).max()))
@@ -54,7 +54,7 @@ def log_pose(
         columns=rr.Arrows3D.columns(origins=flat[some], vectors=ahead * car_m),
     )
     recording.log(
-        "plan/car", rr.Arrows3D.from_fields(colors=[ESTIMATE], radii=[0.1 * car_m]), static=True
+        "plan/car", rr.Arrows3D.from_fields(colors=[FOUND], radii=[0.1 * car_m]), static=True
     )
 
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import LABELS
 from crosscue.eval.scoring.truth import TrueRanges
+from crosscue.replay.colours import END, QUIET, START, TRUTH, Colour, of_feature
 from crosscue.replay.vehicle import cue_table
 from crosscue.replay.vehicle.fusion import NOT_FEATURES
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .colours import END, QUIET, START, TRUTH, of_feature
-from .columns import Colour, DriveTime
+from .columns import DriveTime
 from .scene_rows import SceneRows
 
 BELIEF: Final = ("plots", "belief")

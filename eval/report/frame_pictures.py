@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -14,11 +15,12 @@ from crosscue.detectors.base import Detections, Found
 from crosscue.detectors.cues.observed import FrameDetections, Place
 from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.images import Encoded
-from crosscue.detectors.overlay import draw_frame
+from crosscue.detectors.overlay import NOTHING_TRUE, draw_frame
 from crosscue.eval.pipeline.scene.road_picture import plans_of
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.stored_images import pictures_at, run_camera
 from crosscue.eval.runs.tables.stored_frames import stored_frames
+from crosscue.eval.scoring.true_marks import true_marks
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.cue_table import CUES
@@ -36,7 +38,12 @@ Keep = Callable[[int, bytes, bytes], None]
 
 
 def draw_pictures(
-    run: RunFolder, times: Iterable[int], keep: Keep, *, has_candidates: bool = True
+    run: RunFolder,
+    times: Iterable[int],
+    keep: Keep,
+    *,
+    has_candidates: bool = True,
+    truth: Path | None = None,
 ) -> str:
     """Draw some frames of a run.
 
@@ -46,6 +53,7 @@ def draw_pictures(
         keep: Called for each picture that could be read.
         has_candidates: False to draw only likely detections (``LIKELY``, or ``COUNTED`` where
             their cue was found), without those stored in case other frames support them.
+        truth: Truth file, to also draw labelled boxes and name the cues that are present.
 
     Returns:
         The reason why pictures are missing; empty if none is.
@@ -58,6 +66,7 @@ def draw_pictures(
         found = _found(run, wanted)
         places, cues = _places(run, wanted), _cues(run, wanted)
         plans = plans_of(run, wanted)
+        true = {} if truth is None else true_marks(truth, run, wanted)
 
         def on_picture(t_ns: int, picture: Encoded) -> None:
             regions = partial(_regions, run, places.get(t_ns))
@@ -66,7 +75,8 @@ def draw_pictures(
             counts = cues.get(t_ns, {})
             if not has_candidates:
                 results = tuple(_likely(one, _labels(run, counts)) for one in results)
-            canvas = draw_frame(picture, results, counts, regions, WIDTH_PX)
+            marks = true.get(t_ns, NOTHING_TRUE)
+            canvas = draw_frame(picture, results, counts, regions, WIDTH_PX, marks)
             if t_ns in plans:
                 canvas = _with_plan(canvas, plans[t_ns])
             keep(t_ns, _jpeg(canvas, WIDTH_PX), _jpeg(canvas, SMALL_PX))

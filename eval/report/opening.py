@@ -6,29 +6,48 @@ import base64
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.moments import frame_times, span_ns
+from crosscue.eval.runs.moments import frame_times, seconds_into, span_ns
 from crosscue.eval.scoring.columns import NONE, CueRows, RangeRows, RunTables
 from crosscue.eval.scoring.runs import RunScored, read_run_tables
 from crosscue.eval.scoring.scene.approaches import ApproachResult, Curve
-from crosscue.eval.scoring.scene.cues import SEEN, CueFrames
+from crosscue.eval.scoring.scene.cues import CueFrames
 from crosscue.replay.vehicle.cue_table import CUES
 
 from .frame_pictures import draw_pictures
-from .scene_figures import WorstFrame
 
 MAX_MOMENTS: Final = 8
-MAX_MISTAKES: Final = 2
+MAX_MISTAKES: Final = 3
 # Approaches that are told one by one; a page of many drives has them in its table.
 MAX_TOLD: Final = 4
 # Frames of one cue closer in time than this belong to one mistake.
 APART_NS: Final = 2_000_000_000
 # Which moments are kept first when there are too many.
 BELIEVED, MISTAKE, FIRST, FEATURE, LAST = range(5)
+
+
+class Mistake(NamedTuple):
+    """A failure of a run, as a page shows it.
+
+    Attributes:
+        run: Folder of the run.
+        t_ns: Time of its picture in the run's tables.
+        at_s: Seconds from the run's first frame, as ``crosscue view --at`` expects.
+        kind: Kind of failure.
+        what: The feature, cue or range concerned.
+        text: Its cause with its numbers.
+    """
+
+    run: str
+    t_ns: int
+    at_s: float
+    kind: str
+    what: str
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +99,7 @@ def opening_of(
     run: RunFolder,
     threshold: float,
     scored: RunScored | None = None,
-    worst: Sequence[WorstFrame] = (),
+    mistakes: Sequence[Mistake] = (),
 ) -> Opening:
     """Return the first screen of the report of one run.
 
@@ -88,7 +107,7 @@ def opening_of(
         run: The run.
         threshold: Probability above which a feature is believed.
         scored: The run, compared with its truth; None without a truth.
-        worst: False positives of the run.
+        mistakes: Failures of the run in the order in which they are shown.
 
     Raises:
         RunError: A table is damaged.
@@ -99,8 +118,9 @@ def opening_of(
     moved = frame_times(run)
     if scored is not None:
         logged = {t_ns: log_ns for log_ns, t_ns in moved.items()}
-        placed = [replace(one, t_ns=logged.get(one.t_ns, one.t_ns)) for one in worst]
-        events += _mistakes(scored.judged.cues, placed)
+        for one in mistakes[:MAX_MISTAKES]:
+            text = f"{one.kind}: {_words([one.what])}"
+            events.append(_Event(logged.get(one.t_ns, one.t_ns), MISTAKE, text))
     kept = sorted(sorted(events, key=lambda one: (one.rank, one.t_ns))[:MAX_MOMENTS], key=_when)
     frames = tables.frames_ns
     if frames is None or not len(frames):
@@ -110,14 +130,20 @@ def opening_of(
     for at in sorted({_frame(frames, one) for one in kept}):
         found = _moment(tables, scored, at, [one for one in kept if _frame(frames, one) == at])
         t_ns = moved.get(at, at)
-        moments.append(replace(found, t_ns=t_ns, at_s=(t_ns - start_ns) * 1e-9))
+        moments.append(replace(found, t_ns=t_ns, at_s=seconds_into(start_ns, t_ns)))
     pictures: dict[int, str] = {}
 
     def keep(t_ns: int, picture: bytes, _: bytes) -> None:
         pictures[t_ns] = base64.b64encode(picture).decode()
 
     missing = (
-        draw_pictures(run, [one.t_ns for one in moments], keep, has_candidates=False)
+        draw_pictures(
+            run,
+            [one.t_ns for one in moments],
+            keep,
+            has_candidates=False,
+            truth=None if scored is None else scored.truth_path,
+        )
         if moments
         else ""
     )
@@ -305,21 +331,6 @@ def _events(tables: RunTables, threshold: float) -> Iterator[_Event]:
         yield _Event(
             int(tables.belief.t_ns[tables.belief.approach == number].max()), LAST, "the end"
         )
-
-
-def _mistakes(cues: Sequence[CueFrames], worst: Sequence[WorstFrame]) -> Iterator[_Event]:
-    """Yield the worst wrong cues, and those missed for the longest time."""
-    for wrong in worst[:MAX_MISTAKES]:
-        yield _Event(wrong.t_ns, MISTAKE, f"wrong: {_words([wrong.cue])}")
-    missed = []
-    for cue in cues:
-        rows = np.flatnonzero((cue.is_object == 1) & (cue.count == 0) & ~(cue.visible < SEEN))
-        breaks = np.flatnonzero(np.diff(cue.t_ns[rows]) > APART_NS) + 1
-        longest = max(np.split(rows, breaks), key=len)
-        if len(longest) > 1:
-            missed.append((-len(longest), cue.cue, int(cue.t_ns[longest[len(longest) // 2]])))
-    for frames, name, t_ns in sorted(missed)[:MAX_MISTAKES]:
-        yield _Event(t_ns, MISTAKE, f"missed in {-frames} frames: {_words([name])}")
 
 
 def _words(names: Sequence[str]) -> str:

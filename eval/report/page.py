@@ -1,4 +1,4 @@
-"""Report of scored runs: one HTML file without network access or scripts.
+"""Report of runs: one HTML file without network access or scripts.
 
 All text from logs, truth or settings is escaped. The same runs and scores yield the same bytes.
 """
@@ -6,10 +6,8 @@ All text from logs, truth or settings is escaped. The same runs and scores yield
 from __future__ import annotations
 
 import base64
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -19,39 +17,31 @@ from crosscue.eval.runs.candidates import CandidateRow, candidate_lines, not_loo
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DriveManifest, EstimateManifest
 from crosscue.eval.runs.moments import span_ns
+from crosscue.eval.runs.stored_images import run_camera
 from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.drives import PooledScores
-from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.runs import RunScored
 from crosscue.localization.camera_watch import steps_of, windows_of
-from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import spelled, strict_json
-from crosscue.replay.time.dates import is_date
 from crosscue.replay.vehicle.cue_table import CUES
 
 from . import scene_figures
-from .html import write_page
-from .opening import Opening, curves_of, opening_of
-from .pose_figures import draw_all
-from .scene_figures import WorstFrame
+from .frame_pictures import draw_pictures
+from .html import number, write_page
+from .opening import Mistake, Opening, curves_of, opening_of
+from .pose_figures import Figure, pose_figures, track_figures
 
 if TYPE_CHECKING:
     from markupsafe import Markup
 
 REPORT: Final = "report.html"
 TEMPLATE: Final = "page.html.j2"
-POSE_FIGURES: Final = {
-    "pose_plan.png": "True and estimated track, with the 2-sigma ellipse at twelve moments.",
-    "pose_error.png": "Distance from the truth, and the filter's standard deviation.",
-    "pose_heading.png": "Heading error, and the filter's standard deviation.",
-    "pose_nees.png": "Squared error in units of the filter's covariance; the band contains 95 % of "
-    "it if the filter is consistent.",
-    "pose_major_axis.png": "Length of the 2-sigma ellipse against distance travelled.",
-}
 # Rows of the visual odometry over which its pitch is filtered.
 FILTERED: Final = 4
 # Max number of approaches with their own chart.
 BELIEFS: Final = 12
+# Max number of failures with their pictures.
+MAX_FRAMES: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,25 +60,14 @@ class _Run:
 
 
 @dataclass(frozen=True, slots=True)
-class _Picture:
-    base64: str
-    caption: str
-
-
-@dataclass(frozen=True, slots=True)
-class _Chart:
-    svg: Markup
-    caption: str
-
-
-@dataclass(frozen=True, slots=True)
 class _Figures:
     distances: Markup | None
-    beliefs: tuple[_Chart, ...]
+    beliefs: tuple[Figure, ...]
     beliefs_left_out: int
     reliability: Markup | None
     range: Markup | None
     range_is_traced: bool
+    pose: tuple[Figure, ...] = ()
 
 
 NO_FIGURES: Final = _Figures(None, (), 0, None, None, False)
@@ -99,36 +78,52 @@ def write_report(
     scored: Sequence[RunScored],
     scores: PooledScores,
     metrics: Mapping[str, Any],
-    worst: Sequence[WorstFrame],
+    mistakes: Sequence[Mistake] = (),
     *,
     has_figures: bool = True,
 ) -> Path:
-    """Write ``report.html`` of one run or many, with figures of a single run's pose next to it.
+    """Write ``report.html`` of one run or many.
 
     Args:
         folder: Output folder; for one run its ``score`` folder.
         scored: All runs, at least one.
         scores: Pooled scores of all runs.
         metrics: Metrics from ``metrics_of``, with additions of the command.
-        worst: Frames from ``worst_frames``, shown with their pictures.
-        has_figures: Draw figures, for which matplotlib is imported; tables and frames are always
-            written.
+        mistakes: Failures of the runs in the order in which they are shown.
+        has_figures: Draw charts; tables and pictures are always written.
 
     Raises:
         RunError: A run's manifest or tables cannot be read.
         OutputError: A file cannot be written.
     """
-    content = _content([one.run for one in scored], metrics, worst) | {
+    drawn = _drawn(scored, mistakes[:MAX_FRAMES])
+    content = _content([one.run for one in scored], metrics) | {
         "sources": sorted({one.truth.truth.source for one in scored}),
         "simulated": sum(map(_is_simulated, scored)),
-        "opening": _opening(scored, scores, worst),
+        "opening": _opening(scored, scores, mistakes),
+        "frames": [(one, drawn.get((one.run, one.t_ns), "")) for one in mistakes[:MAX_FRAMES]],
+        "figures": _figures(scored, scores) if has_figures else NO_FIGURES,
     }
-    if has_figures and len(scored) == 1 and scored[0].poses is not None:
-        draw_all(scored[0].poses, folder)
-    content["figures"] = _figures(scored, scores) if has_figures else NO_FIGURES
-    content["pose_figures"] = _pose_figures(folder) if has_figures and len(scored) == 1 else []
-    _write(folder / REPORT, content)
+    write_page(folder / REPORT, TEMPLATE, content)
     return folder / REPORT
+
+
+def _drawn(
+    scored: Sequence[RunScored], mistakes: Sequence[Mistake]
+) -> Mapping[tuple[str, int], str]:
+    """Return the pictures of mistakes by run and time, with what is true beside what was found."""
+    found: dict[tuple[str, int], str] = {}
+    for one in scored:
+        name = str(one.run.path)
+        times = [mistake.t_ns for mistake in mistakes if mistake.run == name]
+        if not times or run_camera(one.run) is None:
+            continue
+
+        def keep(t_ns: int, picture: bytes, _: bytes, name: str = name) -> None:
+            found[name, t_ns] = base64.b64encode(picture).decode()
+
+        draw_pictures(one.run, times, keep, truth=one.truth_path)
+    return found
 
 
 def write_report_without_truth(run: RunFolder, path: Path, threshold: float) -> None:
@@ -157,46 +152,38 @@ def write_report_without_truth(run: RunFolder, path: Path, threshold: float) -> 
     curves, cues = curves_of(run)
     gaps = gaps_of(run.drive_manifest().timeline)
     charts = tuple(
-        _Chart(
+        Figure(
             scene_figures.draw_belief(curve, cues, threshold, gaps),
             f"{curve.intersection}. Dashed: believed above it.",
         )
         for curve in curves[:BELIEFS]
     )
     logs = run.drive_manifest().logs
-    content = _content([run], metrics, ()) | {
+    content = _content([run], metrics) | {
         "sources": (),
         "simulated": int(all(log.is_simulated for log in logs)),
         "opening": opening_of(run, threshold),
-        "figures": replace(NO_FIGURES, beliefs=charts, beliefs_left_out=len(curves[BELIEFS:])),
-        "pose_figures": [],
+        "frames": (),
+        "figures": replace(
+            NO_FIGURES,
+            beliefs=charts,
+            beliefs_left_out=len(curves[BELIEFS:]),
+            pose=track_figures(run, gaps),
+        ),
     }
-    _write(path, content)
-
-
-def _write(path: Path, content: Mapping[str, Any]) -> None:
-    formats: dict[str, Callable[..., str]] = {
-        "number": _number,
-        "style_of": scene_figures.style_of,
-        "signed": _signed,
-        "never": _never,
-        "span": _span,
-        "ends": _ends,
-        "by_cluster": _by_cluster,
-    }
-    write_page(path, TEMPLATE, content, formats)
+    write_page(path, TEMPLATE, content)
 
 
 def _opening(
-    scored: Sequence[RunScored], scores: PooledScores, worst: Sequence[WorstFrame]
+    scored: Sequence[RunScored], scores: PooledScores, mistakes: Sequence[Mistake]
 ) -> Opening:
     if len(scored) == 1:
-        return opening_of(scored[0].run, scores.settings.threshold, scored[0], worst)
+        return opening_of(scored[0].run, scores.settings.threshold, scored[0], mistakes)
     of = scores.approaches
     if of is None:
         return Opening(())
     detected, full, false = of.detected, of.full, of.false_features
-    detected_m, full_m = _number(of.detected_m.value, 1), _number(of.full_m.value, 1)
+    detected_m, full_m = number(of.detected_m.value, 1), number(of.full_m.value, 1)
     found = (
         f"{detected.right} of {detected.of} intersections found, {detected_m} m ahead on average"
     )
@@ -211,9 +198,7 @@ def _is_simulated(one: RunScored) -> bool:
     return all(log.is_simulated for log in logs) or "simulated" in one.truth.truth.source.lower()
 
 
-def _content(
-    folders: Sequence[RunFolder], metrics: Mapping[str, Any], worst: Sequence[WorstFrame]
-) -> dict[str, Any]:
+def _content(folders: Sequence[RunFolder], metrics: Mapping[str, Any]) -> dict[str, Any]:
     runs = [_run(one) for one in folders]
     cues = [_cue(name, one) for name, one in metrics["cues"].items()]
     pose = metrics["pose"]
@@ -235,7 +220,6 @@ def _content(
         "range_scores": metrics["range"],
         "attribution": metrics.get("attribution"),
         "has_scene": bool(metrics["approaches"] or metrics["belief"]),
-        "frames": [_frame(one) for one in worst],
         "pose": pose if is_alone else None,
         "poses": None if is_alone else pose,
     }
@@ -304,22 +288,6 @@ def _cue(name: str, score: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _frame(one: WorstFrame) -> dict[str, Any]:
-    return {
-        **asdict(one),
-        "distance": "" if math.isnan(one.distance_m) else f"{one.distance_m:.0f}",
-        "when": reported_time(one.t_ns),
-    }
-
-
-def reported_time(t_ns: int) -> str:
-    """Return a time as the viewer shows it: a date, or seconds for a clock that starts at boot."""
-    if not is_date(t_ns):
-        return f"{t_ns * 1e-9:.3f} s"
-    at = datetime.fromtimestamp(t_ns // 1_000_000_000, UTC)
-    return f"{at:%Y-%m-%d %H:%M:%S}.{t_ns // 1_000_000 % 1000:03d} UTC"
-
-
 def _figures(scored: Sequence[RunScored], scores: PooledScores) -> _Figures:
     threshold = scores.settings.threshold
     curves = [
@@ -335,7 +303,7 @@ def _figures(scored: Sequence[RunScored], scores: PooledScores) -> _Figures:
     return _Figures(
         distances=scene_figures.draw_distances(results) if results else None,
         beliefs=tuple(
-            _Chart(
+            Figure(
                 scene_figures.draw_belief(
                     curve, one.judged.cues, threshold, gaps[one.judged.coverage.drive]
                 ),
@@ -347,47 +315,9 @@ def _figures(scored: Sequence[RunScored], scores: PooledScores) -> _Figures:
         reliability=scene_figures.draw_reliability(scores.belief) if scores.belief else None,
         range=scene_figures.draw_range(ranges, scores.range, gaps) if scores.range else None,
         range_is_traced=tracks <= scene_figures.TRACES,
+        pose=() if len(scored) > 1 or scored[0].poses is None else pose_figures(scored[0].poses),
     )
 
 
 def _report_text(one: RunScored, intersection: str) -> str:
     return f"{_name(one.run)}: approach to {intersection}. Dashed: established above it."
-
-
-def _pose_figures(folder: Path) -> list[_Picture]:
-    return [
-        _Picture(base64.b64encode(door.read(folder / name)).decode(), caption)
-        for name, caption in POSE_FIGURES.items()
-        if (folder / name).exists()
-    ]
-
-
-def _number(value: float | None, digits: int = 2) -> str:
-    return "-" if value is None or math.isnan(value) else f"{value:.{digits}f}"
-
-
-def _signed(value: float | None, digits: int = 1) -> str:
-    return "-" if value is None or math.isnan(value) else f"{value:+.{digits}f}"
-
-
-def _never(value: float | None) -> str:
-    return "never" if value is None else "unknown" if math.isnan(value) else f"{value:.1f}"
-
-
-def _ends(low: float | None, high: float | None) -> str:
-    if low is None or high is None or math.isnan(low) or math.isnan(high):
-        return "-"
-    return f"{low:.2f} to {high:.2f}"
-
-
-def _by_cluster(fraction: Mapping[str, Any]) -> str:
-    ends = _ends(fraction["clusters_low"], fraction["clusters_high"])
-    return TOO_FEW if ends == "-" and fraction["of"] else ends
-
-
-def _span(mean: Mapping[str, Any], digits: int = 2) -> str:
-    """Return an interval in brackets, or why it is missing; empty without rows."""
-    low, high = mean["low"], mean["high"]
-    if low is None or high is None or math.isnan(low) or math.isnan(high):
-        return f" ({TOO_FEW})" if mean["of"] else ""
-    return f" ({low:.{digits}f} to {high:.{digits}f})"

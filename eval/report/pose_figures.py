@@ -1,174 +1,238 @@
-"""Figures of a pose track compared with its truth."""
+"""Charts of a pose track: on a map, and over the distance travelled."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, Final
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 
-from crosscue.eval.runs.tables.log_time import broken_at
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.tables.log_time import ClockGap, broken_at
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.scoring.pose.score import ScoredPoses
-from crosscue.replay.columns import Floats
-from crosscue.replay.files.whole_file import write_whole
+from crosscue.replay.columns import Floats, Int64s
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from .scene_figures import WIDTH, shade
+from .svg_plot import Panel, SvgChart, ticks
 
-ESTIMATE: Final = "#1f77b4"
-TRUTH: Final = "#2ca02c"
-BAND: Final = "#ff7f0e"
 ELLIPSES: Final = 12
+HEIGHT: Final = 150.0
+MAX_MAP: Final = 420.0
+# Max number of points of a line; a page of an hour's drive stays small.
+POINTS: Final = 1500
 
 
-def draw_all(poses: ScoredPoses, folder: Path) -> list[Path]:
-    """Write the figures as PNG files and return their paths; NEES only if it is defined."""
-    jobs: dict[str, tuple[Callable[[Axes, ScoredPoses], None], tuple[float, float]]] = {
-        "pose_plan.png": (_plan, (7.0, 6.0)),
-        "pose_error.png": (_error, (7.0, 3.4)),
-        "pose_heading.png": (_heading, (7.0, 3.4)),
-        "pose_nees.png": (_nees, (7.0, 3.4)),
-        "pose_major_axis.png": (_major_axis, (7.0, 3.4)),
-    }
-    if not np.isfinite(poses.nees).any():
-        del jobs["pose_nees.png"]
-        (folder / "pose_nees.png").unlink(missing_ok=True)
-    return [_draw(folder / name, paint, poses, size) for name, (paint, size) in jobs.items()]
+class Figure(NamedTuple):
+    """A chart with its caption."""
+
+    svg: Markup
+    caption: str
 
 
-def _draw(
-    path: Path,
-    paint: Callable[[Axes, ScoredPoses], None],
-    poses: ScoredPoses,
-    size: tuple[float, float],
-) -> Path:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+class Track(NamedTuple):
+    """An estimated track, and the true one where it is known.
 
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    paint(axes, poses)
-    axes.set_title(poses.title, fontsize=9, loc="left", color="0.35", parse_math=False)
-    axes.grid(alpha=0.3)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    Attributes:
+        t_ns: Shape (N,).
+        estimate_m: Shape (N, 2): east and north.
+        truth_m: Shape (N, 2), or None.
+        cov_m2: Shape (N, 2, 2): covariance of the position.
+        gaps: Gaps of the drive.
+    """
 
-    def save(partial: Path) -> None:
-        # The library's own stamp would change the bytes with its version.
-        figure.savefig(partial, dpi=130, format="png", metadata={"Software": ""})
-
-    with warnings.catch_warnings():
-        # The title may have characters that the font lacks.
-        warnings.filterwarnings("ignore", "Glyph")
-        write_whole(path, save)
-    return path
+    t_ns: Int64s
+    estimate_m: Floats
+    truth_m: Floats | None
+    cov_m2: Floats
+    gaps: Sequence[ClockGap]
 
 
-def _broken(poses: ScoredPoses, *columns: Floats) -> tuple[Floats, ...]:
-    """Return columns with NaN between two rows that a gap of the drive separates."""
-    rows = broken_at(poses.gaps, poses.t_ns)
-    return tuple(np.insert(np.asarray(one, np.float64), rows, np.nan) for one in columns)
-
-
-def _time_axis(axes: Axes, poses: ScoredPoses) -> None:
-    """Label the axis in seconds; shade each gap of the drive and label it with its length."""
-    first_ns, last_ns = int(poses.t_ns[0]), int(poses.t_ns[-1])
-    axes.set_xlim(0.0, float(poses.seconds[-1]))
-    shown = [one for one in poses.gaps if first_ns <= one.middle_ns <= last_ns]
-    is_shortened = False
-    for one in shown:
-        ends_s = poses.shown_s(np.array([one.start_ns, one.end_ns], np.int64))
-        is_shortened |= float(np.ptp(ends_s)) < (one.end_ns - one.start_ns) * 0.999e-9
-        axes.axvspan(*ends_s.tolist(), color="0.5", alpha=0.18, lw=0)
-        axes.text(
-            float(ends_s.mean()),
-            0.5,
-            one.text,
-            transform=axes.get_xaxis_transform(),
-            rotation=90,
-            ha="center",
-            va="center",
-            fontsize=8,
-            color="0.3",
+def pose_figures(poses: ScoredPoses) -> tuple[Figure, ...]:
+    """Draw a scored pose: the map, errors over the distance, and NEES where it is defined."""
+    track = Track(poses.t_ns, poses.estimate_m, poses.truth_m, poses.cov[:, :2, :2], poses.gaps)
+    error_m = np.linalg.norm(poses.estimate_m - poses.truth_m, axis=1)
+    sd_m = np.sqrt(np.maximum(np.linalg.eigvalsh(track.cov_m2)[:, 1], 0.0))
+    heading_sd = np.sqrt(np.maximum(poses.cov[:, 2, 2], 0.0))
+    found = [
+        Figure(draw_map(track), "True and estimated track, with twelve 2-sigma ellipses."),
+        Figure(
+            _over_distance(poses, "Position error (m)", error_m, (0.0 * sd_m, 2.0 * sd_m)),
+            "Distance from the truth, and the filter's 2-sigma band.",
+        ),
+        Figure(
+            _over_distance(
+                poses,
+                "Heading error (deg)",
+                np.rad2deg(poses.heading_error_rad),
+                (np.rad2deg(-2.0 * heading_sd), np.rad2deg(2.0 * heading_sd)),
+            ),
+            "Heading error, and the filter's 2-sigma band.",
+        ),
+        Figure(
+            draw_ellipse(
+                poses.t_ns,
+                poses.travelled_m,
+                poses.major_axis_m,
+                poses.gaps,
+                poses.lost_above_m,
+            ),
+            "Length of the 2-sigma ellipse; above the dashed line the pose counts as lost.",
+        ),
+    ]
+    if np.isfinite(poses.nees).any():
+        low, high = mean_band(3, 1)
+        ones = np.ones(len(poses.t_ns))
+        band = np.log10(low * ones), np.log10(high * ones)
+        nees = np.log10(np.maximum(poses.nees, 1e-3))
+        found.append(
+            Figure(
+                _over_distance(poses, "NEES of x, y, heading (log10)", nees, band),
+                "Squared error in units of the filter's covariance; the band contains 95 % of it "
+                "if the filter is consistent.",
+            )
         )
-    axes.set_xlabel("time (s), long gaps shortened" if is_shortened else "time (s)")
+    return tuple(found)
 
 
-def _plan(axes: Axes, poses: ScoredPoses) -> None:
-    axes.plot(*_broken(poses, *poses.truth_m.T), color=TRUTH, lw=3, alpha=0.6, label="truth")
-    axes.plot(*_broken(poses, *poses.estimate_m.T), color=ESTIMATE, lw=1.2, label="estimate")
-    rows = np.unique(np.linspace(0, len(poses.t_ns) - 1, ELLIPSES).astype(int))
-    for i, row in enumerate(rows):
-        ring = _ellipse(poses.estimate_m[row], poses.cov[row, :2, :2])
-        axes.plot(*ring, color=BAND, lw=0.8, label="2-sigma ellipse" if i == 0 else None)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("x, east (m)")
-    axes.set_ylabel("y, north (m)")
-    axes.legend(frameon=False)
+def track_figures(run: RunFolder, gaps: Sequence[ClockGap]) -> tuple[Figure, ...]:
+    """Draw the pose of a run without a truth; empty without a pose.
+
+    Raises:
+        RunError: The table is damaged.
+    """
+    names = ["x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "travelled_m", "major_axis_m"]
+    if not run.file("pose.parquet").exists():
+        return ()
+    table = run.table("pose", ["t_ns", *names])
+    if not len(table):
+        return ()
+    t_ns = table["t_ns"].to_numpy()
+    x, y, xx, xy, yy, travelled_m, axis_m = (table[name].to_numpy() for name in names)
+    cov_m2 = np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
+    track = Track(t_ns, np.stack([x, y], axis=1), None, cov_m2, gaps)
+    return (
+        Figure(draw_map(track), "Estimated track, with twelve 2-sigma ellipses."),
+        Figure(draw_ellipse(t_ns, travelled_m, axis_m, gaps), "Length of the 2-sigma ellipse."),
+    )
 
 
-def _ellipse(centre: Floats, cov: Floats) -> Floats:
-    angle = np.linspace(0.0, 2.0 * np.pi, 61)
-    values, vectors = np.linalg.eigh(cov)
+def draw_map(track: Track) -> Markup:
+    """Draw the track on a map with equal scales, the truth below the estimate."""
+    both = [track.estimate_m] if track.truth_m is None else [track.estimate_m, track.truth_m]
+    known = np.concatenate(both)
+    known = known[np.isfinite(known).all(axis=1)]
+    low, high = known.min(axis=0), known.max(axis=0)
+    margin = 0.06 * max(float(np.ptp(known, axis=0).max()), 10.0)
+    wide, tall = (high - low + 2.0 * margin).tolist()
+    across = WIDTH - 70.0
+    height = min(max(across * tall / wide, 120.0), MAX_MAP)
+    # The shorter side is extended, so that a metre has one length.
+    scale = max(wide / across, tall / height)
+    middle = (low + high) / 2.0
+    half = 0.5 * scale * across, 0.5 * scale * height
+    x_range = (float(middle[0] - half[0]), float(middle[0] + half[0]))
+    y_range = (float(middle[1] - half[1]), float(middle[1] + half[1]))
+    panel = Panel(56, 34, across, height, x_range, y_range)
+    named = [] if track.truth_m is None else [("line truth thick", "truth")]
+    drawing = SvgChart(
+        WIDTH,
+        panel.bottom + 38,
+        "Map",
+        "Estimated track" + (" and true track" if named else "") + ", east and north in metres.",
+    )
+    drawing.axes(panel, "x, east (m)", "y, north (m)")
+    rows = _thinned(len(track.t_ns))
+    breaks = broken_at(track.gaps, track.t_ns[rows])
+    for points, style in ((track.truth_m, "line truth thick"), (track.estimate_m, "line found")):
+        if points is not None:
+            x, y = (np.insert(points[rows, i], breaks, np.nan) for i in (0, 1))
+            drawing.curve(panel, x, y, style)
+    for row in np.unique(np.linspace(0, len(track.t_ns) - 1, ELLIPSES).astype(int)):
+        x, y = _ellipse(track.estimate_m[row], track.cov_m2[row])
+        drawing.curve(panel, x, y, "line sigma")
+    drawing.legend(8, 14, [*named, ("line found", "estimate"), ("line sigma", "2 sigma")])
+    return drawing.svg()
+
+
+def draw_ellipse(
+    t_ns: Int64s,
+    travelled_m: Floats,
+    major_axis_m: Floats,
+    gaps: Sequence[ClockGap] = (),
+    lost_above_m: float = math.nan,
+) -> Markup:
+    """Draw the length of the 2-sigma ellipse over the distance travelled."""
+    highest = max(float(np.nanmax(major_axis_m)), 0.1)
+    if lost_above_m < 4.0 * highest:
+        highest = max(highest, lost_above_m)
+    panel = Panel(44, 34, WIDTH - 58, HEIGHT, _distances(travelled_m), (0.0, 1.05 * highest))
+    drawing = _chart(panel, "2-sigma ellipse, full major axis (m)")
+    rows = _thinned(len(t_ns))
+    breaks = broken_at(gaps, t_ns[rows])
+    _gaps(drawing, panel, gaps, t_ns, travelled_m)
+    x, y = (np.insert(one[rows], breaks, np.nan) for one in (travelled_m, major_axis_m))
+    drawing.curve(panel, x, y, "line sigma")
+    if lost_above_m <= highest:
+        lost = panel.y(lost_above_m)
+        drawing.rule(panel.left, lost, panel.right, lost, "line dash")
+    return drawing.svg()
+
+
+def _over_distance(
+    poses: ScoredPoses, label: str, values: Floats, band: tuple[Floats, Floats]
+) -> Markup:
+    """Draw an error over the distance travelled, with what the filter claims."""
+    low, high = (float(np.nanquantile(one, q)) for one, q in zip(band, (0.05, 0.95), strict=True))
+    low, high = min(low, float(np.nanmin(values))), max(high, float(np.nanmax(values)))
+    margin = 0.05 * (high - low) or 1.0
+    ends = (low if low == 0.0 else low - margin, high + margin)
+    panel = Panel(44, 34, WIDTH - 58, HEIGHT, _distances(poses.travelled_m), ends)
+    drawing = _chart(panel, label)
+    _gaps(drawing, panel, poses.gaps, poses.t_ns, poses.travelled_m)
+    rows = _thinned(len(values))
+    x_m = poses.travelled_m[rows]
+    for part in np.split(np.arange(len(rows)), broken_at(poses.gaps, poses.t_ns[rows])):
+        inside = [np.clip(one[rows][part], *ends) for one in band]
+        drawing.band(panel, x_m[part], inside[0], inside[1], "band sigma")
+        drawing.curve(panel, x_m[part], values[rows][part], "line found")
+    return drawing.svg()
+
+
+def _chart(panel: Panel, label: str) -> SvgChart:
+    drawing = SvgChart(
+        WIDTH, panel.bottom + 38, label, f"{label} over the distance travelled, in metres."
+    )
+    decades = ticks(*panel.y_range, 5)
+    drawing.axes(panel, "distance travelled (m)", label, decades)
+    return drawing
+
+
+def _gaps(
+    drawing: SvgChart,
+    panel: Panel,
+    gaps: Sequence[ClockGap],
+    t_ns: Int64s,
+    travelled_m: Floats,
+) -> None:
+    for gap in gaps:
+        for row in broken_at([gap], t_ns):
+            shade(drawing, panel, travelled_m[row - 1 : row + 1], gap.text)
+
+
+def _distances(travelled_m: Floats) -> tuple[float, float]:
+    return 0.0, max(float(np.nanmax(travelled_m)), 1.0)
+
+
+def _thinned(rows: int) -> np.typing.NDArray[np.intp]:
+    return np.unique(np.linspace(0, rows - 1, min(rows, POINTS)).astype(np.intp))
+
+
+def _ellipse(centre: Floats, cov_m2: Floats) -> Floats:
+    angle = np.linspace(0.0, 2.0 * np.pi, 41)
+    values, vectors = np.linalg.eigh(cov_m2)
     axes = vectors * (2.0 * np.sqrt(np.maximum(values, 0.0)))
     ring: Floats = axes @ np.stack([np.cos(angle), np.sin(angle)]) + centre[:, None]
     return ring
-
-
-def _error(axes: Axes, poses: ScoredPoses) -> None:
-    error = np.linalg.norm(poses.estimate_m - poses.truth_m, axis=1)
-    claimed = 2.0 * np.sqrt(np.linalg.eigvalsh(poses.cov[:, :2, :2])[:, 1])
-    seconds, claimed, error = _broken(poses, poses.seconds, claimed, error)
-    axes.fill_between(seconds, 0.0, claimed, color=BAND, alpha=0.25, lw=0, label="2 sigma")
-    axes.plot(seconds, error, color=ESTIMATE, lw=1.2, label="position error")
-    axes.set_ylim(bottom=0.0)
-    _time_axis(axes, poses)
-    axes.set_ylabel("metres")
-    axes.legend(frameon=False)
-
-
-def _heading(axes: Axes, poses: ScoredPoses) -> None:
-    claimed = np.rad2deg(2.0 * np.sqrt(poses.cov[:, 2, 2]))
-    error = np.rad2deg(poses.heading_error_rad)
-    seconds, claimed, error = _broken(poses, poses.seconds, claimed, error)
-    axes.fill_between(seconds, -claimed, claimed, color=BAND, alpha=0.25, lw=0, label="2 sigma")
-    axes.plot(seconds, error, color=ESTIMATE, lw=1.2, label="heading error")
-    _time_axis(axes, poses)
-    axes.set_ylabel("degrees")
-    axes.legend(frameon=False)
-
-
-def _nees(axes: Axes, poses: ScoredPoses) -> None:
-    low, high = mean_band(3, 1)
-    axes.axhspan(low, high, color=BAND, alpha=0.2, lw=0, label="95 % band of chi-square(3)")
-    axes.plot(
-        *_broken(poses, poses.seconds, poses.nees),
-        color=ESTIMATE,
-        lw=1.0,
-        label="NEES of x, y, heading",
-    )
-    axes.set_yscale("log")
-    _time_axis(axes, poses)
-    axes.legend(frameon=False)
-
-
-def _major_axis(axes: Axes, poses: ScoredPoses) -> None:
-    columns = _broken(poses, poses.travelled_m, poses.major_axis_m)
-    axes.plot(*columns, color=ESTIMATE, lw=1.4)
-    axes.axhline(poses.lost_above_m, color="0.3", ls="--", lw=1.0)
-    axes.annotate(
-        "lost above this",
-        (0.0, poses.lost_above_m),
-        xytext=(4, 3),
-        textcoords="offset points",
-        fontsize=8,
-        color="0.3",
-    )
-    axes.set_ylim(bottom=0.0)
-    axes.set_xlim(left=0.0)
-    axes.set_xlabel("distance travelled (m)")
-    axes.set_ylabel("2-sigma ellipse, full major axis (m)")

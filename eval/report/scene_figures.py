@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.log_time import ClockGap, broken_at
+from crosscue.eval.scoring.boxes.reliability import Reliability
+from crosscue.eval.scoring.intervals import Proportion
 from crosscue.eval.scoring.scene.approaches import THRESHOLD, ApproachResult, Curve
 from crosscue.eval.scoring.scene.belief import BeliefScore
 from crosscue.eval.scoring.scene.cues import CueFrames, is_wrong
 from crosscue.eval.scoring.scene.ranges import RangeJudged, RangeScore
 
+from .html import style_of
 from .svg_plot import Panel, SvgChart
 
-STYLES: Final[Mapping[str, str]] = {
-    "intersection": "s0", "left": "s1", "right": "s2", "straight": "s3",
-}  # fmt: skip
 WIDTH: Final = 480.0
 PUBLISHED_DETECTED_M: Final = 34.4
 PUBLISHED_FULL_M: Final = 16.2
@@ -33,11 +33,6 @@ AXES: Final[Mapping[str, str]] = {
     "distance": "true distance to the intersection (m)",
     "time": "time to the last frame (s)",
 }
-
-
-def style_of(feature: str) -> str:
-    """Return the style of a feature; user-defined features share one colour."""
-    return STYLES.get(feature, "s4")
 
 
 def draw_distances(results: Sequence[ApproachResult]) -> Markup:
@@ -138,7 +133,7 @@ def draw_belief(
     drawing.rule(panel.left, panel.y(threshold), panel.right, panel.y(threshold), "line dash")
     t_ns, distance_m = _way(curve, cues)
     for gap, row in _between_rows(gaps, t_ns):
-        _shade(drawing, panel, np.minimum(distance_m[row - 1 : row + 1], far), gap.text)
+        shade(drawing, panel, np.minimum(distance_m[row - 1 : row + 1], far), gap.text)
     rows = broken_at(gaps, curve.t_ns)
     distance_m = np.insert(curve.distance_m, rows, np.nan)
     for name, values in curve.features.items():
@@ -178,7 +173,7 @@ def _between_rows(gaps: Sequence[ClockGap], t_ns: NDArray[np.int64]) -> list[tup
     return [(one, int(row)) for one in gaps for row in broken_at([one], t_ns)]
 
 
-def _shade(drawing: SvgChart, panel: Panel, ends: NDArray[np.float64], text: str) -> None:
+def shade(drawing: SvgChart, panel: Panel, ends: NDArray[np.float64], text: str) -> None:
     """Shade a gap between two values of x and label it with its length."""
     left, right = sorted(panel.x(value) for value in ends.tolist())
     drawing.rect(left, panel.top, max(right - left, 2.0), panel.height, "gap")
@@ -215,33 +210,6 @@ def _lane(
             if across:
                 drawing.rect(min(across) - 1, y + 2, max(across) - min(across) + 3, 10, style)
     drawing.text(panel.left - 6, y + 11, cue.cue.replace("_", " "), "tick", "end")
-
-
-@dataclass(frozen=True, slots=True)
-class WorstFrame:
-    """A frame with a false positive cue.
-
-    Attributes:
-        run: Name of the drive in the scores.
-        t_ns: Time in the run's tables.
-        cue: Name of the cue.
-        count: Number of objects found.
-        true_count: True number of objects, or None if unknown.
-        distance_m: Distance to the intersection ahead; NaN if there is no intersection.
-        confidence: Highest score of the cue's detections, or None without scores.
-        frames: Number of wrong frames of this cue around this one.
-        picture: JPEG in base64; empty if the log or the picture is missing.
-    """
-
-    run: str
-    t_ns: int
-    cue: str
-    count: int
-    true_count: int | None
-    distance_m: float
-    confidence: float | None
-    frames: int
-    picture: str = ""
 
 
 # Max width of a distance bin, which bounds the distance of its middle from its rows.
@@ -284,7 +252,7 @@ def draw_range(
     )
     drawing.axes(above, "true range (m)", "estimate less truth (m)")
     for one in rows:
-        style = "s2" if one.reference == "start" else "s5"
+        style = one.reference
         if few:
             _traces(drawing, above, one, style, (gaps or {}).get(one.drive, ()))
         else:
@@ -292,7 +260,7 @@ def draw_range(
     drawing.axes(below, "true range (m)", "mean NEES, 1 is consistent")
     drawing.rule(below.left, below.y(1.0), below.right, below.y(1.0), "line dash")
     for name, score in scores.items():
-        style = "s2" if name == "start" else "s5"
+        style = name
         for bin_, part in score.by_distance.items():
             middle = min(max(_middle(bin_), near), far)
             hint = f"{bin_} m: {part.nees:.2f}"
@@ -301,8 +269,8 @@ def draw_range(
         10,
         14,
         [
-            ("line s2", "to the start"),
-            ("line s5", "to the end"),
+            ("line start", "to the start"),
+            ("line end", "to the end"),
             ("bandkey", "estimated 2 sigma" if few else "rms error"),
         ],
     )
@@ -317,7 +285,7 @@ def _traces(
         mine = np.flatnonzero(one.approach == number)
         if one.reference == "start":
             for gap, row in _between_rows(gaps, one.t_ns[mine]):
-                _shade(drawing, panel, one.true_m[mine[row - 1 : row + 1]], gap.text)
+                shade(drawing, panel, one.true_m[mine[row - 1 : row + 1]], gap.text)
         for part in np.split(mine, broken_at(gaps, one.t_ns[mine])):
             two_sd = np.minimum(2.0 * np.sqrt(one.var_m2[part]), high)
             drawing.band(panel, one.true_m[part], -two_sd, two_sd, f"band {style}")
@@ -346,44 +314,90 @@ def _max_nees(scores: Mapping[str, RangeScore]) -> float:
     return max(2.0, max(found, default=2.0) * 1.1)
 
 
+class _Bin(NamedTuple):
+    """A bin of stated probabilities, and what was observed in it."""
+
+    stated: float
+    observed: float
+    low: float
+    high: float
+    weight: int
+    hint: str
+
+
 def draw_reliability(belief: Mapping[str, BeliefScore]) -> Markup:
     """Draw the frequency of features against their stated probability, with 95 % intervals."""
+    series = {
+        name: (
+            style_of(name),
+            [
+                _Bin(
+                    one.mean_probability,
+                    one.there.value,
+                    *interval(one.there),
+                    one.steps,
+                    f"{name}: {one.steps} steps, stated {one.mean_probability:.2f}, so in ",
+                )
+                for one in score.reliability
+            ],
+        )
+        for name, score in belief.items()
+    }
+    return _reliability(series, "stated probability", "observed fraction", "steps")
+
+
+def draw_calibration(calibration: Sequence[Reliability]) -> Markup | None:
+    """Draw the fraction of correct detections against their score; None without any detection."""
+    series = {
+        one.label: (
+            f"s{number % 5}",
+            [
+                _Bin(
+                    each.mean_score,
+                    each.fraction,
+                    each.interval.low,
+                    each.interval.high,
+                    each.detections,
+                    f"{one.label}: {each.detections} detections, score {each.mean_score:.2f}, so ",
+                )
+                for each in one.bins
+                if each.detections
+            ],
+        )
+        for number, one in enumerate(calibration)
+        if one.detections
+    }
+    return _reliability(series, "score", "fraction right", "detections") if series else None
+
+
+def _reliability(
+    series: Mapping[str, tuple[str, Sequence[_Bin]]], stated: str, observed: str, what: str
+) -> Markup:
     panel = Panel(40, 46, 300, 260, (0.0, 1.0), (0.0, 1.0))
     drawing = SvgChart(
         panel.right + 20,
         panel.bottom + 38,
         "Reliability",
-        "Fraction of steps in which a feature was there, for ten bins of its stated probability; "
-        "points on the diagonal are well calibrated.",
+        f"{observed.capitalize()} of {what} for ten bins of the {stated}; points on the diagonal "
+        "are well calibrated.",
     )
-    drawing.axes(panel, "stated probability", "observed fraction")
+    drawing.axes(panel, stated, observed)
     drawing.rule(panel.x(0), panel.y(0), panel.x(1), panel.y(1), "line dash")
-    limit_m = max((one.steps for score in belief.values() for one in score.reliability), default=1)
-    for place, (name, score) in enumerate(belief.items()):
-        for one in score.reliability:
-            # Slightly offset, so that features do not hide each other.
-            x = panel.x(one.mean_probability) + 3.0 * (place - 1.5)
-            low, high = interval(
-                one.there.low, one.there.high, one.there.clusters_low, one.there.clusters_high
-            )
-            drawing.rule(x, panel.y(low), x, panel.y(high), f"line {style_of(name)}")
-            radius = 2.0 + 4.0 * math.sqrt(one.steps / limit_m)
-            hint = f"{name}: {one.steps} steps, stated {one.mean_probability:.2f}, so in "
-            drawing.dot(
-                x,
-                panel.y(one.there.value),
-                radius,
-                f"fill {style_of(name)}",
-                f"{hint}{one.there.value:.2f}",
-            )
-    drawing.legend(8, 14, [(f"fill {style_of(name)}", name) for name in belief])
+    most = max((one.weight for _, bins in series.values() for one in bins), default=1)
+    for place, (style, bins) in enumerate(series.values()):
+        for one in bins:
+            # Slightly offset, so that series do not hide each other.
+            x = panel.x(one.stated) + 3.0 * (place - 0.5 * (len(series) - 1))
+            drawing.rule(x, panel.y(one.low), x, panel.y(one.high), f"line {style}")
+            radius = 2.0 + 4.0 * math.sqrt(one.weight / most)
+            hint = f"{one.hint}{one.observed:.2f}"
+            drawing.dot(x, panel.y(one.observed), radius, f"fill {style}", hint)
+    drawing.legend(8, 14, [(f"fill {style}", name) for name, (style, _) in series.items()])
     return drawing.svg()
 
 
-def interval(
-    low: float, high: float, clusters_low: float, clusters_high: float
-) -> tuple[float, float]:
-    """Return the wider of both intervals."""
-    if math.isnan(clusters_low):
-        return low, high
-    return min(low, clusters_low), max(high, clusters_high)
+def interval(found: Proportion) -> tuple[float, float]:
+    """Return the wider of both intervals of a fraction."""
+    if math.isnan(found.clusters_low):
+        return found.low, found.high
+    return min(found.low, found.clusters_low), max(found.high, found.clusters_high)

@@ -21,6 +21,8 @@ from crosscue.eval.scoring.scene.ranges import RangeScore
 from crosscue.replay.columns import Int64s
 from crosscue.replay.safe_text import visible
 
+from .scene_figures import interval
+
 WIDTH: Final = 80
 LABEL: Final = 11
 
@@ -142,15 +144,8 @@ def _left_out(cues: Mapping[str, CueScore]) -> list[str]:
 def _fraction(one: Proportion) -> str:
     if not one.of:
         return "-"
-    low, high = _ends(one)
+    low, high = interval(one)
     return f"{one.value:.3f} ({low:.2f} to {high:.2f})"
-
-
-def _ends(one: Proportion) -> tuple[float, float]:
-    """Return the wider of the two intervals."""
-    if math.isnan(one.clusters_low):
-        return one.low, one.high
-    return min(one.low, one.clusters_low), max(one.high, one.clusters_high)
 
 
 def _approaches(one: ApproachScore) -> list[str]:

@@ -11,10 +11,11 @@ import numpy as np
 
 from crosscue.detectors.base import View
 from crosscue.detectors.images import Encoded, decode
-from crosscue.detectors.overlay import GREEN, write_label
+from crosscue.detectors.overlay import FOUND, TRUE, write_label
 from crosscue.eval.runs.stored_images import StoredCamera, picture_at, run_camera
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun
 from crosscue.eval.scoring.boxes.matching import match
+from crosscue.replay import colours
 from crosscue.replay.columns import Bytes, Floats
 from crosscue.replay.errors import CrosscueError
 
@@ -22,8 +23,7 @@ from crosscue.replay.errors import CrosscueError
 APART_NS: Final = 1_000_000_000
 WIDTH_PX: Final = 960
 QUALITY: Final = 80
-RED: Final = (60, 60, 250)
-AMBER: Final = (0, 190, 255)
+WRONG: Final = colours.bgr(colours.WRONG)
 GREY: Final = (150, 150, 150)
 
 
@@ -64,8 +64,8 @@ def worst_pictures(labelled: LabelledRun, overlap: float, max_count: int) -> lis
     """
     marks = _marks(labelled, overlap)
     order = sorted(
-        (i for i in range(len(marks)) if any(one.colour in (RED, AMBER) for one in marks[i])),
-        key=lambda i: (-sum(one.colour in (RED, AMBER) for one in marks[i]), i),
+        (i for i in range(len(marks)) if any(one.colour in (WRONG, TRUE) for one in marks[i])),
+        key=lambda i: (-sum(one.colour in (WRONG, TRUE) for one in marks[i]), i),
     )
     chosen: list[int] = []
     for i in order:
@@ -78,8 +78,8 @@ def worst_pictures(labelled: LabelledRun, overlap: float, max_count: int) -> lis
         WorstPicture(
             labelled.names[i],
             int(labelled.t_ns[i]),
-            sum(one.colour == RED for one in marks[i]),
-            sum(one.colour == AMBER for one in marks[i]),
+            sum(one.colour == WRONG for one in marks[i]),
+            sum(one.colour == TRUE for one in marks[i]),
             _picture(camera, int(labelled.t_ns[i]), marks[i]),
         )
         for i in chosen
@@ -98,9 +98,9 @@ def _marks(labelled: LabelledRun, overlap: float) -> list[list[Drawn]]:
         hit = set(matched.took[0][sure].tolist())
         for row in np.flatnonzero((truth.label == k) & ~truth.is_ignored).tolist():
             if row not in hit:
-                missed = Drawn(truth.boxes_px[row], AMBER, f"missed {name}")
+                missed = Drawn(truth.boxes_px[row], TRUE, f"missed {name}")
                 marks[truth.picture[row]].append(missed)
-        for is_some, colour in ((matched.is_right[0], GREEN), (matched.is_wrong[0], RED)):
+        for is_some, colour in ((matched.is_right[0], FOUND), (matched.is_wrong[0], WRONG)):
             for i in np.flatnonzero(is_some & sure).tolist():
                 row = matched.row[i]
                 text = f"{name} {matched.scores[i]:.2f}"
@@ -127,7 +127,7 @@ def _drawn(picture: Encoded, marks: Sequence[Drawn]) -> str | None:
     canvas: Bytes = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
     for one in marks:
         x0, y0, x1, y1 = np.rint(one.box_px * (size[0] / whole[0])).astype(int).tolist()
-        thick = 1 if one.colour in (GREY, GREEN) else 2
+        thick = 1 if one.colour in (GREY, FOUND) else 2
         cv2.rectangle(canvas, (x0, y0), (x1, y1), one.colour, thick)
         if thick == 2:
             write_label(canvas, one.text, (x0, max(y0 - 4, 12)), one.colour, 0.4)

@@ -102,8 +102,8 @@ def approach_spans(run: TableFolder) -> dict[int, tuple[int, int]]:
 
 
 def seconds_into(first_ns: int, t_ns: int) -> float:
-    """Return a moment in the seconds of ``--at``, rounded to a millisecond."""
-    return round((t_ns - first_ns) * 1e-9, 3)
+    """Return a moment in the seconds of ``--at``: whole milliseconds, never beyond the moment."""
+    return (t_ns - first_ns) // 1_000_000 / 1000
 
 
 @dataclass(frozen=True, slots=True)

@@ -179,20 +179,19 @@ def write_check(
         if drawn.shape[1] > WIDTH_PX:
             size = (WIDTH_PX, round(drawn.shape[0] * WIDTH_PX / drawn.shape[1]))
             drawn = np.asarray(cv2.resize(drawn, size, interpolation=cv2.INTER_AREA), np.uint8)
-        coded = base64.b64encode(_encoded(drawn, ".jpg")).decode("ascii")
-        picture = f"data:image/jpeg;base64,{coded}"
+        picture = base64.b64encode(_encoded(drawn, ".jpg")).decode("ascii")
         caption = f"{found.picture.topic} at {found.picture.t_ns} ns. {_in_words(vehicle)}"
     content = {
         "vehicle": vehicle.name,
         "logs": logs,
         "part": part,
         "contradictions": found.contradictions,
-        "picture": picture,
+        "camera": picture,
         "caption": caption,
         "signals": found.signals,
         "missing": found.missing,
     }
-    write_page(path, "vehicle_check.html.j2", content, {"number": _number})
+    write_page(path, "vehicle_check.html.j2", content)
 
 
 def _encoded(pixels: Bytes, ending: str) -> bytes:
@@ -217,10 +216,6 @@ def _in_words(vehicle: Vehicle) -> str:
         f"{grid} Green: the regions in which road would be detected if an intersection began "
         f"{ASSUMED.start_m:g} m ahead and ended at {ASSUMED.end_m:g} m."
     )
-
-
-def _number(value: float, digits: int) -> str:
-    return f"{value:,.{digits}f}" if math.isfinite(value) else "-"
 
 
 HEAD = ("signal", "read from", "readings", "rate_hz", "lowest", "highest", "unit")

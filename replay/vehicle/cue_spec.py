@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Literal
 
-Colour = tuple[int, int, int]
+from crosscue.replay.colours import FEATURES, Colour
+
 Scoring = Literal["object", "feature"]
 Input = Literal["objects", "car pairs", "signs", "road", "mobileye"]
-
-FEATURE_COLOURS: Final[dict[str, Colour]] = {
-    "intersection": (160, 90, 220),
-    "left": (50, 130, 230),
-    "right": (230, 110, 30),
-    "straight": (50, 165, 80),
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +62,7 @@ class CueSpec:
     needs_masks: bool = False
     label: str | None = None
     settings: str | None = None
-    colour: Colour = FEATURE_COLOURS["intersection"]
+    colour: Colour = FEATURES["intersection"]
     seen_frames: int = 3
     of_frames: int = 5
     within_m: float = 100.0

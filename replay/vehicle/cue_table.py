@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from typing import Final
 
+from crosscue.replay.colours import FEATURES
 from crosscue.replay.plugins import loaded
 
-from .cue_spec import FEATURE_COLOURS, CueSpec
+from .cue_spec import CueSpec
 
 # Assumed proportion of lights that are at an intersection; the others are at pedestrian crossings,
 # railways and exits. No count is available.
@@ -43,7 +44,7 @@ def _road(side: str, *, can_start: bool) -> CueSpec:
         supports=(side,),
         can_start=can_start,
         absence_counts=True,
-        colour=FEATURE_COLOURS[side],
+        colour=FEATURES[side],
     )
 
 
@@ -68,7 +69,7 @@ def _cars(
         per_detection=True,
         absence_counts=True,
         needs_masks=group == "parked",
-        colour=FEATURE_COLOURS[side],
+        colour=FEATURES[side],
         fade_s=fade_s,
     )
 
@@ -95,7 +96,7 @@ def _cars_past(way: str) -> CueSpec:
         precision_is_lower_bound=True,
         supports=("straight",),
         per_detection=True,
-        colour=FEATURE_COLOURS["straight"],
+        colour=FEATURES["straight"],
         fade_s=MOVES_FADE_S,
     )
 
@@ -112,7 +113,7 @@ def _past(name: str, title: str, *, per_detection: bool) -> CueSpec:
         scored_as="feature",
         per_detection=per_detection,
         absence_counts=True,
-        colour=FEATURE_COLOURS["straight"],
+        colour=FEATURES["straight"],
         fade_s=MOVES_FADE_S if per_detection else None,
     )
 
@@ -129,7 +130,7 @@ def _one_way(side: str, other: str) -> CueSpec:
         supports=(side,),
         excludes=(other,),
         label=f"one way {side}",
-        colour=FEATURE_COLOURS[side],
+        colour=FEATURES[side],
         seen_frames=SIGN_FRAMES,
     )
 

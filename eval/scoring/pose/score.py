@@ -149,27 +149,6 @@ class ScoredPoses:
     title: str
     gaps: tuple[ClockGap, ...] = ()
 
-    @property
-    def seconds(self) -> Floats:
-        """Seconds since the first pose, as ``shown_s``."""
-        return self.shown_s(self.t_ns)
-
-    def shown_s(self, t_ns: Int64s) -> Floats:
-        """Return positions on a chart's time axis: seconds, with long gaps shortened."""
-        first_ns, last_ns = int(self.t_ns[0]), int(self.t_ns[-1])
-        inside = [one for one in self.gaps if first_ns <= one.middle_ns <= last_ns]
-        lengths = [one.end_ns - one.start_ns for one in inside]
-        longest_ns = max(last_ns - first_ns - sum(lengths), 0) * LONGEST_GAP_SHOWN
-        knots, shown = [first_ns], [0.0]
-        for one, length in zip(inside, lengths, strict=True):
-            begin_s = shown[-1] + (one.start_ns - knots[-1]) * 1e-9
-            knots += [one.start_ns, one.end_ns]
-            shown += [begin_s, begin_s + min(length, longest_ns) * 1e-9]
-        knots.append(max(last_ns, knots[-1]))
-        shown.append(shown[-1] + (knots[-1] - knots[-2]) * 1e-9)
-        at: Floats = np.interp(t_ns - first_ns, np.array(knots) - first_ns, shown)
-        return at
-
 
 def load_truth(path: Path) -> tuple[Truth, Trajectory]:
     """Read a truth file and its trajectory.

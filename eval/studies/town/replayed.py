@@ -13,7 +13,6 @@ from pydantic import ValidationError
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.eval.pipeline.whole_run import replay_drive
 from crosscue.eval.recording import save_rrd
-from crosscue.eval.report.pose_figures import draw_all
 from crosscue.eval.report.summary import pose_summary
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
@@ -79,17 +78,16 @@ def through_log(
 
 
 def score_pose(run: RunFolder, truth_path: Path) -> PoseScore:
-    """Score only a run's pose; write metrics, tracks and figures to its ``score`` folder.
+    """Score only a run's pose; write metrics and tracks to its ``score`` folder.
 
     Raises:
         RunError: The run's tables are missing or damaged.
         SchemaError: The truth does not fit the run.
     """
     truth, _ = load_truth(truth_path)
-    result, poses = measure_pose(run, truth_path)
+    result, _ = measure_pose(run, truth_path)
     content = {"truth": truth.model_dump(mode="json"), "pose": asdict(result)}
     write_text(run.file(FOLDER) / METRICS, strict_json(content) + "\n")
-    draw_all(poses, run.file(FOLDER))
     return result
 
 

@@ -16,14 +16,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
+from crosscue.eval.drives.score import mistakes_of
 from crosscue.eval.report.frame_pictures import draw_pictures
 from crosscue.eval.report.opening import opening_of
-from crosscue.eval.report.page import write_report
+from crosscue.eval.report.page import write_report, write_report_without_truth
 from crosscue.eval.report.scene_figures import (
     draw_belief,
 )
 from crosscue.eval.report.svg_plot import ticks
-from crosscue.eval.report.worst_frames import worst_frames
 from crosscue.eval.runs.moments import moment_ns
 from crosscue.eval.scoring.runs import RunScored, judge_run, metrics_of, pooled_scores
 from support.scene_run import SIZE, scene_run
@@ -64,7 +64,7 @@ def _scored(folder: Path, name: str = "A", **more: Any) -> RunScored:
 def _report_text(folder: Path, *scored: RunScored, **more: Any) -> str:
     scores = pooled_scores(scored)
     path = write_report(
-        folder, scored, scores, {**metrics_of(scored, scores), **more}, worst_frames(scored)
+        folder, scored, scores, {**metrics_of(scored, scores), **more}, mistakes_of(scored, 0.9)
     )
     return path.read_text(encoding="utf-8")
 
@@ -94,24 +94,28 @@ def test_what_happened_is_first_and_losses_are_reported(tmp_path: Path) -> None:
     assert "Not scored:</b> pose (the truth has no track (pose: missing))" in page
 
 
-def test_worst_frame_is_shown_with_picture_and_time(tmp_path: Path) -> None:
+def test_failure_is_shown_with_picture_and_command(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
 
-    (worst,) = worst_frames([one])
+    (wrong,) = [m for m in mistakes_of([one], 0.9) if m.kind == "false"]
 
-    assert (worst.cue, worst.t_ns, worst.frames) == ("cross_traffic_right", at(21), 19)
-    assert (worst.count, worst.true_count, worst.confidence) == (1, 0, 0.97)
-    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(worst.picture), np.uint8), 1)
+    assert (wrong.what, wrong.t_ns, wrong.at_s) == ("cross_traffic_right", at(21), 2.1)
+    assert "found in 19 frames, score up to 0.97" in wrong.text
+    page = _report_text(tmp_path, one)
+    assert "<b>false: cross traffic right</b>, another cue is there: found in 19 frames" in page
+    assert f"<code>crosscue view {one.run.path} --at 2.100</code>" in page
+    pictures = re.findall(
+        r'alt="false: cross traffic right" src="data:image/jpeg;base64,([^"]+)', page
+    )
+    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(pictures[0]), np.uint8), 1)
     assert pixels is not None
     assert pixels.shape == (SIZE[1], SIZE[0], 3)
-    page = _report_text(tmp_path, one)
-    assert f"<code>crosscue view {one.run.path} --at {at(21)}ns</code>" in page
 
 
 def test_report_opens_with_a_sentence_and_pictures_of_moments(tmp_path: Path) -> None:
     one = _scored(tmp_path / "drive")
 
-    opening = opening_of(one.run, 0.9, one, worst_frames([one]))
+    opening = opening_of(one.run, 0.9, one, mistakes_of([one], 0.9))
 
     told = " ".join(opening.sentences)
     assert told.startswith("Intersection found 30.0 m ahead.")
@@ -121,8 +125,8 @@ def test_report_opens_with_a_sentence_and_pictures_of_moments(tmp_path: Path) ->
     assert all(m.picture for m in opening.moments)
     (wrong,) = [m for m in opening.moments if m.t_ns == at(21)]
     assert wrong.is_wrong
-    assert "wrong: cross traffic right" in wrong.what
-    seconds = f"{wrong.at_s:.2f}"
+    assert "false: cross traffic right" in wrong.what
+    seconds = f"{wrong.at_s:.3f}"
     assert moment_ns(one.run, seconds) == pytest.approx(wrong.t_ns, abs=5e6)
     page = _report_text(tmp_path, one)
     assert f"crosscue view {one.run.path} --at {seconds}</code>" in page
@@ -141,6 +145,21 @@ def test_run_without_a_truth_has_a_report(
     assert "crosscue view" in page
     assert not {"script", "link"} & set(_ParsedPage(page).tags)
     assert cli.run(["report", str(run.path), "--threshold", "1.5"]) == 2
+
+
+def test_run_with_a_pose_only_has_a_report_of_its_pose(tmp_path: Path) -> None:
+    tables = frozenset({"frames", "detections", "road", "cues", "belief", "range"})
+    run = scene_run(tmp_path / "drive", without=tables)
+
+    write_report_without_truth(run, tmp_path / "report.html", 0.9)
+
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<title>Map</title>" in page
+    assert "2-sigma ellipse, full major axis (m)" in page
+    assert "The estimated path is" in page
+    assert "0 of 0" not in page
+    assert "<b>-" not in page
+    assert ">Intersections</h2>" not in page
 
 
 def test_belief_without_true_distances_is_drawn_over_time(tmp_path: Path) -> None:
