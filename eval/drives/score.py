@@ -148,6 +148,7 @@ def mistakes_of(ones: Sequence[RunScored], threshold: float) -> list[Mistake]:
     found = [
         failure
         for one in ones
+        if one.run.file("frames.parquet").exists()
         for failure in failures_beside_truth(one.run, SceneJudged(one.truth, one.judged), threshold)
     ]
     return [
