@@ -31,6 +31,43 @@ GRAIN_M: Final = 40.0
 HORIZON: Final = -0.002
 
 
+class Lens(NamedTuple):
+    """Focal length and optical centre in samples."""
+
+    focal: float
+    cx: float
+    cy: float
+
+
+class Eye(NamedTuple):
+    """Rotation from world axes to those of the camera, or back, and the camera's position."""
+
+    axes: Float64s
+    at: Float64s
+
+
+class Haze(NamedTuple):
+    """Density and colour of the haze."""
+
+    per_m: float
+    colour: Float64s
+
+
+class Textures(NamedTuple):
+    """All texels, (N, 4); offset, width and height of each texture's levels, (K, 9, 3)."""
+
+    atlas: Bytes
+    places: Int64s
+
+
+class Buffers(NamedTuple):
+    """Buffers of the samples: 1/z, colour, and number of the object."""
+
+    depth: Float32s
+    colour: Bytes
+    owner: NDArray[np.int16]
+
+
 class Kernels(NamedTuple):
     """The compiled loops."""
 
@@ -54,65 +91,40 @@ def draw_triangles(
     tint: Float32s,
     instance: Int32s,
     shift: Float32s,
-    eye_axes: Float64s,
-    camera_at: Float64s,
-    focal: float,
-    cx: float,
-    cy: float,
-    haze_per_m: float,
-    haze: Float64s,
-    atlas: Bytes,
-    places: Int64s,
-    depth: Float32s,
-    colour: Bytes,
-    owner: NDArray[np.int16],
+    eye: Eye,
+    lens: Lens,
+    haze: Haze,
+    textures: Textures,
+    buffers: Buffers,
 ) -> None:
     """Draw triangles into the sample buffers, in the given order; nearest first is fastest.
 
     corners: (T, 3, 3) in world metres. uv: (T, 3, 2) in texture widths. tint: (T, 3), light times
-    albedo. shift: (3,), added to all corners. places: (K, 9, 3): offset, width and height of a
-    texture's levels.
+    albedo. shift: (3,), added to all corners.
     """
-    eye = np.zeros((3, 5))
+    seen = np.zeros((3, 5))
     polygon = np.zeros((4, 5))
     triangle = np.zeros((3, 5))
     for t in order:
         for k in range(3):
-            _to_eye(corners[t, k], shift, eye_axes, camera_at, eye[k])
-            eye[k, 3] = uv[t, k, 0]
-            eye[k, 4] = uv[t, k, 1]
-        size = _clip(eye, polygon)
+            _to_eye(corners[t, k], shift, eye, seen[k])
+            seen[k, 3] = uv[t, k, 0]
+            seen[k, 4] = uv[t, k, 1]
+        size = _clip(seen, polygon)
         for fan in range(1, size - 1):
             triangle[0] = polygon[0]
             triangle[1] = polygon[fan]
             triangle[2] = polygon[fan + 1]
-            _fill(
-                triangle,
-                texture[t],
-                tint[t],
-                instance[t],
-                focal,
-                cx,
-                cy,
-                haze_per_m,
-                haze,
-                atlas,
-                places,
-                depth,
-                colour,
-                owner,
-            )
+            _fill(triangle, texture[t], tint[t], instance[t], lens, haze, textures, buffers)
 
 
-def _to_eye(
-    corner: Float32s, shift: Float32s, eye_axes: Float64s, camera_at: Float64s, eye: Float64s
-) -> None:
-    """Transform a corner to camera axes, and write it to the first three elements of ``eye``."""
-    x = corner[0] + shift[0] - camera_at[0]
-    y = corner[1] + shift[1] - camera_at[1]
-    z = corner[2] + shift[2] - camera_at[2]
+def _to_eye(corner: Float32s, shift: Float32s, eye: Eye, seen: Float64s) -> None:
+    """Transform a corner to camera axes, and write it to the first three elements of ``seen``."""
+    x = corner[0] + shift[0] - eye.at[0]
+    y = corner[1] + shift[1] - eye.at[1]
+    z = corner[2] + shift[2] - eye.at[2]
     for r in range(3):
-        eye[r] = eye_axes[r, 0] * x + eye_axes[r, 1] * y + eye_axes[r, 2] * z
+        seen[r] = eye.axes[r, 0] * x + eye.axes[r, 1] * y + eye.axes[r, 2] * z
 
 
 def _clip(eye: Float64s, polygon: Float64s) -> int:
@@ -136,18 +148,15 @@ def _fill(
     which: int,
     tint: Float32s,
     instance: int,
-    focal: float,
-    cx: float,
-    cy: float,
-    haze_per_m: float,
-    haze: Float64s,
-    atlas: Bytes,
-    places: Int64s,
-    depth: Float32s,
-    colour: Bytes,
-    owner: NDArray[np.int16],
+    lens: Lens,
+    haze: Haze,
+    textures: Textures,
+    buffers: Buffers,
 ) -> None:
     """Draw a triangle (3, 5) of x, y, z, u, v ahead of the camera; ``which`` < 0: no texture."""
+    focal, cx, cy = lens
+    atlas, places = textures
+    depth, colour, owner = buffers
     high, wide = depth.shape
     ia, ib, ic = 1.0 / triangle[0, 2], 1.0 / triangle[1, 2], 1.0 / triangle[2, 2]
     xa, ya = focal * triangle[0, 0] * ia + cx, focal * triangle[0, 1] * ia + cy
@@ -198,10 +207,10 @@ def _fill(
                 red *= 255.0
                 green *= 255.0
                 blue *= 255.0
-            hazy = haze_per_m / (haze_per_m + near)
-            red += hazy * (haze[0] - red)
-            green += hazy * (haze[1] - green)
-            blue += hazy * (haze[2] - blue)
+            hazy = haze.per_m / (haze.per_m + near)
+            red += hazy * (haze.colour[0] - red)
+            green += hazy * (haze.colour[1] - green)
+            blue += hazy * (haze.colour[2] - blue)
             depth[row, column] = near
             colour[row, column, 0] = min(255.0, max(0.0, red))
             colour[row, column, 1] = min(255.0, max(0.0, green))
@@ -255,11 +264,8 @@ def _columns(
 def cover(
     corners: Float32s,
     shift: Float32s,
-    eye_axes: Float64s,
-    camera_at: Float64s,
-    focal: float,
-    cx: float,
-    cy: float,
+    eye: Eye,
+    lens: Lens,
     covered: Bytes,
     left: int,
     top: int,
@@ -273,26 +279,16 @@ def cover(
     count = 0
     px = np.zeros(3)
     py = np.zeros(3)
+    seen = np.zeros(3)
     for t in range(corners.shape[0]):
         behind = False
         for k in range(3):
-            x = corners[t, k, 0] + shift[0] - camera_at[0]
-            y = corners[t, k, 1] + shift[1] - camera_at[1]
-            z = corners[t, k, 2] + shift[2] - camera_at[2]
-            ahead = eye_axes[2, 0] * x + eye_axes[2, 1] * y + eye_axes[2, 2] * z
-            if ahead <= NEAR_M:
+            _to_eye(corners[t, k], shift, eye, seen)
+            if seen[2] <= NEAR_M:
                 behind = True
                 break
-            px[k] = (
-                cx
-                - left
-                + focal / ahead * (eye_axes[0, 0] * x + eye_axes[0, 1] * y + eye_axes[0, 2] * z)
-            )
-            py[k] = (
-                cy
-                - top
-                + focal / ahead * (eye_axes[1, 0] * x + eye_axes[1, 1] * y + eye_axes[1, 2] * z)
-            )
+            px[k] = lens.cx - left + lens.focal / seen[2] * seen[0]
+            py[k] = lens.cy - top + lens.focal / seen[2] * seen[1]
         if behind:
             continue
         first = max(0, math.ceil(min(py[0], py[1], py[2]) - 0.5))
@@ -307,9 +303,7 @@ def cover(
 
 
 def compose(
-    depth: Float32s,
-    colour: Bytes,
-    owner: NDArray[np.int16],
+    buffers: Buffers,
     samples: int,
     ground: Bytes,
     levels: Int64s,
@@ -321,13 +315,9 @@ def compose(
     shadow: Bytes,
     shine: float,
     sky: Bytes,
-    world_axes: Float64s,
-    camera_at: Float64s,
-    focal: float,
-    cx: float,
-    cy: float,
-    haze_per_m: float,
-    haze: Float64s,
+    eye: Eye,
+    lens: Lens,
+    haze: Haze,
     picture: Bytes,
     mask: NDArray[np.int16],
 ) -> None:
@@ -335,14 +325,17 @@ def compose(
 
     ground: all levels of the ground map, flat (N, 4), with the grain's strength as fourth channel.
     levels: (L, 3): offset, width, height. shadow: (H, W), 255 for full light. shine: reflectivity
-    of a wet road. mask: object that covers at least half of the pixel, or -1.
+    of a wet road. eye: rotation to world axes. mask: object that covers at least half of the pixel,
+    or -1.
     """
+    world_axes, camera_at = eye
+    focal, cx, cy = lens
     high, wide, _ = picture.shape
     whole = samples * samples
     for row in range(high):
         for column in range(wide):
             red, green, blue, filled, mask[row, column] = _objects(
-                depth, colour, owner, row * samples, column * samples, samples
+                buffers, row * samples, column * samples, samples
             )
             if filled < whole:
                 dx = (column + 0.5 - cx) / focal
@@ -372,10 +365,10 @@ def compose(
                         g0 += mirror * (back0 - g0)
                         g1 += mirror * (back1 - g1)
                         g2 += mirror * (back2 - g2)
-                    hazy = haze_per_m * reach / (1.0 + haze_per_m * reach)
-                    back0 = g0 + hazy * (haze[0] - g0)
-                    back1 = g1 + hazy * (haze[1] - g1)
-                    back2 = g2 + hazy * (haze[2] - g2)
+                    hazy = haze.per_m * reach / (1.0 + haze.per_m * reach)
+                    back0 = g0 + hazy * (haze.colour[0] - g0)
+                    back1 = g1 + hazy * (haze.colour[1] - g1)
+                    back2 = g2 + hazy * (haze.colour[2] - g2)
                 rest = whole - filled
                 red += rest * back0
                 green += rest * back1
@@ -386,19 +379,16 @@ def compose(
 
 
 def _objects(
-    depth: Float32s, colour: Bytes, owner: NDArray[np.int16], top: int, left: int, samples: int
+    buffers: Buffers, top: int, left: int, samples: int
 ) -> tuple[float, float, float, int, int]:
     """Return a pixel's sum of sample colours, number of filled samples, and object.
 
     The object covers at least half of the pixel; -1 without object.
     """
+    depth, colour, owner = buffers
     whole = samples * samples
-    red = 0.0
-    green = 0.0
-    blue = 0.0
-    filled = 0
-    owned = -1
-    votes = 0
+    red, green, blue = 0.0, 0.0, 0.0
+    filled, owned, votes = 0, -1, 0
     for r in range(top, top + samples):
         for c in range(left, left + samples):
             if depth[r, c] > 0.0:

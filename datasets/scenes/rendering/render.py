@@ -13,7 +13,7 @@ from crosscue.datasets.scenes.world import SceneObject, World
 
 from .camera import CameraView, SceneCamera, view_at
 from .ground import TEXELS_PER_M, X_M, Y_M
-from .kernels import compile_kernels
+from .kernels import Buffers, Eye, Haze, Lens, Textures, compile_kernels
 from .mesh import Floats, Mesh
 from .textures import smooth_noise
 
@@ -94,7 +94,7 @@ class Renderer:
         self.camera = SceneCamera() if camera is None else camera
         self.settings = settings
         self._kernels = compile_kernels()
-        self._atlas, self._places = world.atlas.packed()
+        self._textures = Textures(*world.atlas.packed())
         self._scenery = (world.scenery, world.light.on(world.scenery))
         self._movers = [
             (
@@ -107,9 +107,11 @@ class Renderer:
         ]
         n = settings.samples
         high, wide = self.camera.height_px, self.camera.width_px
-        self._depth = np.zeros((high * n, wide * n), np.float32)
-        self._colour = np.zeros((high * n, wide * n, 3), np.uint8)
-        self._owner = np.zeros((high * n, wide * n), np.int16)
+        size = (high * n, wide * n)
+        self._buffers = Buffers(
+            np.zeros(size, np.float32), np.zeros((*size, 3), np.uint8), np.zeros(size, np.int16)
+        )
+        self._haze = Haze(world.light.haze_per_m, world.light.haze)
         rng = np.random.default_rng([world.conditions.seed, 5])
         self._grain = (smooth_noise(rng, 256, 64) * 140 + rng.random((256, 256)) * 116).astype(
             np.uint8
@@ -124,7 +126,7 @@ class Renderer:
         road = None
         if with_road:
             on_map = self.world.ground.road.view(np.uint8)
-            road = road_seen(on_map, self._depth, self.settings.samples, view)
+            road = road_seen(on_map, self._buffers.depth, self.settings.samples, view)
         return RenderedFrame(t_s, rgb, view, owner, self._seen(owner, view, t_s), road)
 
     def owners(
@@ -139,16 +141,16 @@ class Renderer:
             codes: Map of the ground for ``ground_seen``.
         """
         view = self._drawn(t_s)
-        owner = self._owner.copy()
+        owner = self._buffers.owner.copy()
         black = np.zeros((*owner.shape, 3), np.uint8)
-        ground = ground_seen(codes, self._depth, self.settings.samples, view)
+        ground = ground_seen(codes, self._buffers.depth, self.settings.samples, view)
         return RenderedFrame(t_s, black, view, owner, self._seen(owner, view, t_s)), ground
 
     def _drawn(self, t_s: float) -> CameraView:
         """Draw all static and moving objects into the buffers, and return the view."""
         view = view_at(self.camera, self.world.approach, t_s)
-        self._depth.fill(0.0)
-        self._owner.fill(-1)
+        self._buffers.depth.fill(0.0)
+        self._buffers.owner.fill(-1)
         for thing, tint, later in self._movers:
             if thing.is_there(t_s):
                 mesh = thing.mesh_at(t_s)
@@ -157,12 +159,11 @@ class Renderer:
         self._draw(*self._scenery, np.zeros(3), view)
         return view
 
-    def _lens(self, scale: float) -> tuple[float, float, float]:
+    def _lens(self, scale: float) -> Lens:
         cx, cy = self.camera.centre_px
-        return self.camera.focal * scale, cx * scale, cy * scale
+        return Lens(self.camera.focal * scale, cx * scale, cy * scale)
 
     def _draw(self, mesh: Mesh, tint: NDArray[np.float32], shift: Floats, view: CameraView) -> None:
-        light = self.world.light
         ahead = mesh.corners.mean(axis=1) @ view.eye_axes[2].astype(np.float32)
         self._kernels.draw(
             np.argsort(ahead, kind="stable"),
@@ -172,16 +173,11 @@ class Renderer:
             tint,
             mesh.instance,
             shift.astype(np.float32),
-            view.eye_axes,
-            view.at_m,
-            *self._lens(self.settings.samples),
-            light.haze_per_m,
-            light.haze,
-            self._atlas,
-            self._places,
-            self._depth,
-            self._colour,
-            self._owner,
+            Eye(view.eye_axes, view.at_m),
+            self._lens(self.settings.samples),
+            self._haze,
+            self._textures,
+            self._buffers,
         )
 
     def _composed(
@@ -192,9 +188,7 @@ class Renderer:
         rgb = np.zeros((high, wide, 3), np.uint8)
         owner = np.zeros((high, wide), np.int16)
         self._kernels.compose(
-            self._depth,
-            self._colour,
-            self._owner,
+            self._buffers,
             self.settings.samples,
             ground.texels,
             ground.levels,
@@ -206,11 +200,9 @@ class Renderer:
             self._shadows(view, t_s),
             light.shine,
             light.sky,
-            np.ascontiguousarray(view.eye_axes.T),
-            view.at_m,
-            *self._lens(1.0),
-            light.haze_per_m,
-            light.haze,
+            Eye(np.ascontiguousarray(view.eye_axes.T), view.at_m),
+            self._lens(1.0),
+            self._haze,
             rgb,
             owner,
         )
@@ -308,9 +300,8 @@ class Renderer:
         total = self._kernels.cover(
             mesh.corners,
             thing.shift(t_s).astype(np.float32),
-            view.eye_axes,
-            view.at_m,
-            *self._lens(1.0),
+            Eye(view.eye_axes, view.at_m),
+            self._lens(1.0),
             covered,
             left,
             top,
