@@ -54,7 +54,7 @@ crosscue.detectors.signs.templates: draw_sign
 crosscue.errors: AccountError AnnotationError CanDatabaseError EmptyResultError
   LogFormatError LogTooLargeError MissingTopicError OutputError PluginWarning RunError SchemaError
   StudyFileError UnknownFormatError UnreadableRunError VehicleError WorkerError
-crosscue.eval.batch.status: BatchStatus
+crosscue.eval.batch.journal: BatchStatus
 crosscue.eval.batch.drive_list: DriveList
 crosscue.eval.batch.merge: MergedRuns
 crosscue.eval.catalog.compare: Comparison

@@ -15,8 +15,8 @@ from crosscue.detectors.catalog.known_models import fetch_model as fetch_model
 from crosscue.detectors.catalog.known_models import model as model
 from crosscue.detectors.catalog.known_models import models as models
 from crosscue.detectors.plugins import plugins as plugins
+from crosscue.eval.batch.journal import batch_status as batch_status
 from crosscue.eval.batch.merge import merge as merge
-from crosscue.eval.batch.status import batch_status as batch_status
 from crosscue.eval.catalog.decoded_logs import decode as decode
 from crosscue.eval.catalog.query.catalog import catalog as catalog
 from crosscue.eval.check import check as check

@@ -48,7 +48,7 @@ COMMANDS: Final = {
     "score": "eval.drives.score_runs:score_runs",
     "score detector": "eval.drives.detector_score:score_detector",
     "compare": "eval.fleet.compare:compare_command",
-    "status": "eval.batch.status:batch_status",
+    "status": "eval.batch.journal:batch_status",
     "history": "eval.fleet.history:history",
     "merge": "eval.batch.merge:merge",
     "tag": "eval.fleet.tags:tag",

@@ -44,11 +44,9 @@ def write_yolo(folder: Path, labels: Annotations) -> Path:
     for picture in labels.pictures:
         wide, high = picture.size_px
         lines = []
-        for thing in picture.things:
-            if thing.box_px is not None:
-                x0, y0, x1, y1 = thing.box_px
-                box = (x0 + x1) / 2 / wide, (y0 + y1) / 2 / high, (x1 - x0) / wide, (y1 - y0) / high
-                lines.append(" ".join([str(numbers[thing.label]), *map(repr, map(float, box))]))
+        for thing, (x0, y0, x1, y1) in picture.boxes():
+            box = (x0 + x1) / 2 / wide, (y0 + y1) / 2 / high, (x1 - x0) / wide, (y1 - y0) / high
+            lines.append(" ".join([str(numbers[thing.label]), *map(repr, map(float, box))]))
         place = folder / LABELS / f"{Path(picture.name).stem}.txt"
         write_text(place, "".join(f"{line}\n" for line in lines))
     # JSON strings are valid YAML. Without a path, Ultralytics searches the folder of the file.
@@ -72,12 +70,16 @@ def read_yolo(path: Path, sizes: Sizes) -> Annotations:
         size = labelled_size(stem, sizes, path)
         things = []
         for box in one.boxes:
-            x0, y0, x1, y1 = box.box
-            in_px = (x0 * size[0], y0 * size[1], x1 * size[0], y1 * size[1])
-            things.append(Annotation(box.label, in_px, place=one.name))
+            things.append(Annotation(box.label, _in_pixels(*box.box, size), place=one.name))
         pictures.append(Picture(stem, size, None, None, tuple(things)))
     classes = dict.fromkeys(name for part in parts for name in part.classes)
     return Annotations(str(path), tuple(classes), tuple(pictures))
+
+
+def _in_pixels(
+    x0: float, y0: float, x1: float, y1: float, size: tuple[int, int]
+) -> tuple[float, float, float, float]:
+    return x0 * size[0], y0 * size[1], x1 * size[0], y1 * size[1]
 
 
 def _label_folders(folder: Path) -> list[Path]:
@@ -100,16 +102,11 @@ def write_fiftyone(folder: Path, labels: Annotations) -> Path:
     for picture in labels.pictures:
         wide, high = picture.size_px
         things = []
-        for thing in picture.things:
-            if thing.box_px is None:
-                continue
-            x0, y0, x1, y1 = thing.box_px
+        for thing, (x0, y0, x1, y1) in picture.boxes():
             box = [x0 / wide, y0 / high, (x1 - x0) / wide, (y1 - y0) / high]
-            one: dict[str, Any] = {
-                "label": labels.labels.index(thing.label),
-                "bounding_box": box,
-            }
-            things.append(one if thing.score is None else one | {"confidence": thing.score})
+            score = {} if thing.score is None else {"confidence": thing.score}
+            label = labels.labels.index(thing.label)
+            things.append({"label": label, "bounding_box": box} | score)
         found[Path(picture.name).stem] = things
     tree = {"classes": list(labels.labels), "labels": found}
     write_text(folder / FIFTYONE_FILE, strict_json(tree) + "\n")
@@ -123,10 +120,7 @@ def read_fiftyone(path: Path, sizes: Sizes) -> Annotations:
         AnnotationError: The file cannot be read, or the size of a picture is unknown.
     """
     file = path / FIFTYONE_FILE if path.is_dir() else path
-    try:
-        tree = json_tree(file.read_bytes())
-    except (OSError, ValueError) as error:
-        raise AnnotationError(f"{file}: not readable as JSON ({error})") from None
+    tree = _tree(file)
     by_picture = tree.get("labels") if isinstance(tree, dict) else None
     classes = (tree.get("classes") or []) if isinstance(tree, dict) else []
     if not isinstance(by_picture, dict) or not isinstance(classes, list):
@@ -149,7 +143,7 @@ def _fiftyone_thing(row: Any, classes: list[Any], size: tuple[int, int], where: 
         # FiftyOne writes class numbers if there is a list of classes, else class names.
         name = str(classes[label]) if isinstance(label, int) else str(label)
         score = row.get("confidence")
-        box = (x * size[0], y * size[1], (x + w) * size[0], (y + h) * size[1])
+        box = _in_pixels(x, y, x + w, y + h, size)
         return Annotation(name, box, score=None if score is None else float(score), place=where)
     except (KeyError, TypeError, ValueError, IndexError, AttributeError):
         raise AnnotationError(
@@ -173,29 +167,26 @@ def write_label_studio(folder: Path, labels: Annotations) -> Path:
     for picture in labels.pictures:
         wide, high = picture.size_px
         results = []
-        for number, thing in enumerate(picture.things):
-            if thing.box_px is not None:
-                x0, y0, x1, y1 = thing.box_px
-                results.append(
-                    {
-                        "id": f"{picture.t_ns}-{number}",
-                        "from_name": "label",
-                        "to_name": "image",
-                        "type": "rectanglelabels",
-                        "original_width": wide,
-                        "original_height": high,
-                        "image_rotation": 0,
-                        "value": {
-                            "x": 100.0 * x0 / wide,
-                            "y": 100.0 * y0 / high,
-                            "width": 100.0 * (x1 - x0) / wide,
-                            "height": 100.0 * (y1 - y0) / high,
-                            "rotation": 0,
-                            "rectanglelabels": [thing.label],
-                        },
-                    }
-                    | ({} if thing.score is None else {"score": thing.score})
-                )
+        for number, (thing, (x0, y0, x1, y1)) in enumerate(picture.boxes()):
+            value = {
+                "x": 100.0 * x0 / wide,
+                "y": 100.0 * y0 / high,
+                "width": 100.0 * (x1 - x0) / wide,
+                "height": 100.0 * (y1 - y0) / high,
+                "rotation": 0,
+                "rectanglelabels": [thing.label],
+            }
+            row = {
+                "id": f"{picture.t_ns}-{number}",
+                "from_name": "label",
+                "to_name": "image",
+                "type": "rectanglelabels",
+                "original_width": wide,
+                "original_height": high,
+                "image_rotation": 0,
+                "value": value,
+            }
+            results.append(row if thing.score is None else row | {"score": thing.score})
         size = {"width": wide, "height": high, "t_ns": picture.t_ns}
         data = {"image": f"{LOCAL}images/{picture.name}", **size}
         predictions = [{"model_version": "crosscue", "result": results}]
@@ -214,10 +205,7 @@ def read_label_studio(path: Path) -> Annotations:
         AnnotationError: The file cannot be read.
     """
     file = path / TASKS_FILE if path.is_dir() else path
-    try:
-        tasks = json_tree(file.read_bytes())
-    except (OSError, ValueError) as error:
-        raise AnnotationError(f"{file}: not readable as JSON ({error})") from None
+    tasks = _tree(file)
     if not isinstance(tasks, list) or not all(isinstance(task, dict) for task in tasks):
         raise AnnotationError(f"{file}: expected a list of tasks, as Label Studio exports JSON")
     pictures: list[Picture] = []
@@ -268,7 +256,7 @@ def _rectangles(results: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
 def _studio_thing(row: Mapping[str, Any], size: tuple[int, int], where: str) -> Annotation:
     value = row["value"]
     x, y, w, h = (float(value[name]) / 100.0 for name in ("x", "y", "width", "height"))
-    box = (x * size[0], y * size[1], (x + w) * size[0], (y + h) * size[1])
+    box = _in_pixels(x, y, x + w, y + h, size)
     return Annotation(str(value["rectanglelabels"][0]), box, place=where)
 
 
@@ -321,6 +309,16 @@ def read_tool_labels(path: Path, sizes: Sizes, kind: ToolFormat | None = None) -
     return LABEL_FORMATS[kind or _recognised(path)].read(path, sizes)
 
 
+def _tree(path: Path) -> Any:
+    try:
+        content = read_at_most(path, MAX_BYTES)
+        if content is None:
+            raise AnnotationError(f"{path}: over {MAX_BYTES >> 20} MiB; split it")
+        return json_tree(content)
+    except (OSError, ValueError) as error:
+        raise AnnotationError(f"{path}: not readable as JSON ({error}); expected labels") from None
+
+
 def _recognised(path: Path) -> ToolFormat:
     suffix = path.suffix.lower()
     if path.is_dir():
@@ -331,11 +329,7 @@ def _recognised(path: Path) -> ToolFormat:
         raise UsageError(
             f"{path}: expected COCO, FiftyOne or Label Studio (.json), CVAT (.xml), or a folder"
         )
-    try:
-        content = read_at_most(path, MAX_BYTES)
-        tree = None if content is None else json_tree(content)
-    except (OSError, ValueError) as error:
-        raise AnnotationError(f"{path}: not readable as JSON ({error}); expected labels") from None
+    tree = _tree(path)
     if isinstance(tree, list):
         return "labelstudio"
     return "fiftyone" if isinstance(tree, dict) and "labels" in tree else "coco"

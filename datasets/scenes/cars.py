@@ -18,6 +18,7 @@ from crosscue.datasets.scenes.rendering.mesh import (
     merge_meshes,
     quad,
     triangles,
+    upright,
 )
 
 SKIRT_M: Final = 0.24
@@ -126,14 +127,14 @@ def any_look(rng: Generator) -> Look:
     return Look(kind, PAINTS[int(rng.integers(len(PAINTS)))])
 
 
-def car(look: Look, *, lamps_on: bool, brakes_on: bool) -> Mesh:
+def car(look: Look, *, lamps_on: bool) -> Mesh:
     """Return the mesh of a car with its centre over the origin, nose along +x."""
     shape = look.shape
     parts = [
         _slab(shape.body, SKIRT_M, shape.half_width_m, shape.half_width_m, look.paint),
         *_cabin(shape, look.paint),
         *_wheels(shape),
-        *_ends(shape, lamps_on=lamps_on, brakes_on=brakes_on),
+        *_ends(shape, lamps_on=lamps_on),
     ]
     return merge_meshes(parts).placed(-shape.length_m / 2, 0.0)
 
@@ -149,21 +150,15 @@ def _slab(
     edge = _upper(top)
     parts = []
     for (xa, za), (xb, zb) in pairwise(edge):
-        parts.append(
-            quad([(xa, -low, foot_m), (xb, -low, foot_m), (xb, -high, zb), (xa, -high, za)], rgb)
-        )
-        parts.append(
-            quad([(xb, low, foot_m), (xa, low, foot_m), (xa, high, za), (xb, high, zb)], rgb)
-        )
-        parts.append(quad([(xa, -high, za), (xb, -high, zb), (xb, high, zb), (xa, high, za)], rgb))
+        parts += [
+            [(xa, -low, foot_m), (xb, -low, foot_m), (xb, -high, zb), (xa, -high, za)],
+            [(xb, low, foot_m), (xa, low, foot_m), (xa, high, za), (xb, high, zb)],
+            [(xa, -high, za), (xb, -high, zb), (xb, high, zb), (xa, high, za)],
+        ]
     (x0, z0), (x1, z1) = edge[0], edge[-1]
-    parts.append(
-        quad([(x0, low, foot_m), (x0, -low, foot_m), (x0, -high, z0), (x0, high, z0)], rgb)
-    )
-    parts.append(
-        quad([(x1, -low, foot_m), (x1, low, foot_m), (x1, high, z1), (x1, -high, z1)], rgb)
-    )
-    return merge_meshes(parts)
+    parts.append([(x0, low, foot_m), (x0, -low, foot_m), (x0, -high, z0), (x0, high, z0)])
+    parts.append([(x1, -low, foot_m), (x1, low, foot_m), (x1, high, z1), (x1, -high, z1)])
+    return merge_meshes([quad(corners, rgb) for corners in parts])
 
 
 def _cabin(shape: CarShape, paint: Rgb) -> list[Mesh]:
@@ -186,14 +181,8 @@ def _cabin(shape: CarShape, paint: Rgb) -> list[Mesh]:
         parts.append(quad(skin, rgb))
         yf = half(belt)
         for side in (-1.0, 1.0):
-            wall = np.array(
-                [
-                    (xa, side * yf, belt),
-                    (xb, side * yf, belt),
-                    (xb, side * yb, zb),
-                    (xa, side * ya, za),
-                ]
-            )
+            ends = ((xa, yf, belt), (xb, yf, belt), (xb, yb, zb), (xa, ya, za))
+            wall = [(x, side * y, z) for x, y, z in ends]
             parts.append(quad(wall if side < 0 else wall[::-1], paint))
     parts += _windows(shape, edge, belt, half)
     return parts
@@ -244,21 +233,16 @@ def _wheels(shape: CarShape) -> list[Mesh]:
     return parts
 
 
-def _ends(shape: CarShape, *, lamps_on: bool, brakes_on: bool) -> list[Mesh]:
+def _ends(shape: CarShape, *, lamps_on: bool) -> list[Mesh]:
     nose, tail = shape.length_m + TILL_SHUT_M, -TILL_SHUT_M
     w = shape.half_width_m
     low = shape.body[-2][1]
     parts = []
     for side in (-1.0, 1.0):
         near, far = side * (w - 0.36), side * (w - 0.06)
-        lamp = [
-            (nose, near, low - 0.12),
-            (nose, far, low - 0.12),
-            (nose, far, low + 0.02),
-            (nose, near, low + 0.02),
-        ]
         rgb: Rgb = (1.0, 0.98, 0.9) if lamps_on else (0.75, 0.77, 0.8)
-        parts.append(quad(lamp, rgb, glow=1.0 if lamps_on else 0.0))
+        glow = 1.0 if lamps_on else 0.0
+        parts.append(upright(nose, (near, far), (low - 0.12, low + 0.02), rgb, glow=glow))
         corner = [
             (nose - 0.42, side * (w + TILL_SHUT_M), low + 0.02),
             (nose - 0.1, side * (w + TILL_SHUT_M), low - 0.02),
@@ -267,36 +251,11 @@ def _ends(shape: CarShape, *, lamps_on: bool, brakes_on: bool) -> list[Mesh]:
         ]
         parts.append(quad(corner, (0.72, 0.74, 0.78)))
         top = shape.body[0][1] - 0.02
-        back = [
-            (tail, near, top - 0.2),
-            (tail, far, top - 0.2),
-            (tail, far, top),
-            (tail, near, top),
-        ]
-        glows = 1.0 if brakes_on or lamps_on else 0.0
-        red: Rgb = (0.95, 0.08, 0.06) if brakes_on else (0.55, 0.05, 0.05)
-        parts.append(quad(back, red, glow=glows))
-    parts.append(
-        quad(
-            [
-                (nose, -0.45, low - 0.3),
-                (nose, 0.45, low - 0.3),
-                (nose, 0.45, low - 0.14),
-                (nose, -0.45, low - 0.14),
-            ],
-            (0.06, 0.06, 0.06),
-        )
-    )
+        red: Rgb = (0.55, 0.05, 0.05)
+        parts.append(upright(tail, (near, far), (top - 0.2, top), red, glow=glow))
+    grille: Rgb = (0.06, 0.06, 0.06)
+    parts.append(upright(nose, (-0.45, 0.45), (low - 0.3, low - 0.14), grille))
     plate_z = shape.body[0][1] - 0.3
-    parts.append(
-        quad(
-            [
-                (tail, -0.16, plate_z),
-                (tail, 0.16, plate_z),
-                (tail, 0.16, plate_z + 0.16),
-                (tail, -0.16, plate_z + 0.16),
-            ],
-            (0.85, 0.83, 0.6),
-        )
-    )
+    plate: Rgb = (0.85, 0.83, 0.6)
+    parts.append(upright(tail, (-0.16, 0.16), (plate_z, plate_z + 0.16), plate))
     return parts

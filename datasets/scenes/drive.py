@@ -40,11 +40,11 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 from crosscue.results import Result
 
-from .car_file import scene_vehicle_text
 from .layout import Layout
 from .mobileye import Device
 from .motion import Conditions
 from .scene_truth import CueRuns, present
+from .settings import scene_vehicle_text
 from .world import World
 
 # File that identifies the drive of a folder.

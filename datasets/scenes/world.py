@@ -213,7 +213,7 @@ class _Site:
     ) -> None:
         """Add a car, which is at (x, y) at time zero."""
         moving = speed != 0.0
-        mesh = car(look, lamps_on=self.lamps_on and moving, brakes_on=False)
+        mesh = car(look, lamps_on=self.lamps_on and moving)
         shape = look.shape
         velocity = (speed * float(np.cos(heading)), speed * float(np.sin(heading)))
         self.add(

@@ -11,7 +11,7 @@ import difflib
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -79,6 +79,10 @@ class Picture:
     t_ns: int | None = None
     frame: int | None = None
     things: tuple[Annotation, ...] = ()
+
+    def boxes(self) -> Iterator[tuple[Annotation, tuple[float, float, float, float]]]:
+        """Yield its objects that have a box, with the box."""
+        return ((thing, thing.box_px) for thing in self.things if thing.box_px is not None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,16 +316,14 @@ def check_boxes(annotations: Annotations) -> None:
     """
     for picture in annotations.pictures:
         width, height = picture.size_px
-        for thing in picture.things:
-            if thing.box_px is None:
-                continue
-            x0, y0, x1, y1 = thing.box_px
+        for thing, box_px in picture.boxes():
+            x0, y0, x1, y1 = box_px
             where = f"{annotations.where}: {thing.place or picture.name} ({thing.label})"
             if not (x0 < x1 and y0 < y1):
-                raise SchemaError(f"{where}: box {_box(thing.box_px)} has no area; correct it")
+                raise SchemaError(f"{where}: box {_box(box_px)} has no area; correct it")
             if x0 < -SLACK_PX or y0 < -SLACK_PX or x1 > width + SLACK_PX or y1 > height + SLACK_PX:
                 raise SchemaError(
-                    f"{where}: box {_box(thing.box_px)} is outside the picture of "
+                    f"{where}: box {_box(box_px)} is outside the picture of "
                     f"{_size(picture.size_px)} pixels; correct it"
                 )
 

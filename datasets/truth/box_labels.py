@@ -226,12 +226,11 @@ def _coco(path: Path) -> BoxLabels:
             tuple(
                 LabelBox(
                     thing.label,
-                    thing.box_px,
+                    box_px,
                     thing.is_crowd,
                     math.nan if thing.range_m is None else thing.range_m,
                 )
-                for thing in one.things
-                if thing.box_px is not None
+                for thing, box_px in one.boxes()
             ),
             one.size_px,
             one.t_ns,

@@ -188,11 +188,9 @@ def write_coco(folder: Path, labels: Annotations) -> Path:
     for picture in labels.pictures:
         t_ns = {} if picture.t_ns is None else {"t_ns": picture.t_ns}
         rows.add_image(picture.name, picture.size_px, **t_ns)
-        for thing in picture.things:
-            if thing.box_px is not None:
-                score = {} if thing.score is None else {"score": thing.score}
-                is_crowd = int(thing.is_crowd)
-                rows.add_box(numbers[thing.label], thing.box_px, iscrowd=is_crowd, **score)
+        for thing, box_px in picture.boxes():
+            score = {} if thing.score is None else {"score": thing.score}
+            rows.add_box(numbers[thing.label], box_px, iscrowd=int(thing.is_crowd), **score)
     return rows.write(folder / WRITTEN, labels.where, numbers)
 
 
@@ -212,13 +210,12 @@ def write_imported(
     rows = CocoRows()
     for picture, t_ns in zip(annotations.pictures, placed.t_ns, strict=True):
         rows.add_image(picture.name, picture.size_px, t_ns=t_ns)
-        for thing in picture.things:
-            if thing.box_px is not None:
-                found = {"visible": thing.visible, "track_id": thing.track}
-                found["segmentation"] = thing.segmentation
-                known = {name: value for name, value in found.items() if value is not None}
-                number = names[plain[thing.label]]
-                rows.add_box(number, thing.box_px, iscrowd=int(thing.is_crowd), **known)
+        for thing, box_px in picture.boxes():
+            found = {"visible": thing.visible, "track_id": thing.track}
+            found["segmentation"] = thing.segmentation
+            known = {name: value for name, value in found.items() if value is not None}
+            number = names[plain[thing.label]]
+            rows.add_box(number, box_px, iscrowd=int(thing.is_crowd), **known)
     return rows.write(path, f"imported from {annotations.where}", names)
 
 

@@ -303,13 +303,12 @@ def write_cvat(folder: Path, labels: Annotations) -> Path:
 def _written(number: int, picture: Picture) -> list[str]:
     wide, high = picture.size_px
     boxes = []
-    for thing in picture.things:
-        if thing.box_px is not None:
-            x0, y0, x1, y1 = (repr(float(side)) for side in thing.box_px)
-            boxes.append(
-                f'<box label={quoteattr(thing.label)} source="auto" occluded="0" xtl="{x0}" '
-                f'ytl="{y0}" xbr="{x1}" ybr="{y1}" z_order="0"></box>'
-            )
+    for thing, box_px in picture.boxes():
+        x0, y0, x1, y1 = (repr(float(side)) for side in box_px)
+        boxes.append(
+            f'<box label={quoteattr(thing.label)} source="auto" occluded="0" xtl="{x0}" '
+            f'ytl="{y0}" xbr="{x1}" ybr="{y1}" z_order="0"></box>'
+        )
     head = f'<image id="{number}" name={quoteattr(picture.name)} width="{wide}" height="{high}">'
     return [head, *boxes, "</image>"]
 

@@ -18,7 +18,6 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.boxes import box_ious
@@ -30,7 +29,14 @@ from crosscue.replay.columns import Floats
 from crosscue.replay.errors import UsageError
 
 from .annotations import LabelledPicture, LabelledSet, TrainingObject, mask_of
-from .operating_point import DetectionCounts, Verdicts, fit_platt, rates_at
+from .operating_point import (
+    DetectionCounts,
+    Verdicts,
+    concatenate_verdicts,
+    fit_platt,
+    match_boxes,
+    rates_at,
+)
 from .samples import read_bgr
 
 # Area below which true objects are ignored: found or not, they do not count.
@@ -255,49 +261,33 @@ MIN_ROWS: Final = 20
 
 def judged(labelled: LabelledSet, found: Sequence[Detections]) -> Mapping[str, Verdicts]:
     """Judge every detection as correct or wrong, by class, without those of ignored objects."""
-    table: dict[str, Verdicts] = {}
-    for label, name in enumerate(labelled.classes):
-        scores: list[float] = []
-        right: list[bool] = []
-        objects = 0
-        for picture, detections in zip(labelled.pictures, found, strict=True):
-            truth = [one for one in picture.objects if one.label == label]
-            counts = np.array([_counts(one, picture) for one in truth], np.bool_)
-            objects += int(counts.sum())
-            for score, verdict in _verdicts(detections, name, truth, counts):
-                scores.append(score)
-                right.append(verdict)
-        table[name] = Verdicts(np.array(scores), np.array(right, np.bool_), objects)
-    return table
+    return {
+        name: concatenate_verdicts(
+            [
+                _judged_in(picture, detections, label, name)
+                for picture, detections in zip(labelled.pictures, found, strict=True)
+            ]
+        )
+        for label, name in enumerate(labelled.classes)
+    }
 
 
-def _counts(one: TrainingObject, picture: LabelledPicture) -> bool:
+def _judged_in(picture: LabelledPicture, found: Detections, label: int, name: str) -> Verdicts:
+    truth = [one for one in picture.objects if one.label == label]
+    counts = np.array([_counts(one) for one in truth], np.bool_)
+    boxes_px = np.array([one.box_px for one in truth], np.float64).reshape(-1, 4)
+    rows = np.flatnonzero(np.array(found.labels) == name)
+    rows = rows[np.argsort(-found.scores[rows], kind="stable")]
+    return match_boxes(found.boxes_px[rows], found.scores[rows], boxes_px, OVERLAP, counts)
+
+
+def _counts(one: TrainingObject) -> bool:
     if one.mask is None:
         x0, y0, x1, y1 = one.box_px
         return not one.is_crowd and (x1 - x0) * (y1 - y0) >= MIN_AREA_PX
     return not one.is_crowd and (
         not isinstance(one.mask, bytes) or area_px(one.mask) >= MIN_AREA_PX
     )
-
-
-def _verdicts(
-    detections: Detections, name: str, truth: list[TrainingObject], counts: NDArray[np.bool_]
-) -> list[tuple[float, bool]]:
-    rows = [i for i, label in enumerate(detections.labels) if label == name]
-    rows.sort(key=lambda i: -detections.scores[i])
-    boxes = np.array([one.box_px for one in truth], np.float64).reshape(-1, 4)
-    is_free = np.ones(len(truth), np.bool_)
-    verdicts = []
-    for i in rows:
-        overlap = np.where(is_free, box_ious(detections.boxes_px[i], boxes), 0.0)
-        best = int(overlap.argmax()) if len(truth) else -1
-        if best < 0 or overlap[best] < OVERLAP:
-            verdicts.append((float(detections.scores[i]), False))
-            continue
-        is_free[best] = False
-        if counts[best]:
-            verdicts.append((float(detections.scores[i]), True))
-    return verdicts
 
 
 def fitted(rows: Verdicts) -> Calibration:

@@ -51,35 +51,33 @@ class DetectionCounts:
         return self.right / self.signs if self.signs else float("nan")
 
 
-def match_signs(
+def match_boxes(
     boxes_px: NDArray[np.float64],
     scores: NDArray[np.float64],
     truth_px: NDArray[np.float64],
     min_overlap: float,
-    min_height_px: float = 0.0,
+    counts: NDArray[np.bool_],
 ) -> Verdicts:
-    """Match the detections of one frame to true signs, each at most once, best scores first.
+    """Match the detections of one frame to true boxes, each at most once, best scores first.
 
     Args:
         boxes_px: Shape (N, 4).
         scores: Shape (N,).
-        truth_px: Shape (M, 4): boxes of the true signs.
+        truth_px: Shape (M, 4): true boxes.
         min_overlap: Minimum intersection over union of a correct detection.
-        min_height_px: Height below which true signs and their detections are ignored.
+        counts: Shape (M,), bool: False for true boxes to ignore, with their detections.
     """
-    heights = truth_px[:, 3] - truth_px[:, 1]
     order = np.argsort(-scores, kind="stable")
-    is_right, counts = np.zeros(len(scores), np.bool_), np.ones(len(scores), np.bool_)
-    left = set(range(len(truth_px)))
-    for i in order.tolist():
-        fractions = box_ious(boxes_px[i], truth_px) if len(truth_px) else np.empty(0)
-        fits = [k for k in left if fractions[k] >= min_overlap]
-        if fits:
-            taken = max(fits, key=lambda k: float(fractions[k]))
-            left.remove(taken)
+    is_right, is_judged = np.zeros(len(scores), np.bool_), np.ones(len(scores), np.bool_)
+    is_free = np.ones(len(truth_px), np.bool_)
+    for i in order.tolist() if len(truth_px) else ():
+        overlap = np.where(is_free, box_ious(boxes_px[i], truth_px), -1.0)
+        best = int(overlap.argmax())
+        if overlap[best] >= min_overlap:
+            is_free[best] = False
             is_right[i] = True
-            counts[i] = heights[taken] >= min_height_px
-    return Verdicts(scores[counts], is_right[counts], int((heights >= min_height_px).sum()))
+            is_judged[i] = counts[best]
+    return Verdicts(scores[is_judged], is_right[is_judged], int(counts.sum()))
 
 
 def concatenate_verdicts(parts: list[Verdicts]) -> Verdicts:

@@ -43,7 +43,7 @@ from crosscue.replay.files.tree_text import spelled
 from crosscue.results import Result, json_key
 from crosscue.verb import Option
 
-from .status import MERGED, NO_RUN, unfinished
+from .journal import MERGED, NO_RUN, unfinished
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -127,6 +127,14 @@ def quad(
     return triangles(four[order], rgb, uv=at[order], texture=texture, glow=glow)
 
 
+def upright(
+    x: float, y: tuple[float, float], z: tuple[float, float], rgb: Rgb, *, glow: float = 0.0
+) -> Mesh:
+    """Return a vertical quad across the x axis."""
+    corners = [(x, y[0], z[0]), (x, y[1], z[0]), (x, y[1], z[1]), (x, y[0], z[1])]
+    return quad(corners, rgb, glow=glow)
+
+
 def box(
     x: tuple[float, float],
     y: tuple[float, float],
@@ -135,7 +143,6 @@ def box(
     *,
     texture: int = -1,
     wall_m: tuple[float, float] = (1.0, 1.0),
-    glow: float = 0.0,
 ) -> Mesh:
     """Return a box without floor; walls repeat their texture every ``wall_m``."""
     (x0, x1), (y0, y1), (z0, z1) = x, y, z
@@ -154,11 +161,10 @@ def box(
             rgb,
             repeat=(times, high),
             texture=texture,
-            glow=glow,
         )
         for (a, b), times in sides
     ]
-    parts.append(quad([(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)], rgb, glow=glow))
+    parts.append(quad([(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)], rgb))
     return merge_meshes(parts)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from crosscue.datasets.truth.coco import OBJECTS_FILE
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.images import Encoded, decode, encoded, lose, read_file
-from crosscue.detectors.training.operating_point import Verdicts, concatenate_verdicts, match_signs
+from crosscue.detectors.training.operating_point import Verdicts, concatenate_verdicts, match_boxes
 from crosscue.eval.batch.drive_list import DriveInput, drives_of
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Floats
@@ -214,11 +214,6 @@ class ScoringRules:
     min_overlap: float
     min_height_px: float = 0.0
 
-    @property
-    def of_judge(self) -> tuple[float, float]:
-        """Arguments of ``match_signs``."""
-        return self.min_overlap, self.min_height_px
-
 
 def judged_pictures(
     path: Path,
@@ -272,7 +267,7 @@ def _judged(one: SignPicture, detector: Detector, rules: ScoringRules) -> Verdic
                 f"{one.name}: a box lies outside its {width} x {height} px; correct it"
             )
         which = np.array([name == label for name in found.labels], np.bool_)
-        parts.append(
-            match_signs(found.boxes_px[which], found.scores[which], truth, *rules.of_judge)
-        )
+        boxes_px, scores = found.boxes_px[which], found.scores[which]
+        counts = truth[:, 3] - truth[:, 1] >= rules.min_height_px
+        parts.append(match_boxes(boxes_px, scores, truth, rules.min_overlap, counts))
     return concatenate_verdicts(parts)

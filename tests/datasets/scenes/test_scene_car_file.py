@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from crosscue.datasets.scenes.car_file import scene_vehicle_text
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
+from crosscue.datasets.scenes.settings import scene_vehicle_text
 from crosscue.detectors.ranging.height_to_range import range_of
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from support.scenes import picture_at, world

@@ -13,8 +13,15 @@ import pytest
 import crosscue
 from crosscue.eval.batch import status
 from crosscue.eval.batch.jobs import Job, in_turn, run_many
-from crosscue.eval.batch.journal import entry_path, error_of, write_entry, write_plan
-from crosscue.eval.batch.status import DriveState, drives_of_folder, pace_of
+from crosscue.eval.batch.journal import (
+    DriveState,
+    drives_of_folder,
+    entry_path,
+    error_of,
+    pace_of,
+    write_entry,
+    write_plan,
+)
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import FAILURE, LOCK, signature
 from support.drive_work import letters, write_jobs
