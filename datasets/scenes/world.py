@@ -55,7 +55,6 @@ class SceneObject:
     """One labelled object.
 
     Attributes:
-        number: Instance number, which is also its index in ``World.things``.
         category: Class of the object.
         role: Role of the object at the intersection.
         mesh: Triangles at time zero; a traffic light is red.
@@ -67,9 +66,9 @@ class SceneObject:
         later: Mesh from ``later_s`` on, or None.
         later_s: Start of ``later``.
         curved: Layout whose curve it follows while it moves, or None.
+        number: Instance number, which is also its index in ``World.things``.
     """
 
-    number: int
     category: Category
     role: Role
     mesh: Mesh
@@ -81,6 +80,7 @@ class SceneObject:
     later: Mesh | None = None
     later_s: float = 0.0
     curved: Layout | None = None
+    number: int = 0
 
     @property
     def is_fixed(self) -> bool:
@@ -137,14 +137,6 @@ class World:
     patches: tuple[Patch, ...] = ()
 
 
-class _Box(NamedTuple):
-    """Middle, heading and size of an object."""
-
-    at: tuple[float, float, float]
-    heading: float
-    size: tuple[float, float, float]
-
-
 class _Flow(NamedTuple):
     """Cars that follow one another: their lane across the heading, and how many a second."""
 
@@ -174,32 +166,12 @@ class _Site:
             for x0, x1, y0, y1 in self.taken
         )
 
-    def add(
-        self,
-        category: Category,
-        role: Role,
-        mesh: Mesh,
-        box: _Box,
-        velocity: tuple[float, float] = (0.0, 0.0),
-        span_s: tuple[float, float] = ALWAYS,
-        later: tuple[Mesh, float] | None = None,
-    ) -> None:
-        """Add a labelled object, whose mesh is already in position; another from a time on."""
+    def add(self, thing: SceneObject) -> None:
+        """Add a labelled object, whose mesh is already in position."""
         number = len(self.things)
-        owned = None if later is None else later[0].owned_by(number)
-        self.things.append(
-            SceneObject(
-                number,
-                category,
-                role,
-                mesh.owned_by(number),
-                *box,
-                velocity,
-                span_s,
-                owned,
-                0.0 if later is None else later[1],
-            )
-        )
+        later = None if thing.later is None else thing.later.owned_by(number)
+        mesh = thing.mesh.owned_by(number)
+        self.things.append(replace(thing, number=number, mesh=mesh, later=later))
 
     def add_car(
         self,
@@ -216,18 +188,17 @@ class _Site:
         mesh = car(look, lamps_on=self.lamps_on and moving)
         shape = look.shape
         velocity = (speed * float(np.cos(heading)), speed * float(np.sin(heading)))
-        self.add(
+        thing = SceneObject(
             "car",
             role,
             mesh.placed(x, y, heading),
-            _Box(
-                (x, y, shape.height_m / 2),
-                heading,
-                (shape.length_m, 2 * shape.half_width_m, shape.height_m),
-            ),
+            (x, y, shape.height_m / 2),
+            heading,
+            (shape.length_m, 2 * shape.half_width_m, shape.height_m),
             velocity if moving else (0.0, 0.0),
             span_s,
         )
+        self.add(thing)
         if not moving and span_s == ALWAYS:
             c, s = abs(np.cos(heading)), abs(np.sin(heading))
             a = shape.length_m / 2 * c + shape.half_width_m * s
@@ -420,16 +391,8 @@ def _plants(site: _Site, fixed: Generator) -> None:
     for x in (-112.0, 116.0):
         for y in np.arange(-60.0, 60.0, 5.0):
             if abs(y) > w + 3:
-                site.parts.append(
-                    crown(
-                        (x + float(fixed.uniform(-2, 2)), float(y), 4.0),
-                        4.0,
-                        4.0,
-                        5,
-                        site.atlas,
-                        fixed,
-                    )
-                )
+                place = (x + float(fixed.uniform(-2, 2)), float(y), 4.0)
+                site.parts.append(crown(place, 4.0, 4.0, 5, site.atlas, fixed))
     if layout.vegetation:
         _overgrowth(site, fixed)
 
@@ -476,8 +439,8 @@ def _sign(site: _Site, category: Category, x: float, y: float, z: float, turn: f
     flat = face.corners.reshape(-1, 3)
     wide, high = (float(np.ptp(flat[:, k])) for k in (1, 2))
     site.parts += [post(x, y, z + high / 2), sign_back(face).placed(x, y, turn, z)]
-    box = _Box((x, y, z), turn, (0.02, wide, high))
-    site.add(category, "furniture", face.placed(x, y, turn, z), box)
+    mesh, size = face.placed(x, y, turn, z), (0.02, wide, high)
+    site.add(SceneObject(category, "furniture", mesh, (x, y, z), turn, size))
 
 
 def _control(site: _Site, drive: ApproachMotion) -> None:
@@ -509,11 +472,11 @@ def _lights(site: _Site, drive: ApproachMotion) -> None:
     for y, z in ((lane, 5.45), (lane + 3.4, 5.5), (-(w + 1.2), 3.2)):
         red = light_head("red").placed(end, y, 0.0, z)
         green = light_head("green").placed(end, y, 0.0, z)
-        box = _Box((end, y, z), 0.0, (0.24, 0.36, 1.06))
-        if drive.green_s < 0.0:
-            site.add("traffic_light", "furniture", green, box)
-        else:
-            site.add("traffic_light", "furniture", red, box, later=(green, drive.green_s))
+        size = (0.24, 0.36, 1.06)
+        light = SceneObject("traffic_light", "furniture", green, (end, y, z), 0.0, size)
+        if drive.green_s >= 0.0:
+            light = replace(light, mesh=red, later=green, later_s=drive.green_s)
+        site.add(light)
 
 
 def _parked(site: _Site, varied: Generator) -> None:

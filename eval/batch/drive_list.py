@@ -23,7 +23,7 @@ import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from crosscue.eval.runs.folder import MANIFEST
 from crosscue.replay.errors import LogError, UnknownFormatError, UsageError
@@ -45,24 +45,9 @@ DEPTH: Final = 8
 NAME_LENGTH: Final = 150
 # File names of logs that do not identify a drive.
 SAYS_NOTHING: Final = frozenset(
-    {
-        "bag",
-        "camera",
-        "can",
-        "can0",
-        "can1",
-        "data",
-        "drive",
-        "images",
-        "log",
-        "logs",
-        "record",
-        "recording",
-        "rosbag",
-        "rosbag2",
-        "video",
-    }
-)
+    {"bag", "camera", "can", "can0", "can1", "data", "drive", "images", "log", "logs", "record",
+     "recording", "rosbag", "rosbag2", "video"}
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,14 +101,8 @@ class DriveList:
         return replace(self, drives=mine, shard=shard, of=len(self.drives))
 
 
-@dataclass(frozen=True, slots=True)
-class _Found:
-    """A drive before it has a name.
-
-    Attributes:
-        logs: As in ``DriveInput``, in the order found.
-        beside: The folder that may hold its vehicle file and ground truth, or None.
-    """
+class _Found(NamedTuple):
+    """Logs of a drive before it has a name, and the folder that may hold its own files."""
 
     logs: tuple[str, ...]
     beside: Path | None
@@ -156,7 +135,7 @@ def _all_of(arguments: Sequence[str], *, each: bool) -> DriveList:
         return DriveList(tuple(_named([_Found(tuple(arguments), None)])), False)
     found = [one for text in arguments for one in _expanded(text, each=each)]
     if not is_many and not Path(arguments[0]).is_dir():
-        found = [replace(found[0], beside=None)]
+        found = [found[0]._replace(beside=None)]
     return DriveList(tuple(_named(found)), is_many)
 
 
@@ -216,7 +195,7 @@ def _listed(path: Path, *, each: bool) -> Iterator[_Found]:
         if len(logs) == 1:
             yield from _expanded(logs[0], each=each)
         elif logs:
-            yield replace(_plain(logs[0]), logs=tuple(logs))
+            yield _plain(logs[0])._replace(logs=tuple(logs))
         count += bool(logs)
     if not count:
         raise UsageError(f"@{path}: names no drive; expected a line for each")

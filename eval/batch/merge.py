@@ -53,23 +53,6 @@ DRIVE: Final = "drive"
 FOLDER: Final = MERGED
 
 
-@dataclass(frozen=True, slots=True)
-class Merged:
-    """Summary of a merge.
-
-    Attributes:
-        run: The folder that holds the rows of all drives.
-        drives: Number of drives.
-        rows: Number of rows by table.
-        drive_seconds: Log time of all drives, each from its first to its last pose.
-    """
-
-    run: RunFolder
-    drives: int
-    rows: dict[str, int]
-    drive_seconds: float
-
-
 @dataclass(slots=True)
 class _Drive:
     name: str
@@ -89,13 +72,16 @@ class _Drive:
 
 def merge_runs(
     runs: Mapping[str, RunFolder], out: RunFolder, failures: Mapping[str, str]
-) -> Merged:
+) -> dict[str, int]:
     """Write one table of each kind with a ``drive`` column, and a manifest.
 
     Args:
         runs: Runs by drive name; rows are in the order of names.
         out: Output folder; cleared first.
         failures: Reason why a drive has no run, by drive name.
+
+    Returns:
+        Number of rows by table.
 
     Raises:
         RunError: A run is damaged, or a column has different types in two runs.
@@ -110,8 +96,7 @@ def merge_runs(
         for kind in kinds:
             _merge_table(kind, drives, new)
         write_manifest(new, _manifest(drives, kinds, failures))
-    rows = {kind: sum(one.rows.get(kind, 0) for one in drives) for kind in kinds}
-    return Merged(out, len(drives), rows, sum(one.seconds for one in drives))
+    return {kind: sum(one.rows.get(kind, 0) for one in drives) for kind in kinds}
 
 
 def _merge_table(kind: str, drives: Sequence[_Drive], out: RunFolder) -> None:
@@ -182,7 +167,9 @@ def _manifest(
         ),
         failures={spelled(name): why for name, why in sorted(failures.items())},
         account=sum_accounts(one.manifest.account for one in drives),
-        notices=dict(Counter(text for one in drives for text in _notices(one)).most_common()),
+        notices=dict(
+            Counter(text for one in drives for text in {*one.manifest.notices}).most_common()
+        ),
         versions=_versions(drives),
     )
 
@@ -280,10 +267,6 @@ def _content(run: RunFolder) -> tuple[str, ...]:
     return (*logs, _settings_hash(manifest), _tables_hash(run))
 
 
-def _notices(one: _Drive) -> set[str]:
-    return set(one.manifest.notices)
-
-
 def _versions(drives: Sequence[_Drive]) -> dict[str, tuple[str, ...]]:
     """Return all versions of each library; more than one is worth checking."""
     found: dict[str, set[str]] = {}
@@ -364,5 +347,5 @@ def merge(
     if not runs:
         raise RunError(f"{places[0]}: contains no finished run; replay first")
     with created(Path(output), overwrite=overwrite) as folder:
-        merged = merge_runs(runs, folder, failures)
-    return MergedRuns(merged.run.path, tuple(sorted(runs)), failures, merged.rows)
+        rows = merge_runs(runs, folder, failures)
+    return MergedRuns(folder.path, tuple(sorted(runs)), failures, rows)

@@ -61,12 +61,8 @@ def building(
     if is_shop:
         walls.texture[-2:] = -1
         walls.albedo[-2:] = 0.35
-        lip = box(
-            (x[0] - 0.2, x[1] + 0.2),
-            (y[0] - 0.2, y[1] + 0.2),
-            (high, high + 0.35),
-            (0.5, 0.47, 0.44),
-        )
+        edge = ((x[0] - 0.2, x[1] + 0.2), (y[0] - 0.2, y[1] + 0.2))
+        lip = box(*edge, (high, high + 0.35), (0.5, 0.47, 0.44))
         return merge_meshes([walls, lip]), high
     return merge_meshes([walls, _gable(x, y, high, atlas, rng)]), high + 1.5
 
@@ -163,9 +159,9 @@ def crown(
     return merge_meshes(parts)
 
 
-def sign_face(kind: str, atlas: Atlas, width_m: float | None = None) -> Mesh:
+def sign_face(kind: str, atlas: Atlas) -> Mesh:
     """Return a sign's face, centred at the origin, facing -x; the stop sign is an octagon."""
-    wide = WIDTH_M[kind] if width_m is None else width_m
+    wide = WIDTH_M[kind]
     high = (
         wide / 3 if kind.startswith("one_way") else wide * 1.25 if kind == "speed_limit" else wide
     )
@@ -211,17 +207,9 @@ def light_head(state: str) -> Mesh:
         parts.append(
             disc((-0.02, 0.0, z), (-1.0, 0.0, 0.0), 0.14, (rgb[0], rgb[1], rgb[2]), glow=float(lit))
         )
-        parts.append(
-            quad(
-                [
-                    (-0.2, 0.16, z + 0.15),
-                    (-0.2, -0.16, z + 0.15),
-                    (0.0, -0.16, z + 0.17),
-                    (0.0, 0.16, z + 0.17),
-                ],
-                case,
-            )
-        )
+        front, back = z + 0.15, z + 0.17
+        hood = [(-0.2, 0.16, front), (-0.2, -0.16, front), (0.0, -0.16, back), (0.0, 0.16, back)]
+        parts.append(quad(hood, case))
     return merge_meshes(parts)
 
 

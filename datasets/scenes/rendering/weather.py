@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from crosscue.datasets.scenes.motion import Conditions
+from crosscue.datasets.scenes.motion import Conditions, Light
 
-from .mesh import Floats, Mesh
+from .mesh import Floats, Mesh, Rgb
 from .textures import smooth_noise
 
 SKY_HIGH, SKY_WIDE = 128, 1024
+
+
+# Elevation of the sun in degrees, colours of sun, ambient light, haze and zenith, strength of the
+# glare, noise of the sensor, amount of clouds.
+LIGHTS: Final[dict[Light, tuple[float, Rgb, Rgb, Rgb, Rgb, float, float, float]]] = {
+    "noon": (52.0, (0.72, 0.69, 0.62), (0.50, 0.54, 0.60), (206, 216, 226), (96, 142, 206),
+             0.0, 2.0, 0.45),
+    "overcast": (50.0, (0.05, 0.05, 0.05), (0.80, 0.82, 0.84), (208, 212, 216), (186, 192, 200),
+                 0.0, 2.6, 0.9),
+    "dusk": (4.0, (0.03, 0.02, 0.02), (0.36, 0.36, 0.43), (150, 130, 132), (66, 80, 124),
+             0.0, 5.5, 0.5),
+    "low_sun": (9.0, (1.05, 0.80, 0.50), (0.42, 0.43, 0.48), (240, 222, 188), (140, 166, 206),
+                1.0, 2.4, 0.35),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,48 +86,7 @@ class Daylight:
 
 def daylight(conditions: Conditions, rng: Generator) -> Daylight:
     """Return the light of a run."""
-    high_deg, sun, ambient, haze, zenith, flare, noise, clouds = {
-        "noon": (
-            52.0,
-            (0.72, 0.69, 0.62),
-            (0.50, 0.54, 0.60),
-            (206, 216, 226),
-            (96, 142, 206),
-            0.0,
-            2.0,
-            0.45,
-        ),
-        "overcast": (
-            50.0,
-            (0.05, 0.05, 0.05),
-            (0.80, 0.82, 0.84),
-            (208, 212, 216),
-            (186, 192, 200),
-            0.0,
-            2.6,
-            0.9,
-        ),
-        "dusk": (
-            4.0,
-            (0.03, 0.02, 0.02),
-            (0.36, 0.36, 0.43),
-            (150, 130, 132),
-            (66, 80, 124),
-            0.0,
-            5.5,
-            0.5,
-        ),
-        "low_sun": (
-            9.0,
-            (1.05, 0.80, 0.50),
-            (0.42, 0.43, 0.48),
-            (240, 222, 188),
-            (140, 166, 206),
-            1.0,
-            2.4,
-            0.35,
-        ),
-    }[conditions.light]
+    high_deg, sun, ambient, haze, zenith, flare, noise, clouds = LIGHTS[conditions.light]
     elevation = np.deg2rad(high_deg)
     turn = conditions.sun_turn_rad
     to_sun = np.array(

@@ -20,7 +20,9 @@ def _merged(folder: Path, words: list[str], out: str = "merged") -> RunFolder:
     results = run_many(jobs, letters, in_turn)
     runs = {one.job.name: open_run(one.job.run) for one in results if one.error is None}
     failures = {one.job.name: one.error for one in results if one.error is not None}
-    return merge_runs(runs, create(folder / out, overwrite=True), failures).run
+    merged = create(folder / out, overwrite=True)
+    merge_runs(runs, merged, failures)
+    return merged
 
 
 def _run(path: Path, **columns: "pa.Array") -> RunFolder:

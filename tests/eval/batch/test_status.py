@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import crosscue
-from crosscue.eval.batch import status
+from crosscue.eval.batch import journal
 from crosscue.eval.batch.jobs import Job, in_turn, run_many
 from crosscue.eval.batch.journal import (
     DriveState,
@@ -92,7 +92,7 @@ def test_drive_of_a_dead_worker_is_stale(
         assert states(folder)["later"] == state
     assert pace_of(drives_of_folder(folder), folder).left_s > 0.0
 
-    monkeypatch.setattr(status, "STALE_S", 60.0)
+    monkeypatch.setattr(journal, "STALE_S", 60.0)
     os.utime(entry_path(later), (1.0e9, 1.0e9))
     assert states(folder)["later"] == "stale"
     assert "later: its worker on another-machine is gone, last update" in repr(

@@ -52,7 +52,8 @@ def test_manifest_is_read_back_unchanged(manifest: Manifest, tmp_path: Path) -> 
 def test_single_drive_commands_refuse_merged_run_in_one_line(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    merged = merge_runs({}, create(tmp_path / "merged", overwrite=False), {}).run.path
+    merged = create(tmp_path / "merged", overwrite=False).path
+    merge_runs({}, RunFolder(merged), {})
 
     assert cli.run([command, str(merged)]) == 1
 
