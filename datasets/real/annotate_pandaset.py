@@ -27,9 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.datasets.adapters.pandaset import FRONT, PandasetPoses, read_pandaset_poses
+from crosscue.datasets.adapters.published import json_of
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
 from crosscue.replay.columns import Floats
-from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.vehicle.vehicle import load
 
@@ -58,30 +59,23 @@ class VehicleBoxes:
 
     def __init__(self, sequence: Path, poses: PandasetPoses) -> None:
         """Read the boxes of a sequence."""
-        import pyarrow.parquet as pq
-
-        table = pq.read_table(sequence / "annotations" / "cuboids.parquet")
-        sizes = ("width_m", "length_m", "height_m")
-        columns: dict[str, Any] = {
-            name: table[name].to_numpy()
-            for name in ("frame", "x_m", "y_m", "z_m", "yaw_rad", *sizes)
-        }
+        columns = read_boxes(sequence)
         frame = columns["frame"]
-        boxes_px, depth_m = _projected(columns, poses, _intrinsics(sequence))
+        boxes_px, depth_m = _projected(columns, poses, intrinsics_of(sequence))
         at = np.column_stack([columns["x_m"], columns["y_m"]]) - poses.xyz_m[frame, :2]
         forward, left = poses.forward[frame, :2], poses.left[frame, :2]
         ahead, aside = (at * forward).sum(axis=1), (at * left).sum(axis=1)
         # The long axis of a box is its y axis.
         along = np.column_stack([-np.sin(columns["yaw_rad"]), np.cos(columns["yaw_rad"])])
         turn = np.arctan2((along * left).sum(axis=1), (along * forward).sum(axis=1))
-        focal, center, _ = _intrinsics(sequence)
+        focal, _, center, _ = intrinsics_of(sequence)
         column_px = center - focal * aside / np.maximum(ahead, 1e-9)
-        kept = np.isin(table["label"].to_pylist(), VEHICLES) & (ahead > 0.0) & (ahead < REACH_M)
+        kept = np.isin(columns["label"], VEHICLES) & (ahead > 0.0) & (ahead < REACH_M)
         kept &= (column_px >= 0.0) & (column_px < WIDTH_PX)
         self.frame: Final = frame[kept]
         self.ahead_m: Final[Floats] = ahead[kept]
         self.turn_deg: Final[Floats] = np.degrees(turn[kept])
-        self.motion: Final = np.array(table["motion"].to_pylist())[kept]
+        self.motion: Final = columns["motion"][kept]
         self.visible: Final[Floats] = _visible(frame, boxes_px, depth_m)[kept]
         self.outline_px: Final[Floats] = boxes_px[kept]
         self.at_m: Final[Floats] = at[kept]
@@ -222,11 +216,28 @@ def _ranges(poses: PandasetPoses, gone_m: Floats, camera_x_m: float) -> str:
     return text.getvalue()
 
 
-def _projected(
-    boxes: dict[str, Any], poses: PandasetPoses, intrinsics: tuple[float, float, float]
-) -> tuple[Floats, Floats]:
-    """Return outlines of N boxes in their pictures, shape (N, 4), and depths of their centres."""
-    focal, center_x, center_y = intrinsics
+def read_boxes(sequence: Path) -> dict[str, Any]:
+    """Read the columns of a sequence's 3-D boxes.
+
+    Raises:
+        LogFormatError: There is no table of boxes.
+    """
+    import pyarrow.parquet as pq
+
+    path = sequence / "annotations" / "cuboids.parquet"
+    if not path.exists():
+        raise LogFormatError(
+            f"{path}: missing; the boxes are published as pickles, which are not read; "
+            "docs/reference/formats.md describes how to convert them to this table"
+        )
+    table = pq.read_table(path)
+    numbers = ("frame", "x_m", "y_m", "z_m", "yaw_rad", "width_m", "length_m", "height_m")
+    texts = {name: np.array(table[name].to_pylist()) for name in ("label", "motion")}
+    return {name: table[name].to_numpy() for name in numbers} | texts
+
+
+def corners_m(boxes: dict[str, Any], poses: PandasetPoses) -> Floats:
+    """Return the corners of N boxes ahead, left and up of the camera, shape (N, 8, 3)."""
     frame = boxes["frame"]
     forward, left = poses.forward[frame], poses.left[frame]
     axes = np.stack([forward, left, np.cross(forward, left)], axis=1)
@@ -234,13 +245,26 @@ def _projected(
     own = unit * np.stack([boxes[f"{of}_m"] for of in ("width", "length", "height")], 1)[:, None]
     cos, sin = np.cos(boxes["yaw_rad"])[:, None], np.sin(boxes["yaw_rad"])[:, None]
     turned = [own[..., 0] * cos - own[..., 1] * sin, own[..., 0] * sin + own[..., 1] * cos]
-    middle = np.stack([boxes["x_m"], boxes["y_m"], boxes["z_m"]], 1) - poses.xyz_m[frame]
-    corners = np.stack([*turned, own[..., 2]], axis=2) + middle[:, None]
-    depth, leftwards, up = np.moveaxis(corners @ np.swapaxes(axes, 1, 2), 2, 0)
+    corners = np.stack([*turned, own[..., 2]], axis=2) + _middles_m(boxes, poses)[:, None]
+    return np.asarray(corners @ np.swapaxes(axes, 1, 2))
+
+
+def _middles_m(boxes: dict[str, Any], poses: PandasetPoses) -> Floats:
+    middles = np.stack([boxes["x_m"], boxes["y_m"], boxes["z_m"]], 1)
+    return np.asarray(middles - poses.xyz_m[boxes["frame"]])
+
+
+def _projected(
+    boxes: dict[str, Any], poses: PandasetPoses, intrinsics: tuple[float, float, float, float]
+) -> tuple[Floats, Floats]:
+    """Return outlines of N boxes in their pictures, shape (N, 4), and depths of their centres."""
+    focal, _, center_x, center_y = intrinsics
+    depth, leftwards, up = np.moveaxis(corners_m(boxes, poses), 2, 0)
     depth = np.maximum(depth, 0.1)
     x, y = center_x - focal * leftwards / depth, center_y - focal * up / depth
     outlines = np.stack([x.min(1), y.min(1), x.max(1), y.max(1)], axis=1)
-    return outlines, np.asarray((middle * forward).sum(axis=1))
+    forward = poses.forward[boxes["frame"]]
+    return outlines, np.asarray((_middles_m(boxes, poses) * forward).sum(axis=1))
 
 
 def _visible(frame: NDArray[np.int64], boxes_px: Floats, depth_m: Floats) -> Floats:
@@ -257,10 +281,10 @@ def _visible(frame: NDArray[np.int64], boxes_px: Floats, depth_m: Floats) -> Flo
     return found
 
 
-def _intrinsics(sequence: Path) -> tuple[float, float, float]:
-    """Return focal length, and column and row of the optical axis."""
-    found = json_tree((sequence / "camera" / FRONT / "intrinsics.json").read_bytes())
-    return float(found["fx"]), float(found["cx"]), float(found["cy"])
+def intrinsics_of(sequence: Path) -> tuple[float, float, float, float]:
+    """Return both focal lengths, and column and row of the optical axis."""
+    found = json_of(sequence / "camera" / FRONT / "intrinsics.json")
+    return float(found["fx"]), float(found["fy"]), float(found["cx"]), float(found["cy"])
 
 
 if __name__ == "__main__":

@@ -14,17 +14,17 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from crosscue.datasets.adapters.pandaset import FRONT, PandasetPoses, read_pandaset_poses
+from crosscue.datasets.adapters.pandaset import read_pandaset_poses
 from crosscue.datasets.truth.coco import CocoRows
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.tree_text import json_tree
+
+from .annotate_pandaset import corners_m, intrinsics_of, read_boxes
 
 CATEGORIES: Final = {"car": 1, "truck": 2, "person": 3}
 LABELS: Final = {
@@ -39,19 +39,6 @@ REACH_M: Final = 60.0
 MIN_VISIBLE: Final = 0.5
 # Boxes nearer to the camera's plane are not projected.
 NEAR_M: Final = 1.0
-_COLUMNS: Final = ("frame", "label", "x_m", "y_m", "z_m", "width_m", "length_m", "height_m")
-_CORNERS: Final = np.array(
-    [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
-)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
-    """One 3-D box in one picture: label, range, and corners of shape (8, 2) in pixels."""
-
-    label: str
-    range_m: float
-    corners_px: Floats
 
 
 def write_labels(sequence: Path, output: Path) -> Path:
@@ -61,82 +48,49 @@ def write_labels(sequence: Path, output: Path) -> Path:
         LogFormatError: The sequence has no poses, or no table of boxes.
         OutputError: It cannot be written.
     """
-    import pyarrow.parquet as pq
-
-    poses = read_pandaset_poses(sequence)
-    found = json_tree((sequence / "camera" / FRONT / "intrinsics.json").read_bytes())
-    camera = np.array([found[name] for name in ("fx", "fy", "cx", "cy")], np.float64)
-    path = sequence / "annotations" / "cuboids.parquet"
-    if not path.exists():
-        raise LogFormatError(
-            f"{path}: missing; the boxes are published as pickles, which are not read; "
-            "docs/reference/formats.md describes how to convert them to this table"
-        )
-    table = pq.read_table(path)
-    rows: dict[str, Any] = {
-        name: table[name].to_numpy(zero_copy_only=False) for name in (*_COLUMNS, "yaw_rad")
-    }
+    poses, boxes = read_pandaset_poses(sequence), read_boxes(sequence)
+    fx, fy, cx, cy = intrinsics_of(sequence)
+    ahead, aside, up = np.moveaxis(corners_m(boxes, poses), 2, 0)
+    range_m = ahead.mean(axis=1)
+    corners_px = np.stack([cx - fx * aside / ahead, cy - fy * up / ahead], axis=2)
+    low = np.clip(corners_px.min(axis=1), 0.0, SIZE_PX)
+    high = np.clip(corners_px.max(axis=1), 0.0, SIZE_PX)
+    is_seen = (ahead.min(axis=1) >= NEAR_M) & (high - low >= 1.0).all(axis=1)
     labels = CocoRows()
     for frame, t_ns in enumerate(poses.t_ns.tolist()):
         labels.add_image(f"{frame:02}.jpg", SIZE_PX, id=frame, t_ns=t_ns)
-        seen = [
-            one
-            for row in np.flatnonzero(rows["frame"] == frame)
-            if (one := _projected(rows, int(row), poses, frame, camera)) is not None
-        ]
-        for one, visible in _visible(seen):
-            name = LABELS.get(one.label)
-            low = np.clip(one.corners_px.min(axis=0), 0.0, SIZE_PX)
-            high = np.clip(one.corners_px.max(axis=0), 0.0, SIZE_PX)
-            wide, high_px = (high - low).tolist()
-            is_out = name is None or visible < MIN_VISIBLE or one.range_m > REACH_M
+        rows = np.flatnonzero((boxes["frame"] == frame) & is_seen)
+        rows = rows[np.argsort(range_m[rows], kind="stable")]
+        for row, visible in zip(rows.tolist(), _visible(corners_px[rows]), strict=True):
+            name = LABELS.get(str(boxes["label"][row]))
+            (x0, y0), (x1, y1) = low[row].tolist(), high[row].tolist()
+            is_out = name is None or visible < MIN_VISIBLE or range_m[row] > REACH_M
             labels.add_box(
                 CATEGORIES[name or "truck"],
-                (*low.tolist(), *high.tolist()),
-                bbox=[round(v, 1) for v in (*low.tolist(), wide, high_px)],
-                area=round(wide * high_px, 1),
+                (x0, y0, x1, y1),
+                bbox=[round(v, 1) for v in (x0, y0, x1 - x0, y1 - y0)],
+                area=round((x1 - x0) * (y1 - y0), 1),
                 iscrowd=int(is_out),
                 visible=round(visible, 3),
-                range_m=round(one.range_m, 2),
+                range_m=round(float(range_m[row]), 2),
             )
     source = "PandaSet 002 (Scale AI, Hesai; CC BY 4.0): projected boxes"
     return labels.write(output, source, CATEGORIES)
 
 
-def _projected(
-    rows: dict[str, Any], row: int, poses: PandasetPoses, frame: int, camera: Floats
-) -> _Seen | None:
-    """Return a box in the picture, or None if it is completely outside."""
-    size = np.array([rows[f"{name}_m"][row] for name in ("width", "length", "height")])
-    yaw = float(rows["yaw_rad"][row])
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
-    center = np.array([rows[f"{axis}_m"][row] for axis in "xyz"])
-    at = (_CORNERS * size) @ turn.T + center - poses.xyz_m[frame]
-    forward, left = poses.forward[frame], poses.left[frame]
-    ahead, aside, up = at @ forward, at @ left, at @ np.cross(forward, left)
-    if ahead.min() < NEAR_M:
-        return None
-    fx, fy, cx, cy = camera.tolist()
-    corners = np.column_stack([cx - fx * aside / ahead, cy - fy * up / ahead])
-    low, high = np.clip(corners.min(axis=0), 0, SIZE_PX), np.clip(corners.max(axis=0), 0, SIZE_PX)
-    if (high - low < 1.0).any():
-        return None
-    return _Seen(str(rows["label"][row]), float(ahead.mean()), corners)
-
-
-def _visible(seen: list[_Seen]) -> Iterator[tuple[_Seen, float]]:
-    """Yield each box with its fraction that is in the picture and not hidden by nearer boxes."""
+def _visible(corners_px: Floats) -> Iterator[float]:
+    """Yield the fraction of each box in the picture that no earlier, nearer box hides."""
     import cv2
 
     hidden = np.zeros(SIZE_PX[::-1], np.uint8)
-    for one in sorted(seen, key=lambda box: box.range_m):
+    for corners in corners_px:
         mine = np.zeros_like(hidden)
-        hull = cv2.convexHull(np.clip(one.corners_px, -20_000, 20_000).astype(np.int32))
+        hull = cv2.convexHull(np.clip(corners, -20_000, 20_000).astype(np.int32))
         whole = float(cv2.contourArea(hull))
         cv2.fillConvexPoly(mine, hull, (1,))
         shown = int((mine & ~hidden & 1).sum())
         hidden |= mine
-        yield one, min(shown / max(whole, 1.0), 1.0)
+        yield min(shown / max(whole, 1.0), 1.0)
 
 
 if __name__ == "__main__":
