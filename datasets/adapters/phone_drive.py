@@ -37,25 +37,9 @@ GRAVITY: Final = tuple(f"motionGravity{axis}(G)" for axis in "XYZ")
 GYRO: Final = tuple(f"gyroRotation{axis}(rad/s)" for axis in "XYZ")
 FIELD: Final = tuple(f"locationHeading{axis}(µT)" for axis in "XYZ")
 FIX_TIME: Final = "locationTimestamp_since1970(s)"
+COURSE: Final = "locationCourse(°)"
 
 Values = Mapping[str, Floats]
-
-
-def _speed(of: Values) -> dict[str, Floats]:
-    return {"speed_mps": of["Speed (MPH)"] * MILE_H_MPS}
-
-
-def _engine(of: Values) -> dict[str, Floats]:
-    return {
-        "steering_deg": of["Steering Angle"],
-        "throttle_percent": of["Throttle Position"],
-        "engine_rpm": of["Engine RPM"],
-    }
-
-
-def _car_position(of: Values) -> dict[str, Floats]:
-    latitude, longitude = "Latitude / Y Position (Degrees)", "Longitude / X Position (Degrees)"
-    return {"latitude_deg": of[latitude], "longitude_deg": of[longitude]}
 
 
 def _yaw_rate(of: Values) -> dict[str, Floats]:
@@ -65,57 +49,71 @@ def _yaw_rate(of: Values) -> dict[str, Floats]:
     return {"yaw_rate_radps": -(rate * down).sum(axis=1) / np.linalg.norm(down, axis=1)}
 
 
-def _field(of: Values) -> dict[str, Floats]:
-    return {f"mag_{axis}_t": of[name] * MICROTESLA for axis, name in zip("xyz", FIELD, strict=True)}
-
-
-def _fix(of: Values) -> dict[str, Floats]:
-    course = np.deg2rad(90.0 - of["locationCourse(°)"])
-    return {
-        "latitude_deg": of["locationLatitude(WGS84)"],
-        "longitude_deg": of["locationLongitude(WGS84)"],
-        "altitude_m": of["locationAltitude(m)"],
-        "position_sd_m": of["locationHorizontalAccuracy(m)"],
-        "speed_mps": of["locationSpeed(m/s)"],
-        "course_rad": np.arctan2(np.sin(course), np.cos(course)),
-    }
+def _course(of: Values) -> dict[str, Floats]:
+    course = np.deg2rad(90.0 - of[COURSE])
+    return {"course_rad": np.arctan2(np.sin(course), np.cos(course))}
 
 
 class _Stream(NamedTuple):
-    """A topic: its type, its source columns, and their conversion."""
+    """A topic: its type, and its columns.
+
+    Attributes:
+        type_name: Type of the topic.
+        columns: Column of the file by our name.
+        scale: Factor on these columns.
+        more: Further columns that ``derived`` uses.
+        derived: Function that computes columns.
+    """
 
     type_name: str
-    fields: tuple[str, ...]
-    to_columns: Callable[[Values], dict[str, Floats]]
+    columns: Mapping[str, str]
+    scale: float = 1.0
+    more: tuple[str, ...] = ()
+    derived: Callable[[Values], dict[str, Floats]] = lambda _: {}
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """All columns of the file that the topic needs."""
+        return (*self.more, *self.columns.values())
 
 
 CAR: Final[dict[str, _Stream]] = {
-    "car/speed": _Stream("crosscue/WheelSpeeds", ("Speed (MPH)",), _speed),
+    "car/speed": _Stream("crosscue/WheelSpeeds", {"speed_mps": "Speed (MPH)"}, MILE_H_MPS),
     "car/engine": _Stream(
-        "crosscue/Table", ("Steering Angle", "Throttle Position", "Engine RPM"), _engine
+        "crosscue/Table",
+        {
+            "steering_deg": "Steering Angle",
+            "throttle_percent": "Throttle Position",
+            "engine_rpm": "Engine RPM",
+        },
     ),
     "car/position": _Stream(
         "crosscue/Table",
-        ("Latitude / Y Position (Degrees)", "Longitude / X Position (Degrees)"),
-        _car_position,
+        {
+            "latitude_deg": "Latitude / Y Position (Degrees)",
+            "longitude_deg": "Longitude / X Position (Degrees)",
+        },
     ),
 }
 PHONE: Final[dict[str, _Stream]] = {
-    "phone/gyro": _Stream("sensor_msgs/msg/Imu", (*GYRO, *GRAVITY), _yaw_rate),
-    "phone/magnetometer": _Stream("sensor_msgs/msg/MagneticField", FIELD, _field),
+    "phone/gyro": _Stream("sensor_msgs/msg/Imu", {}, more=(*GYRO, *GRAVITY), derived=_yaw_rate),
+    "phone/magnetometer": _Stream(
+        "sensor_msgs/msg/MagneticField",
+        {f"mag_{axis}_t": name for axis, name in zip("xyz", FIELD, strict=True)},
+        MICROTESLA,
+    ),
 }
 FIX: Final = _Stream(
     "sensor_msgs/msg/NavSatFix",
-    (
-        FIX_TIME,
-        "locationLatitude(WGS84)",
-        "locationLongitude(WGS84)",
-        "locationAltitude(m)",
-        "locationHorizontalAccuracy(m)",
-        "locationSpeed(m/s)",
-        "locationCourse(°)",
-    ),
-    _fix,
+    {
+        "latitude_deg": "locationLatitude(WGS84)",
+        "longitude_deg": "locationLongitude(WGS84)",
+        "altitude_m": "locationAltitude(m)",
+        "position_sd_m": "locationHorizontalAccuracy(m)",
+        "speed_mps": "locationSpeed(m/s)",
+    },
+    more=(FIX_TIME, COURSE),
+    derived=_course,
 )
 
 
@@ -192,10 +190,11 @@ def _held(name: str, stream: _Stream, lines: _Lines) -> HeldRows:
         at = int(lines.t_ns[np.flatnonzero(~good)[0]])
         losses = (*losses, Loss("a field is not a number", bad, f"first at {at} ns"))
     t_ns = lines.t_ns[good]
-    made = stream.to_columns({one: column[good] for one, column in values.items()})
+    kept = {one: column[good] for one, column in values.items()}
+    table = {ours: kept[theirs] * stream.scale for ours, theirs in stream.columns.items()}
     declared = len(t_ns) + sum(loss.rows or 0 for loss in losses)
     topic = Topic(name, stream.type_name, "columns", declared=declared)
-    return HeldRows(topic, t_ns, Table({**made}), losses)
+    return HeldRows(topic, t_ns, Table({**table, **stream.derived(kept)}), losses)
 
 
 def _fixes(lines: _Lines) -> HeldRows:
