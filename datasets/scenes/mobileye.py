@@ -58,11 +58,11 @@ class DeviceFaults:
 class Device:
     """A Mobileye during one drive, with the state of its tracks."""
 
-    def __init__(self, world: World, rng: Generator, faults: DeviceFaults | None = None) -> None:
+    def __init__(self, world: World, rng: Generator) -> None:
         """Begin without tracks."""
         self._world = world
         self._rng = rng
-        self._faults = DeviceFaults() if faults is None else faults
+        self._faults = DeviceFaults()
         self._reports: dict[int, bool] = {}
         self._scale: dict[int, float] = {}
         self._age: dict[int, int] = {}

@@ -202,12 +202,12 @@ def _middle(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(rgb[y : rgb.shape[0] - y, x : rgb.shape[1] - x])
 
 
-def sheet_jpeg(sheet: NDArray[np.uint8], quality: int = 82) -> bytes:
+def sheet_jpeg(sheet: NDArray[np.uint8]) -> bytes:
     """Encode a sheet as JPEG."""
     import cv2
 
     bgr = np.ascontiguousarray(sheet[..., ::-1])
-    return bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
+    return bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 82])[1])
 
 
 SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp")

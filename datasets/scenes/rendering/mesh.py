@@ -172,18 +172,22 @@ def tube(a: Sequence[float], b: Sequence[float], radius_m: float, rgb: Rgb, side
     """Return a thin pole from ``a`` to ``b``."""
     start, stop = np.asarray(a, np.float64), np.asarray(b, np.float64)
     along = (stop - start) / np.linalg.norm(stop - start)
-    helper = np.array([1.0, 0.0, 0.0]) if abs(along[2]) > 0.9 else np.array([0.0, 0.0, 1.0])
-    e1 = np.cross(helper, along)
-    e1 /= np.linalg.norm(e1)
-    e2 = np.cross(along, e1)
-    angle = np.arange(sides + 1) * 2 * np.pi / sides
-    ring = radius_m * (np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2)
+    ring = _ring(along, radius_m, sides, is_level=bool(abs(along[2]) <= 0.9))
     return merge_meshes(
         [
             quad([start + ring[k], start + ring[k + 1], stop + ring[k + 1], stop + ring[k]], rgb)
             for k in range(sides)
         ]
     )
+
+
+def _ring(along: Floats, radius_m: float, sides: int, *, is_level: bool) -> Floats:
+    """Return a closed ring around an axis, shape (sides + 1, 3)."""
+    e1 = np.cross([0.0, 0.0, 1.0] if is_level else [1.0, 0.0, 0.0], along)
+    e1 /= np.linalg.norm(e1)
+    e2 = np.cross(along, e1)
+    angle = np.arange(sides + 1) * 2 * np.pi / sides
+    return np.asarray(radius_m * (np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2))
 
 
 def disc(
@@ -193,15 +197,10 @@ def disc(
     rgb: Rgb,
     *,
     glow: float = 0.0,
-    sides: int = 14,
 ) -> Mesh:
     """Return a flat disc facing along ``normal``."""
     middle, n = np.asarray(centre, np.float64), np.asarray(normal, np.float64)
-    helper = np.array([0.0, 0.0, 1.0]) if abs(n[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
-    e1 = np.cross(helper, n)
-    e1 /= np.linalg.norm(e1)
-    e2 = np.cross(n, e1)
-    angle = np.arange(sides + 1) * 2 * np.pi / sides
-    rim = middle + radius_m * (np.cos(angle)[:, None] * e1 + np.sin(angle)[:, None] * e2)
+    sides = 14
+    rim = middle + _ring(n, radius_m, sides, is_level=bool(abs(n[2]) < 0.9))
     fan = np.stack([np.tile(middle, (sides, 1)), rim[:-1], rim[1:]], axis=1)
     return triangles(fan, rgb, glow=glow)

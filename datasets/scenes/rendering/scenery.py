@@ -213,8 +213,9 @@ def light_head(state: str) -> Mesh:
     return merge_meshes(parts)
 
 
-def mast(x: float, y: float, arm_to_y: float, high: float = 6.3) -> Mesh:
+def mast(x: float, y: float, arm_to_y: float) -> Mesh:
     """Return a pole with an arm over the road."""
+    high = 6.3
     return merge_meshes(
         [
             tube((x + 0.3, y, 0.0), (x + 0.3, y, high + 0.3), 0.13, STEEL, 8),

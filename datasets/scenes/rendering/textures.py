@@ -32,6 +32,11 @@ def sign(name: str) -> Rgba:
 
 
 LEVELS: Final = 9
+# Colours of walls.
+WALLS: Final = (
+    (168, 92, 74), (196, 186, 168), (150, 158, 166), (206, 200, 188), (128, 104, 88),
+    (176, 164, 132), (110, 120, 112),
+)  # fmt: skip
 # Width and height of the wall that one house-front texture covers.
 FRONT_M: Final = (8.0, 6.0)
 
@@ -100,13 +105,13 @@ def smooth_noise(rng: Generator, size: int, cells: int) -> NDArray[np.float64]:
     )
 
 
-def leaves(rng: Generator, size: int = 128) -> Rgba:
+def leaves(rng: Generator) -> Rgba:
     """Return a bunch of leaves: many small ellipses, dark ones first, on transparency."""
     import cv2
 
+    size, count = 128, 420
     canvas = np.zeros((size, size, 4), np.uint8)
     base = np.array([74, 104, 42]) * rng.uniform(0.85, 1.1) + rng.normal(0, 6, 3)
-    count = 420
     for k in range(count):
         radius = np.sqrt(rng.random()) * size * 0.42
         angle = rng.uniform(0, 2 * np.pi)
@@ -122,20 +127,12 @@ def leaves(rng: Generator, size: int = 128) -> Rgba:
     return canvas
 
 
-def front(rng: Generator, *, is_shop: bool, size: int = 256) -> Rgba:
+def front(rng: Generator, *, is_shop: bool) -> Rgba:
     """Return a wall of eight by six metres with two storeys of windows."""
     import cv2
 
-    walls = [
-        (168, 92, 74),
-        (196, 186, 168),
-        (150, 158, 166),
-        (206, 200, 188),
-        (128, 104, 88),
-        (176, 164, 132),
-        (110, 120, 112),
-    ]
-    wall = np.array(walls[int(rng.integers(len(walls)))]) * rng.uniform(0.85, 1.08)
+    size = 256
+    wall = np.array(WALLS[int(rng.integers(len(WALLS)))]) * rng.uniform(0.85, 1.08)
     grain = smooth_noise(rng, size, 32)[..., None] * 0.12 + 0.94
     canvas = np.full((size, size, 4), 255, np.uint8)
     canvas[..., :3] = np.clip(wall * grain, 0, 255)
@@ -165,8 +162,9 @@ def front(rng: Generator, *, is_shop: bool, size: int = 256) -> Rgba:
     return canvas
 
 
-def roof(rng: Generator, size: int = 64) -> Rgba:
+def roof(rng: Generator) -> Rgba:
     """Return a texture of shingles."""
+    size = 64
     base = np.array([92, 88, 88]) * rng.uniform(0.7, 1.2) + rng.normal(0, 8, 3)
     canvas = np.full((size, size, 4), 255, np.uint8)
     light = 0.85 + 0.3 * rng.random((size // 4, size // 8))
@@ -176,8 +174,9 @@ def roof(rng: Generator, size: int = 64) -> Rgba:
     return canvas
 
 
-def bark(rng: Generator, size: int = 32) -> Rgba:
+def bark(rng: Generator) -> Rgba:
     """Return a texture of a tree's trunk."""
+    size = 32
     canvas = np.full((size, size, 4), 255, np.uint8)
     stripes = 0.7 + 0.6 * rng.random((1, size, 1)) + 0.15 * rng.random((size, size, 1))
     canvas[..., :3] = np.clip(np.array([84, 70, 58]) * stripes, 0, 255)
