@@ -176,7 +176,6 @@ HANDLE: Final = "Arrow or Python reads a file that the door has opened"
 # Modules that open files otherwise, or folders of them, and why they may.
 PAST_THE_DOOR: Final[dict[str, str]] = {
     "datasets/adapters/": LOGS,
-    "datasets/labels/": NAMED,
     "datasets/real/": NAMED,
     "datasets/scenes/drive.py": PACKAGE,
     "datasets/scenes/rendering/textures.py": PACKAGE,
