@@ -49,8 +49,8 @@ PUBLISHED_RUNS: Final[Mapping[str, tuple[float, float]]] = {
 }  # fmt: skip
 
 Row = dict[str, Any]
-# Cues of cars at the intersection, which both rules count.
-CARS: Final = ("cross_traffic", "parked")
+# Cues of cars, with which the rule that tracks them is compared.
+CARS: Final = ("cross_traffic", "parked", "oncoming", "outgoing")
 
 
 def cue_rows(cues: Mapping[str, CueScore], tracked: Mapping[str, CueScore]) -> list[Row]:
