@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.studies.intervals import km, mean_of, percent
-from crosscue.eval.studies.town.landmark_study import comparisons_of
+from crosscue.eval.studies.town.landmark_study import summarise_landmarks
 from crosscue.eval.studies.town.range_study import law_m
 from crosscue.eval.studies.town.settings import UNTIL_LOST, FieldStudy, LandmarkStudy
 from crosscue.eval.studies.town.work import chunks_of
@@ -95,7 +95,7 @@ def landmarks(drives: int, seed: int) -> None:
             dict(zip(DriveResult._fields, np.concatenate(parts[case]).T, strict=True))
             for case in sorted(parts)
         ]
-        for compared in comparisons_of(study, rows):
+        for compared in summarise_landmarks(study, rows).comparisons:
             print(
                 f"{name:42} {percent(compared.extra):>24} {percent(compared.extra_reached):>24} "
                 f"{percent(compared.extra_all):>24}  {compared.strategy}"

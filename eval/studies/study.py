@@ -7,21 +7,42 @@ with its pictures and to a JSON file with its settings and results.
 
 from __future__ import annotations
 
+import base64
 import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
+from crosscue.eval.report.html import write_page
 from crosscue.replay.errors import RunError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.safe_text import table
 from crosscue.results import Result
 
-from .page import PageTable, write_study_page
-
 PAGE: Final = "study.html"
+
+
+@dataclass(frozen=True, slots=True)
+class PageTable:
+    """A table of text.
+
+    Attributes:
+        heading: Heading above the table.
+        head: Column names.
+        rows: Rows with one entry per column.
+    """
+
+    heading: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+    def as_text(self) -> str:
+        """Return the table as text with aligned columns, of any width."""
+        return "\n".join([self.heading, *table(self.head, self.rows, sys.maxsize, (0,))])
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -54,7 +75,7 @@ class StudyResult(Result):
 
     def lines(self) -> Iterator[str]:
         """Yield the tables, the notes, and the paths of the page and of other files."""
-        yield "\n\n".join(table.as_text() for table in self.tables)
+        yield "\n\n".join(one.as_text() for one in self.tables)
         yield from ("", *self.notes, "", f"page       {self.page}")
         yield from (f"{what:10} {self.folder / name}" for name, what in self.files.items())
 
@@ -78,12 +99,14 @@ class Written:
     pictures: Sequence[Path] = field(default=())
 
     def write(self, folder: Path, name: str) -> None:
-        """Write the page and the JSON file.
+        """Write the page, which needs no network and runs no script, and the JSON file.
 
         Raises:
             OutputError: A file cannot be written.
         """
-        write_study_page(folder / PAGE, self.title, self.notes, self.tables, self.pictures)
+        drawn = [(one.stem, base64.b64encode(door.read(one)).decode()) for one in self.pictures]
+        page = {"title": self.title, "notes": self.notes, "tables": self.tables, "pictures": drawn}
+        write_page(folder / PAGE, "study.html.j2", page)
         write_text(folder / name, strict_json(self.content) + "\n")
 
 

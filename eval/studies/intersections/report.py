@@ -18,8 +18,7 @@ from crosscue.eval.scoring.files import write_scores
 from crosscue.eval.scoring.intervals import TOO_FEW, Proportion
 from crosscue.eval.scoring.runs import RunScored, metrics_of
 from crosscue.eval.scoring.scene.approaches import ApproachScore
-from crosscue.eval.studies.page import PageTable
-from crosscue.eval.studies.study import PAGE
+from crosscue.eval.studies.study import PAGE, PageTable
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text

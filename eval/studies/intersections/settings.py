@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from crosscue.datasets.scenes.layout import SCORED
-from crosscue.datasets.scenes.rendering.camera import SceneCamera
-from crosscue.datasets.scenes.settings import SceneSettings
+from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 from crosscue.detectors.registry import EMBEDDED
 from crosscue.replay.errors import UsageError
 from crosscue.verb import Option
@@ -50,10 +49,7 @@ class IntersectionStudy:
             raise UsageError(
                 f"runs {self.runs}, seed {self.seed}: expected 1 or more runs, a seed of 0 or more"
             )
-        if not 64 <= self.width_px <= 3840 or self.width_px % 16:
-            raise UsageError(
-                f"width_px: {self.width_px}, expected a multiple of 16 from 64 to 3840"
-            )
+        camera_of_width(self.width_px)
         unknown = [name for name in self.layouts if name not in SCORED]
         if unknown or len(set(self.layouts)) != len(self.layouts) or not self.layouts:
             raise UsageError(
@@ -62,7 +58,7 @@ class IntersectionStudy:
 
     def scenes(self) -> tuple[SceneSettings, ...]:
         """Return all drives, in the order of processing."""
-        camera = SceneCamera(width_px=self.width_px, height_px=self.width_px * 9 // 16)
+        camera = camera_of_width(self.width_px)
         return tuple(
             SceneSettings(layout=layout, run=run, seed=self.seed, camera=camera)
             for run in range(1, self.runs + 1)

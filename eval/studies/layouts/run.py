@@ -14,10 +14,9 @@ from crosscue.eval.batch.jobs import JobOutcome, exit_status_of
 from crosscue.eval.batch.ray_jobs import engine_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.scoring.intervals import TOO_FEW, Mean
-from crosscue.eval.studies.page import PageTable
 from crosscue.eval.studies.pictures import save_png
 from crosscue.eval.studies.simulated_drives import SPARSE_AND_EMBEDDED, run_drives
-from crosscue.eval.studies.study import StudyResult, Written, without_nan
+from crosscue.eval.studies.study import PageTable, StudyResult, Written, without_nan
 from crosscue.replay.errors import RunError
 from crosscue.replay.versions import versions
 from crosscue.results import HIDDEN

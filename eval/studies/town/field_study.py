@@ -17,9 +17,8 @@ import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder, locked
 from crosscue.eval.studies.intervals import fraction_of, mean_of, percent
-from crosscue.eval.studies.page import PageTable
 from crosscue.eval.studies.pictures import figure, save_figure
-from crosscue.eval.studies.study import StudyResult, Written, claim
+from crosscue.eval.studies.study import PageTable, StudyResult, Written, claim
 from crosscue.localization.town.random_stream import key_of
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files import door

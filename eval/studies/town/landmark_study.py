@@ -27,16 +27,14 @@ from crosscue.eval.studies.intervals import (
     ratio_of,
     ratio_of_means,
 )
-from crosscue.eval.studies.page import PageTable
 from crosscue.eval.studies.pictures import COLOURS, figure, save_figure
+from crosscue.eval.studies.study import PageTable
 from crosscue.localization.town.drive import DriveOutcome
 from crosscue.localization.town.settings import TownDrive
 
 from .settings import LandmarkStudy
-from .work import split
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from matplotlib.axes import Axes
 
 SUCCESS: Final = 0.8
@@ -154,10 +152,11 @@ class LandmarkResult:
     comparisons: tuple[StrategyComparison, ...]
 
 
-def summarise_landmarks(study: LandmarkStudy, table: pa.Table) -> LandmarkResult:
-    """Return the results from ``drives.parquet``."""
+def summarise_landmarks(
+    study: LandmarkStudy, rows: Sequence[dict[str, NDArray[np.float64]]]
+) -> LandmarkResult:
+    """Return the results from the drives of each case; strategies are compared on the grid."""
     cases = study.cases()
-    rows = list(split(table))
     cells = tuple(_cell(case.settings, part) for case, part in zip(cases, rows, strict=True))
     grid = len(cases) - len(study.points)
     return LandmarkResult(cells, tuple(_comparisons(cells[:grid], rows[:grid])))
@@ -178,20 +177,6 @@ def _cell(settings: TownDrive, rows: dict[str, NDArray[np.float64]]) -> Cell:
         travelled_m=mean_of(rows["travelled_m"]),
         updates=float(rows["detected"].mean()),
     )
-
-
-def comparisons_of(
-    study: LandmarkStudy, rows: Sequence[dict[str, NDArray[np.float64]]]
-) -> list[StrategyComparison]:
-    """Compare strategies with straight to goal.
-
-    Args:
-        study: The study, of which only the grid is compared.
-        rows: Columns of ``Result`` for each of the study's cases.
-    """
-    grid = len(study.cases()) - len(study.points)
-    cells = [_cell(case.settings, part) for case, part in zip(study.cases(), rows, strict=True)]
-    return _comparisons(cells[:grid], rows[:grid])
 
 
 def _comparisons(

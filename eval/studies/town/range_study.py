@@ -31,10 +31,8 @@ from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import TownDrive
 
 from .settings import UNTIL_LOST, RangeStudy, changed
-from .work import split
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from matplotlib.axes import Axes
 
 # Mean distance at loss by compass 2-sigma in degrees; infinite if never lost.
@@ -121,12 +119,12 @@ class CompassResult:
     is_calibrated: bool
 
 
-def summarise_ranges(study: RangeStudy, table: pa.Table) -> list[CompassResult]:
+def summarise_ranges(
+    study: RangeStudy, rows: Sequence[dict[str, NDArray[np.float64]]]
+) -> list[CompassResult]:
     """Return the results by compass, in the order of the study's cases."""
-    return [
-        _of_case(case.settings, rows)
-        for case, rows in zip(study.cases(), split(table), strict=True)
-    ]
+    cases = zip(study.cases(), rows, strict=True)
+    return [_of_case(case.settings, part) for case, part in cases]
 
 
 def loss_points(

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, over
 
 from crosscue.eval.runs.folder import RunFolder, locked
 from crosscue.eval.studies.intervals import km, percent
-from crosscue.eval.studies.page import PageTable
-from crosscue.eval.studies.study import StudyResult, Written, claim
+from crosscue.eval.studies.study import PageTable, StudyResult, Written, claim
 from crosscue.localization.town.drive import DriveResult as DriveResult
 from crosscue.localization.town.drive import drive_traced
 from crosscue.replay.progress import Progress, emit
@@ -201,10 +200,10 @@ def drive_study(
 
 def finish_range(study: RangeStudy, folder: Path) -> Written:
     """Write summary, picture and page from ``drives.parquet``."""
-    table = RunFolder(folder).table(DRIVES)
-    results = range_study.summarise_ranges(study, table)
+    rows = list(split(RunFolder(folder).table(DRIVES)))
+    results = range_study.summarise_ranges(study, rows)
     picture = range_study.draw_range_study(
-        results, list(split(table)), study.drive.navigation.lost_above_m, folder
+        results, rows, study.drive.navigation.lost_above_m, folder
     )
     others = range_study.drive_choices(study)
     return _finish(
@@ -221,9 +220,9 @@ def finish_range(study: RangeStudy, folder: Path) -> Written:
 
 def finish_landmarks(study: LandmarkStudy, folder: Path) -> Written:
     """Write summary, pictures and page from ``drives.parquet``."""
-    table = RunFolder(folder).table(DRIVES)
-    result = landmark_study.summarise_landmarks(study, table)
-    pictures = landmark_study.draw_landmark_study(study, result, list(split(table)), folder)
+    rows = list(split(RunFolder(folder).table(DRIVES)))
+    result = landmark_study.summarise_landmarks(study, rows)
+    pictures = landmark_study.draw_landmark_study(study, result, rows, folder)
     tables = landmark_study.tables(study, result)
     return _finish(
         study,

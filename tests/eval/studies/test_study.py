@@ -24,7 +24,7 @@ from crosscue.eval.studies.intervals import (
 )
 from crosscue.eval.studies.town import work
 from crosscue.eval.studies.town.field_study import drive_field, finish_field
-from crosscue.eval.studies.town.landmark_study import comparisons_of
+from crosscue.eval.studies.town.landmark_study import summarise_landmarks
 from crosscue.eval.studies.town.range_study import (
     calibrate,
     drive_choices,
@@ -38,7 +38,7 @@ from crosscue.eval.studies.town.settings import (
     RangeStudy,
     load_study,
 )
-from crosscue.eval.studies.town.work import assemble, chunks_of, run
+from crosscue.eval.studies.town.work import assemble, chunks_of, run, split
 from crosscue.localization.town.drive import DriveResult, Keys, drive_many
 from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
 from crosscue.replay.columns import Floats
@@ -135,7 +135,7 @@ def test_extra_distance_is_averaged_over_pairs_reached_goals_and_all_drives() ->
         }
         for distance_m, outcome in zip(distances_m, outcomes, strict=True)
     ]
-    (found,) = comparisons_of(study, rows)
+    (found,) = summarise_landmarks(study, rows).comparisons
 
     assert found.pairs == 2
     assert found.extra.value == pytest.approx(0.1)
@@ -219,7 +219,7 @@ def test_distance_until_loss_scales_with_squared_compass_error(tmp_path: Path) -
         patch.setattr(work, "CHUNK_DRIVES", 60)
         list(drive_study(study, tmp_path, 2))
     finish_range(study, tmp_path)
-    twenty, thirty, none = summarise_ranges(study, RunFolder(tmp_path).table("drives"))
+    twenty, thirty, none = summarise_ranges(study, list(split(RunFolder(tmp_path).table("drives"))))
 
     ratio = twenty.lost_after_m.value / thirty.lost_after_m.value
     assert ratio == pytest.approx(2.25, rel=0.12)
