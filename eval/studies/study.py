@@ -10,10 +10,10 @@ from __future__ import annotations
 import base64
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, TypeVar
 
 from crosscue.eval.report.html import write_page
 from crosscue.replay.errors import RunError
@@ -23,6 +23,7 @@ from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.safe_text import table
 from crosscue.results import Result
 
+T = TypeVar("T")
 PAGE: Final = "study.html"
 
 
@@ -39,6 +40,14 @@ class PageTable:
     heading: str
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+
+    @classmethod
+    def of(
+        cls, heading: str, rows: Iterable[T], *columns: tuple[str, Callable[[T], str]]
+    ) -> PageTable:
+        """Return the table of records, with the name and the text of each column."""
+        texts = tuple(tuple(text(row) for _, text in columns) for row in rows)
+        return cls(heading, tuple(name for name, _ in columns), texts)
 
     def as_text(self) -> str:
         """Return the table as text with aligned columns, of any width."""

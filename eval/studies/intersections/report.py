@@ -155,26 +155,22 @@ def _text_tables(tables: Mapping[str, Any], approaches: ApproachScore) -> list[P
                 *((f"failed {one}", "", "", "") for one in tables["failures"]),
             ),
         ),
-        PageTable(
+        PageTable.of(
             "By intersection",
-            ("intersection", "detected", "mean, m", "full", "mean, m"),
-            tuple(
-                (
-                    row["intersection"],
-                    f"{row['detected']} of {row['approaches']}",
-                    _number(row["detected_m"]),
-                    f"{row['full']} of {row['approaches']}",
-                    _number(row["full_m"]),
-                )
-                for row in rows
-            ),
+            rows,
+            ("intersection", lambda row: row["intersection"]),
+            ("detected", lambda row: f"{row['detected']} of {row['approaches']}"),
+            ("mean, m", lambda row: _number(row["detected_m"])),
+            ("full", lambda row: f"{row['full']} of {row['approaches']}"),
+            ("mean, m", lambda row: _number(row["full_m"])),
         ),
-        PageTable(
+        PageTable.of(
             "Late, missing or invented",
-            ("cause", "drives at each intersection"),
-            tuple(
-                (cause, ", ".join(f"{place} {drives}" for place, drives in places.items()))
-                for cause, places in tables["causes"].items()
+            tables["causes"].items(),
+            ("cause", lambda item: item[0]),
+            (
+                "drives at each intersection",
+                lambda item: ", ".join(f"{place} {drives}" for place, drives in item[1].items()),
             ),
         ),
         PageTable(

@@ -255,6 +255,10 @@ def _less_one(ratio: ValueInterval) -> ValueInterval:
     return ValueInterval(*(value - 1.0 for value in ratio))
 
 
+def _published_extra(one: StrategyComparison) -> str:
+    return "" if math.isnan(one.published_extra) else f"{100 * one.published_extra:.0f} %"
+
+
 def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[PageTable, ...]:
     """Return the results as tables, with the published ones."""
     grid = result.cells[: len(result.cells) - len(study.points)]
@@ -276,37 +280,27 @@ def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[PageTable, ...
         )
         for strategy in study.strategies
     ]
-    compared = PageTable(
+    published = ("published", _published_extra)
+    compared = PageTable.of(
         "Against straight to goal",
+        result.comparisons,
+        ("strategy", lambda c: c.strategy),
+        ("drives farther by", lambda c: percent(c.extra_reached)),
+        (f"below {DENSE_PER_KM2:g} per km2", lambda c: percent(c.extra_sparse)),
+        published,
+        ("paired", lambda c: percent(c.extra)),
+        ("pairs", lambda c: str(c.pairs)),
+        ("all drives", lambda c: percent(c.extra_all)),
         (
-            "strategy",
-            "drives farther by",
-            f"below {DENSE_PER_KM2:g} per km2",
-            "published",
-            "paired",
-            "pairs",
-            "all drives",
             "range gained, km",
-            "published",
-            "more drives succeed",
-        ),
-        tuple(
-            (
-                c.strategy,
-                percent(c.extra_reached),
-                percent(c.extra_sparse),
-                "" if math.isnan(c.published_extra) else f"{100 * c.published_extra:.0f} %",
-                percent(c.extra),
-                str(c.pairs),
-                percent(c.extra_all),
+            lambda c: (
                 ""
                 if math.isnan(c.gain_m)
-                else f"{c.gain_m / 1e3:.1f} ({len(c.gains_m)} cells; {c.beyond} beyond)",
-                "1 to 2",
-                percent(c.more_success),
-            )
-            for c in result.comparisons
+                else f"{c.gain_m / 1e3:.1f} ({len(c.gains_m)} cells; {c.beyond} beyond)"
+            ),
         ),
+        ("published", lambda _: "1 to 2"),
+        ("more drives succeed", lambda c: percent(c.more_success)),
     )
     cities = PageTable(
         "Drives farther than straight to goal, by size of city",
@@ -322,26 +316,26 @@ def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[PageTable, ...
                 c.strategy,
                 *("" if math.isnan(one.extra.value) else percent(one.extra) for one in c.by_city),
                 percent(c.extra_reached),
-                "" if math.isnan(c.published_extra) else f"{100 * c.published_extra:.0f} %",
+                _published_extra(c),
             )
             for c in result.comparisons
         ),
     )
-    points = PageTable(
+    points = PageTable.of(
         "Landmark to landmark, single points",
-        ("landmarks per km2", "rate", "drives", "reached", "range at 80 %, km", "field test, km"),
-        tuple(
-            (
-                f"{c.landmarks_per_km2:g}",
-                f"{100 * c.detection_rate:.0f} %",
-                str(c.drives),
-                percent(c.success),
-                km(c.range_m, 1),
+        result.cells[len(grid) :],
+        ("landmarks per km2", lambda c: f"{c.landmarks_per_km2:g}"),
+        ("rate", lambda c: f"{100 * c.detection_rate:.0f} %"),
+        ("drives", lambda c: str(c.drives)),
+        ("reached", lambda c: percent(c.success)),
+        ("range at 80 %, km", lambda c: km(c.range_m, 1)),
+        (
+            "field test, km",
+            lambda c: (
                 "at least 6.9 (8 of 10)"
                 if (c.landmarks_per_km2, c.detection_rate) == PUBLISHED_POINT[:2]
-                else "",
-            )
-            for c in result.cells[len(grid) :]
+                else ""
+            ),
         ),
     )
     return (

@@ -211,7 +211,7 @@ def finish_range(study: RangeStudy, folder: Path) -> Written:
         folder,
         "Range without landmarks",
         [asdict(r) for r in results],
-        (*range_tables(results), choices_table(others)),
+        (range_table(results), choices_table(others)),
         (OURS, *RANGE_NOTES),
         [picture, range_study.draw_choices(others, folder)],
         choices=[range_study.choice_tree(one) for one in others],
@@ -258,66 +258,49 @@ RANGE_NOTES: Final = (
 )
 
 
-def range_tables(results: Sequence[range_study.CompassResult]) -> tuple[PageTable, ...]:
+def range_table(results: Sequence[range_study.CompassResult]) -> PageTable:
     """Return the results by compass, with the published ones."""
-    return (
-        PageTable(
-            "Distance at loss (95 % intervals)",
-            (
-                "compass",
-                "drives",
-                "lost",
-                "mean, km",
-                "published, km",
-                "shortest..longest",
-                "curve at 100 m",
-                "r ds D",
-                "NEES (consistent)",
-            ),
-            tuple(
-                (
-                    range_study.compass_name(r),
-                    str(r.drives),
-                    percent(r.fraction_lost),
-                    km(r.lost_after_m) if r.lost else "never lost",
-                    _published(r),
-                    f"{r.shortest_m / 1e3:.2f}..{r.longest_m / 1e3:.2f}" if r.lost else "",
-                    km(r.growth.crossing_m),
-                    "" if math.isnan(r.law_m) else f"{r.law_m / 1e3:.1f}",
-                    f"{r.nees_mean:.2f} ({r.nees_band[0]:.2f}..{r.nees_band[1]:.2f})",
-                )
-                for r in results
-            ),
+    return PageTable.of(
+        "Distance at loss (95 % intervals)",
+        results,
+        ("compass", range_study.compass_name),
+        ("drives", lambda r: str(r.drives)),
+        ("lost", lambda r: percent(r.fraction_lost)),
+        ("mean, km", lambda r: km(r.lost_after_m) if r.lost else "never lost"),
+        ("published, km", _published),
+        (
+            "shortest..longest",
+            lambda r: f"{r.shortest_m / 1e3:.2f}..{r.longest_m / 1e3:.2f}" if r.lost else "",
+        ),
+        ("curve at 100 m", lambda r: km(r.growth.crossing_m)),
+        ("r ds D", lambda r: "" if math.isnan(r.law_m) else f"{r.law_m / 1e3:.1f}"),
+        (
+            "NEES (consistent)",
+            lambda r: f"{r.nees_mean:.2f} ({r.nees_band[0]:.2f}..{r.nees_band[1]:.2f})",
         ),
     )
 
 
 def choices_table(choices: Sequence[range_study.CompassCase]) -> PageTable:
     """Return every choice, with the published numbers."""
-    published = [
-        f"{range_study.PUBLISHED_M[c] / 1e3:.1f} published"
-        for c in (range_study.CALIBRATED_DEG, *range_study.PREDICTED)
-    ]
-    return PageTable(
+
+    def lost_after(compass: float | None) -> tuple[str, Callable[[Any], str]]:
+        name = "none" if compass is None else f"{compass:g} degrees"
+        published_km = range_study.PUBLISHED_M[compass] / 1e3
+        return (
+            f"{name}, {published_km:.1f} published",
+            lambda one: km(one.lost_after_m[compass]),
+        )
+
+    return PageTable.of(
         f"Mean distance at loss with other choices, km ({choices[0].drives} drives each)",
+        choices,
+        ("slip, m per root m", lambda one: f"{one.slip_per_sqrt_m:g}"),
         (
-            "slip, m per root m",
             "compass interval, m",
-            f"30 degrees, {published[0]}",
-            f"20 degrees, {published[1]}",
-            f"none, {published[2]}",
+            lambda one: f"{one.compass_interval_m:.3f}" + (" (studied)" if one.is_studied else ""),
         ),
-        tuple(
-            (
-                f"{one.slip_per_sqrt_m:g}",
-                f"{one.compass_interval_m:.3f}" + (" (studied)" if one.is_studied else ""),
-                *(
-                    km(one.lost_after_m[c])
-                    for c in (range_study.CALIBRATED_DEG, *range_study.PREDICTED)
-                ),
-            )
-            for one in choices
-        ),
+        *map(lost_after, (range_study.CALIBRATED_DEG, *range_study.PREDICTED)),
     )
 
 
