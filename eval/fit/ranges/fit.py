@@ -1,4 +1,4 @@
-"""Fit of the curve from heights in pixels to ranges, from tables, drives or runs, and its figure."""
+"""Fit of the curve from heights in pixels to ranges, to tables, drives or runs, and its figure."""
 
 from __future__ import annotations
 
