@@ -150,10 +150,12 @@ def travel_between(
     first, second = _followed(_View(0, before, nothing), _View(0, after, nothing))
     if len(first) < TRAVEL_CORNERS or np.median(np.hypot(*(second - first).T)) < PARALLAX_PX:
         return None
-    rays = [_rays(points, focal_px, center_px) for points in (first, second)]
+    before_rays, after_rays = (_rays(one, focal_px, center_px) for one in (first, second))
     ahead = np.array([1.0, 0.0, 0.0])
-    rotation, _ = _fitted(*rays, np.eye(3), ahead, focal_px, is_free=False)
-    rotation, along = _fitted(*rays, rotation, ahead, focal_px, is_free=True, direction_sd=ASIDE_SD)
+    rotation, _ = _fitted(before_rays, after_rays, np.eye(3), ahead, focal_px, is_free=False)
+    rotation, along = _fitted(
+        before_rays, after_rays, rotation, ahead, focal_px, is_free=True, direction_sd=ASIDE_SD
+    )
     x, y, z = _rotated(0.5 * np.asarray(cv2.Rodrigues(rotation)[0], np.float64)) @ along
     turned_rad = -math.atan2(rotation[1, 0], rotation[0, 0])
     return Travel(-math.atan2(y, x), math.atan2(z, math.hypot(x, y)), turned_rad, len(first))
@@ -390,7 +392,7 @@ def _fitted(
 def _rays(points: Floats, focal_px: float, center_px: tuple[float, float]) -> Floats:
     """Rays of pixels in the axes of the camera's body, with 1 ahead."""
     flat = (points - np.array(center_px)) / focal_px
-    return np.column_stack([flat, np.ones(len(points))]) @ BODY.T
+    return np.asarray(np.column_stack([flat, np.ones(len(points))]) @ BODY.T, np.float64)
 
 
 def _expansion(first: Floats, second: Floats, ahead: Floats) -> float:
