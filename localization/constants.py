@@ -19,7 +19,7 @@ import numpy as np
 from crosscue.replay.columns import Floats
 
 from .angles import wrap
-from .ekf import PoseBelief, odometry_motion, turning
+from .ekf import PoseBelief, coasting, odometry_derivatives
 from .odometry import BY_STEERING, BY_WHEELS, BY_YAW_RATE, Increments, OdometrySettings, TurnKind
 from .pose_filter import HEADING, State, predict_pose
 
@@ -51,6 +51,9 @@ class Constants:
     cov: Floats
     cross: Floats
     drift_var_per_s: Floats
+
+
+NO_CONSTANTS: Final = Constants((), np.empty(0), np.empty((0, 0)), np.empty((4, 0)), np.empty(0))
 
 
 def start_constants(
@@ -90,6 +93,7 @@ class _Motion:
     distance_m: Floats
     turn_rad: Floats
     dt_s: Floats
+    speed_mps: Floats
     by: Mapping[int, Floats]
     car: OdometrySettings
 
@@ -106,6 +110,15 @@ class _Motion:
         """Derivative of a turn by steering with respect to the road-wheel angle."""
         base = self.car.wheelbase_m or 1.0
         return self.by[BY_STEERING] * self.distance_m * (1.0 + self.tangent() ** 2) / base
+
+    def by_delay(self) -> tuple[Floats, Floats]:
+        """Derivatives by the wheels' delay: the change of speed, and none of the turn.
+
+        Between two times, a delay adds its product with the change of the yaw rate to the turn,
+        which is zero again after each bend.
+        """
+        change_mps = 2.0 * (self.speed_mps - self.distance_m / self.dt_s)
+        return change_mps, np.zeros_like(change_mps)
 
     def by_right(self) -> tuple[Floats, Floats]:
         """Derivatives of distance and turn by the right wheels' scale."""
@@ -129,6 +142,7 @@ EFFECTS: Final[Mapping[str, _Columns]] = {
     "steering_offset_rad": lambda m: -m.turn_by_angle() / m.car.steering_ratio,
     "wheelbase_m": lambda m: -m.by[BY_STEERING] * m.turn_rad / (m.car.wheelbase_m or 1.0),
     "right_wheel_scale": _Motion.by_right,
+    "wheel_delay_s": _Motion.by_delay,
     "track_width_m": lambda m: -m.by[BY_WHEELS] * m.turn_rad / m.car.track_width_m,
 }
 
@@ -140,7 +154,7 @@ def effects(made: Increments, settings: OdometrySettings, names: tuple[str, ...]
         for source in (BY_YAW_RATE, BY_STEERING, BY_WHEELS)
     }
     dt_s = np.asarray((made.stop_ns - made.start_ns) * 1e-9)
-    motion = _Motion(made.distance_m, made.turn_rad, dt_s, by, settings)
+    motion = _Motion(made.distance_m, made.turn_rad, dt_s, made.speed_mps, by, settings)
     found = np.zeros((len(made), 2, len(names)))
     for k, name in enumerate(names):
         columns = EFFECTS[name](motion)
@@ -162,11 +176,13 @@ def predict_constants(
     """
     off_m, off_rad = (by @ constants.mean).tolist()
     distance_m, turn_rad, *noise = step
-    motion = odometry_motion(np.array(state[:4]), distance_m + off_m, turn_rad + off_rad, by)
-    moved = motion.by_state @ constants.cross
-    caused = motion.by_input @ constants.cov
-    shared = moved @ motion.by_input.T
-    added = shared + shared.T + caused @ motion.by_input.T
+    by_state, by_input = odometry_derivatives(
+        state.heading_rad, distance_m + off_m, turn_rad + off_rad, by
+    )
+    moved = by_state @ constants.cross
+    caused = by_input @ constants.cov
+    shared = moved @ by_input.T
+    added = shared + shared.T + caused @ by_input.T
     after = predict_pose(state, distance_m + off_m, turn_rad + off_rad, *noise)
     cov = np.array(after[4:]) + added[_UPPER]
     return State(*after[:4], *cov.tolist()), _drifted(constants, moved + caused, dt_s)
@@ -174,7 +190,7 @@ def predict_constants(
 
 def coast_constants(belief: PoseBelief, constants: Constants, dt_s: float) -> Constants:
     """Predict the parameters while the car coasts from ``belief``."""
-    by_state = turning(belief.mean, 0.0, 0.0, dt_s).by_state
+    _, by_state = coasting(belief.mean, dt_s)
     return _drifted(constants, by_state @ constants.cross, dt_s)
 
 

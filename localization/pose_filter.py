@@ -8,8 +8,7 @@ Measurements are of states themselves (a compass heading, a speed, a landmark's 
 equations: Bar-Shalom, Li, Kirubarajan, *Estimation with Applications to Tracking and Navigation*,
 section 10.3 (EKF) and 5.2.3 (update, here as P - K S K').
 
-These equations exist only here. The replay calls them, ``crosscue.localization.ekf`` wraps them for
-beliefs with a time, and the Monte Carlo studies compile them.
+These equations exist only here. The replay calls them, and the Monte Carlo studies compile them.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
-"""Estimate a pose track from odometry and compass, by running the filter of ``ekf`` over columns.
+"""Estimate a pose track from odometry and compass, by running ``pose_filter`` over columns.
 
 Events are processed in order of time: the end of an odometry interval, then a heading, then a
 requested row. An interval that contains a heading or a requested row is divided, with distance,
-turn and variances in proportion to time. The results are those of ``predict_odometry``,
-``update_speed`` and ``update_heading``, implemented with plain floats because a drive has millions
-of steps; tests verify the equality.
+turn and variances in proportion to time.
 
 Compass errors persist (a bridge, a lorry, the car's own current), so ten readings per second do not
 carry ten times the information of one, and a filter that assumes so is overconfident. Here a

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .ekf import PoseBelief, pack_belief, unpack_belief
+from .ekf import PoseBelief, pack_belief, update_point
 from .fixes import NO_FIXES, Fixes
-from .pose_filter import at_point, update_position
+from .pose_filter import at_point
 
 
 @dataclass(slots=True)
@@ -81,20 +81,21 @@ class PositionUpdates:
         if not self._is_due(belief.t_ns):
             self.counts.thinned += 1
             return None
-        ahead_m, left_m = self.lever_m
-        antenna = at_point(pack_belief(belief), ahead_m, left_m)
+        antenna = at_point(pack_belief(belief), *self.lever_m)
         moved_m = self.delay_s * antenna.speed_mps
-        x_m = float(fix.xy_m[0, 0]) + moved_m * math.cos(antenna.heading_rad)
-        y_m = float(fix.xy_m[0, 1]) + moved_m * math.sin(antenna.heading_rad)
-        (xx, xy), (_, yy) = fix.cov_m2[0].tolist()
-        done = update_position(antenna, x_m, y_m, xx, xy, yy, self.gate_nis)
+        heading = antenna.heading_rad
+        xy_m = fix.xy_m[0] + moved_m * np.array([math.cos(heading), math.sin(heading)])
+        cov_m2 = fix.cov_m2[0]
+        done = update_point(belief, xy_m, cov_m2, self.lever_m, self.gate_nis)
         if not done.is_accepted:
             self.counts.rejected += 1
             return None
         self.counts.accepted += 1
         self._counted_ns = belief.t_ns
+        (xx, xy), (_, yy) = cov_m2.tolist()
+        x_m, y_m = xy_m.tolist()
         self._used.append((belief.t_ns, x_m, y_m, xx, xy, yy))
-        return unpack_belief(belief.t_ns, at_point(done.state, -ahead_m, -left_m))
+        return done.belief
 
     def let_go(self, before_ns: int) -> None:
         """Drop positions that are before all further odometry."""

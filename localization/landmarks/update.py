@@ -2,11 +2,7 @@
 
 A picture is compared only with landmarks inside the 2-sigma ellipse of the camera's estimated
 position. A match measures that position: the landmark's coordinates, with the landmark's
-covariance. The camera is ``lever_m`` ahead of the rear axle, so the measurement depends on heading:
-
-    z = p + R(heading) lever,    H = [I, dR/dheading lever, 0]
-
-with the update in Joseph form (Bar-Shalom, Li, Kirubarajan, eq. 5.2.3-18).
+covariance.
 
 A car that passes a landmark matches it many times, at first from a distance. It is used once, at
 the best match: when the score has fallen from its peak, the position at the peak is moved to the
@@ -26,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.localization.angles import wrap
-from crosscue.localization.ekf import PoseBelief, Updated
-from crosscue.localization.pose_filter import HEADING, SPEED
+from crosscue.localization.ekf import PoseBelief, pack_belief, update_point
+from crosscue.localization.pose_filter import HEADING, SPEED, at_point
 from crosscue.localization.pose_track import ACCEPTED, REJECTED
 
 from .database import REACH_SIGMAS, LandmarkDatabase, LandmarkPosition, Nearby
@@ -110,59 +106,6 @@ class Best(NamedTuple):
     match: Match
 
 
-def camera_position(
-    belief: PoseBelief, lever_m: tuple[float, float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The camera's estimated position, shape (2,), and its covariance, shape (2, 2)."""
-    expected, observe = _observed(belief, lever_m)
-    cov = observe @ belief.cov @ observe.T
-    return expected, 0.5 * (cov + cov.T)
-
-
-def update_camera_position(
-    belief: PoseBelief,
-    xy_m: NDArray[np.float64],
-    cov_m2: NDArray[np.float64],
-    lever_m: tuple[float, float] = (0.0, 0.0),
-    gate_nis: float | None = None,
-) -> Updated:
-    """Update with a measured position of the camera; without a lever, ``ekf.update_position``.
-
-    Raises:
-        ValueError: A shape is wrong, a value is not finite, or ``cov_m2`` is not positive definite.
-    """
-    if xy_m.shape != (2,) or not np.isfinite(xy_m).all():
-        raise ValueError(f"xy_m: expected two finite numbers, got {xy_m}")
-    if cov_m2.shape != (2, 2) or not np.isfinite(cov_m2).all():
-        raise ValueError(f"cov_m2: expected finite (2, 2), got {cov_m2.tolist()}")
-    if (np.linalg.eigvalsh(cov_m2) <= 0.0).any() or not np.allclose(cov_m2, cov_m2.T):
-        raise ValueError(f"cov_m2: expected positive definite, got {cov_m2.tolist()}")
-    expected, observe = _observed(belief, lever_m)
-    innovation = xy_m - expected
-    spread = observe @ belief.cov @ observe.T + cov_m2
-    nis = float(innovation @ np.linalg.solve(spread, innovation))
-    if gate_nis is not None and nis > gate_nis:
-        return Updated(belief, False, innovation, nis)
-    gain = np.linalg.solve(spread, observe @ belief.cov).T
-    keep = np.eye(4) - gain @ observe
-    cov = keep @ belief.cov @ keep.T + gain @ cov_m2 @ gain.T
-    mean = belief.mean + gain @ innovation
-    mean[HEADING] = wrap(mean[HEADING])
-    return Updated(PoseBelief(belief.t_ns, mean, 0.5 * (cov + cov.T)), True, innovation, nis)
-
-
-def _observed(
-    belief: PoseBelief, lever_m: tuple[float, float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The camera's expected position and its Jacobian by the state."""
-    c, s = math.cos(belief.mean[HEADING]), math.sin(belief.mean[HEADING])
-    ahead, left = lever_m
-    offset = np.array([c * ahead - s * left, s * ahead + c * left])
-    observe = np.eye(2, 4)
-    observe[:, HEADING] = -offset[1], offset[0]
-    return belief.mean[:2] + offset, observe
-
-
 def best_candidate(
     seen: Keypoints, candidates: tuple[Nearby, ...], database: LandmarkDatabase, matcher: Matcher
 ) -> Best | None:
@@ -227,8 +170,9 @@ class LandmarkSearch:
             self.counts.thinned += 1
             return None
         self._looked_m = travelled_m
-        camera_m, cov_m2 = camera_position(belief, self.settings.lever_m)
-        best = self._best(camera_m, cov_m2, describe)
+        camera = at_point(pack_belief(belief), *self.settings.lever_m)
+        cov_m2 = np.array([[camera.xx, camera.xy], [camera.xy, camera.yy]])
+        best = self._best(np.array([camera.x_m, camera.y_m]), cov_m2, describe)
         passed = self._passed(best, belief, travelled_m)
         return None if passed is None else self._weigh(belief, travelled_m, passed)
 
@@ -288,7 +232,7 @@ class LandmarkSearch:
             self.counts.repeated += 1
             return None
         carried_m = place.xy_m + self._moved(belief, travelled_m, peak)
-        done = update_camera_position(
+        done = update_point(
             belief, carried_m, place.cov_m2, self.settings.lever_m, self.settings.gate_nis
         )
         outcome = ACCEPTED if done.is_accepted else REJECTED

@@ -20,7 +20,7 @@ from crosscue.localization.constants import (
     start_constants,
     update_constants,
 )
-from crosscue.localization.ekf import PoseBelief, coast, pack_belief, unpack_belief, update_position
+from crosscue.localization.ekf import PoseBelief, coast, pack_belief, unpack_belief
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import OdometrySettings, TurnKind, TurnSignal, integrate
 from crosscue.localization.pose_filter import predict_pose
@@ -34,6 +34,7 @@ from crosscue.localization.pose_track import (
 )
 from crosscue.localization.position_updates import PositionUpdates
 from crosscue.replay.columns import Floats
+from support.beliefs import with_position
 from support.simulated_drive import BASE_M, TRACK_M, Truth, compass, drive, gyro, wheels
 
 CAR = OdometrySettings(
@@ -60,7 +61,7 @@ def steering(truth: Truth) -> TurnSignal:
 
 
 @pytest.mark.parametrize("kind", ["yaw rate", "steering", "wheels"])
-@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize("name", [name for name in EFFECTS if name != "wheel_delay_s"])
 def test_effect_of_a_parameter_matches_finite_differences(kind: str, name: str) -> None:
     truth = drive(np.random.default_rng(seed=5), seconds=40.0)
     turn = {"yaw rate": gyro(truth, CAR), "steering": steering(truth), "wheels": None}[kind]
@@ -79,6 +80,29 @@ def test_effect_of_a_parameter_matches_finite_differences(kind: str, name: str) 
     np.testing.assert_allclose(found, (columns(step) - columns(-step)) / (2 * step), atol=atol)
     shared = name in ("wheel_scale", "right_wheel_scale") and kind != "yaw rate"
     assert found[:, 1].any() == (shared or name in TURN_PARAMETERS[kind])
+
+
+def test_effect_of_a_delay_is_the_change_of_speed_between_two_times() -> None:
+    truth = drive(np.random.default_rng(seed=5), seconds=40.0)
+
+    def way_m(delay_s: float) -> Floats:
+        car = replace(CAR, wheel_delay_s=delay_s)
+        made = integrate(wheels(truth, CAR), car, gyro(truth, CAR)).increments
+        edges = np.append(made.start_ns[:1], made.stop_ns)
+        way: Floats = np.interp(at_ns, edges, np.append(0.0, np.cumsum(made.distance_m)))
+        return way
+
+    at_ns = truth.t_ns[20:-20]
+    made = integrate(wheels(truth, CAR), CAR, gyro(truth, CAR)).increments
+    found = effects(made, CAR, ("wheel_delay_s",))[:, :, 0]
+    summed = np.interp(at_ns, made.stop_ns, np.cumsum(found[:, 0]))
+    expected = (way_m(0.01) - way_m(0.0)) / 0.01
+
+    assert np.ptp(expected) > 2.0  # the speed changes on this drive
+    # The simulated speed jumps, and 10 ms see half of a jump between two rows.
+    differs = np.abs(summed - summed[0] - expected + expected[0]) > 0.05
+    assert differs.mean() < 0.01
+    assert not found[:, 1].any()
 
 
 def correlated(seed: int = 3) -> tuple[PoseBelief, Constants, Floats]:
@@ -139,7 +163,7 @@ def test_coasting_keeps_the_joint_covariance_valid() -> None:
 def test_position_updates_parameters_as_a_filter_of_the_joint_state_does() -> None:
     belief, constants, joint = correlated()
     noise = np.array([[0.5, 0.1], [0.1, 0.8]])
-    after = update_position(belief, np.array([4.0, -2.5]), noise).belief
+    after = with_position(belief, np.array([4.0, -2.5]), noise)
 
     found = update_constants(constants, belief, after)
 

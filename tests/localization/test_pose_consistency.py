@@ -14,13 +14,7 @@ from hypothesis import strategies as st
 
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import wrap_all
-from crosscue.localization.ekf import (
-    PoseBelief,
-    major_axis_m,
-    predict_odometry,
-    update_heading,
-    update_speed,
-)
+from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.odometry import (
     Increments,
     OdometrySettings,
@@ -29,6 +23,7 @@ from crosscue.localization.odometry import (
     WheelSamples,
     integrate,
 )
+from crosscue.localization.pose_filter import major_axis_m
 from crosscue.localization.pose_track import (
     NO_HEADINGS,
     Advance,
@@ -41,6 +36,7 @@ from crosscue.localization.pose_track import (
     start_belief,
 )
 from crosscue.replay.columns import Floats, Int64s
+from support.beliefs import driven, with_heading, with_speed
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
 
 ODOMETRY = OdometrySettings(
@@ -112,21 +108,22 @@ def reference(
         for t_ns, heading, var in [*inside, (stop, None, None)]:
             fraction = (int(t_ns) - belief.t_ns) / (stop - start)
             dt_s = (int(t_ns) - belief.t_ns) * 1e-9
-            moved = predict_odometry(
+            moved = driven(
                 belief,
                 fraction * made.distance_m[k],
                 fraction * made.turn_rad[k],
-                fraction * made.distance_var_m2[k],
-                fraction * made.turn_var_rad2[k],
-                dt_s,
-                settings.accel_var_m2ps3,
+                (
+                    fraction * made.distance_var_m2[k],
+                    fraction * made.turn_var_rad2[k],
+                    dt_s * settings.accel_var_m2ps3,
+                ),
             )
             belief = PoseBelief(int(t_ns), moved.mean, moved.cov)
             if heading is not None:
-                belief = update_heading(belief, heading, var).belief
+                belief = with_heading(belief, heading, var)
         waiting = [w for w in waiting if w[0] > stop]
         speed, var = made.speed_mps[k], made.speed_var_m2ps2[k]
-        belief = update_speed(belief, speed, var).belief
+        belief = with_speed(belief, speed, var)
     return belief
 
 
@@ -146,7 +143,8 @@ def test_advance_matches_the_filter_functions_step_by_step(seed: int) -> None:
     np.testing.assert_allclose(done.state.belief.mean, wanted.mean, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(done.state.belief.cov, wanted.cov, rtol=1e-9, atol=1e-9)
     assert done.state.belief.t_ns == wanted.t_ns
-    assert done.poses.major_axis_m[-1] == pytest.approx(major_axis_m(wanted))
+    (xx, xy), (_, yy) = wanted.cov[:2, :2].tolist()
+    assert done.poses.major_axis_m[-1] == pytest.approx(major_axis_m(xx, xy, yy))
     assert done.counts.headings_accepted == len(headings)
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from crosscue.localization.fixes import Fixes
-from crosscue.localization.landmarks.update import update_camera_position
 from crosscue.localization.pose_track import BothSources, start_belief
 from crosscue.localization.position_updates import PositionUpdates
+from support.beliefs import joseph
 
 SECOND = 1_000_000_000
 LEVER_M = (1.3, -0.4)
@@ -30,10 +30,10 @@ def test_position_update_applies_the_antenna_lever() -> None:
     measurements = PositionUpdates(LEVER_M)
     measurements.add(fixes((SECOND, 5.5, 5.2)))
     found = measurements.update(belief, 0.0)
-    wanted = update_camera_position(belief, np.array([5.5, 5.2]), COV, LEVER_M, None).belief
+    wanted = joseph(belief, np.array([5.5, 5.2]), COV, LEVER_M)
 
     assert found is not None
-    # The landmark's update is linear in the heading; this one rotates the lever.
+    # The Joseph form is linear in the heading; this one rotates the lever.
     np.testing.assert_allclose(found.mean, wanted.mean, atol=2e-4)
     np.testing.assert_allclose(found.cov, wanted.cov, atol=2e-3)
 

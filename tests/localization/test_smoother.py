@@ -9,9 +9,8 @@ import pytest
 
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import wrap_all
-from crosscue.localization.ekf import PoseBelief
+from crosscue.localization.ekf import PoseBelief, update_point
 from crosscue.localization.fixes import Fixes
-from crosscue.localization.landmarks.update import update_camera_position
 from crosscue.localization.odometry import Increments, OdometrySettings, WheelSamples, integrate
 from crosscue.localization.pose_track import (
     NO_HEADINGS,
@@ -99,7 +98,7 @@ class FixMeasurements:
     def update(self, belief: PoseBelief, travelled_m: float, /) -> PoseBelief | None:
         """Update with one fix."""
         i = int(np.searchsorted(self.fixes.t_ns, belief.t_ns))
-        return update_camera_position(belief, self.fixes.xy_m[i], self.fixes.cov_m2[i]).belief
+        return update_point(belief, self.fixes.xy_m[i], self.fixes.cov_m2[i]).belief
 
 
 def errors(truth: Truth, t_ns: Int64s, xyh: Floats) -> Floats:

@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from crosscue.eval.scoring.consistency import mean_band
-from crosscue.localization import ekf
+from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import (
     EVENT_FIELDS,
@@ -24,6 +24,7 @@ from crosscue.localization.town.drive import (
 from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
 from crosscue.replay.columns import Floats
 from crosscue.replay.compiled import fingerprint
+from support.beliefs import driven, with_heading
 
 FIELD = {name: i for i, name in enumerate(DriveResult._fields)}
 TOWN = City(largest_km2=3.0)
@@ -152,10 +153,10 @@ def test_lateral_variance_on_a_straight_drive_follows_the_range_law(compass_deg:
     interval_m, way_m = 2.0, 4000.0
     r = math.radians(compass_deg / 2.0) ** 2
     for slip in (1e-4, 1e-3):
-        belief = ekf.PoseBelief(0, np.zeros(4), np.diag([1e-6, 1e-6, 0.01, 0.1]))
+        belief = PoseBelief(0, np.zeros(4), np.diag([1e-6, 1e-6, 0.01, 0.1]))
         for _ in range(round(way_m / interval_m)):
-            belief = ekf.predict_odometry(belief, interval_m, 0.0, slip**2, slip**2, 0.2, 1.0)
-            belief = ekf.update_heading(belief, 0.0, r).belief
+            belief = driven(belief, interval_m, 0.0, (slip**2, slip**2, 0.2))
+            belief = with_heading(belief, 0.0, r)
 
         assert belief.cov[1, 1] == pytest.approx(r * interval_m * way_m, rel=0.15)
 
