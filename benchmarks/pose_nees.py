@@ -3,9 +3,8 @@
 Each drive is cut into parts. `fit odometry` is fitted to each part, and the filter, with the fit's
 constant errors as states, predicts the next part (and the part before) from the last 15 s of known
 positions. The table has the mean NEES of x and y by horizon: 2 is expected, and less means that the
-filter is too cautious. Errors of one fit are common to its predictions, so a short drive counts
-little more than once; the column "fits" has their number, and "95 %" the range of the mean of as
-many independent values.
+filter is too cautious. Errors of one fit are common to its predictions, so the interval comes from
+resampling parts, and predictions in them; two parts cannot decide much.
 
     python benchmarks/pose_nees.py --data ../shared/data [--simulated 20] [--json nees.json]
 
@@ -16,16 +15,18 @@ of their own: slip that persists for two seconds, and tyres of four sizes.
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
 import crosscue
+from crosscue.datasets.geodesy import geodetic_to_enu
 from crosscue.datasets.simulated.drive import (
     START_NS,
     TRACK_WIDTH_M,
@@ -39,23 +40,17 @@ from crosscue.eval.fit.log_signals import read_signals, signal_plan, turn_sample
 from crosscue.eval.fit.reference import ReferencePositions, of_gnss, of_truth
 from crosscue.eval.logs.log import opened
 from crosscue.eval.pipeline.pose import odometry_settings, turn_signal_of
-from crosscue.eval.scoring.consistency import mean_band
-from crosscue.localization.constants import effects
-from crosscue.localization.ekf import PoseBelief, unpack_belief
 from crosscue.localization.fit.known_drive import KnownDrive
-from crosscue.localization.fit.odometry import FIX_DELAY, OdometryFit, fit_odometry
+from crosscue.localization.fit.odometry import OdometryFit, fit_odometry
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import (
     Increments,
     OdometrySettings,
     TurnSignal,
     WheelSamples,
-    integrate,
 )
-from crosscue.localization.pose_filter import State, at_point, major_axis_m
-from crosscue.localization.pose_track import NO_HEADINGS, TrackSettings, TrackState, advance_pose
-from crosscue.localization.position_updates import PositionUpdates
-from crosscue.localization.start_pose import START_S, start_pose
+from crosscue.localization.pose_filter import State
+from crosscue.localization.start_pose import START_S, path_of, start_pose
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.vehicle.vehicle import Topics, Vehicle
@@ -71,71 +66,80 @@ START_SD_M: Final = 30.0
 START_SD_RAD: Final = 0.3
 MAX_HEADING_VAR_RAD2: Final = 0.2**2
 SECOND_NS: Final = 1_000_000_000
+RESAMPLES: Final = 1_000
 
 
 class Prediction(NamedTuple):
-    """NEES of one prediction, and its error and major axis in metres."""
+    """NEES of one prediction, with its error in metres along and across the car, and their s.d."""
 
     drive: str
     fit: int
+    part: int
     horizon_s: int
     nees: float
-    error_m: float
-    axis_m: float
+    along_m: float
+    along_sd_m: float
+    across_m: float
+    across_sd_m: float
 
 
-def predictions(name: str, fit: int, drive: KnownDrive, found: OdometryFit) -> Iterator[Prediction]:
-    """Predict a part of a drive from starts that are a horizon apart."""
-    delay_ns, car = round(found.value(FIX_DELAY) * 1e9), found.settings
-    cov = np.eye(2) * found.fix_sd_m**2
-    t_ns, xy_m = drive.fixes.t_ns - delay_ns, drive.fixes.xy_m
-    fixes = Fixes(t_ns, xy_m, np.tile(cov, (len(t_ns), 1, 1)))
-    made = integrate(drive.wheels, car, drive.turn).increments
+def predictions(
+    name: str, numbers: tuple[int, int], drive: KnownDrive, found: OdometryFit
+) -> Iterator[Prediction]:
+    """Predict a part of a drive, by the fit of another, from starts half a horizon apart."""
+    made = drive.increments(found.settings)
+    t_ns = drive.fixes.t_ns
+    since_ns = round(START_S * 1e9)
     for horizon_s in HORIZONS_S:
-        begin_ns = int(t_ns[0]) + round(START_S * 1e9)
+        begin_ns = int(t_ns[0]) + since_ns
         while begin_ns + (horizon_s - 0.7) * 1e9 <= t_ns[-1]:
-            since_ns, until_ns = begin_ns - round(START_S * 1e9), begin_ns + horizon_s * SECOND_NS
-            before = fixes.take((t_ns <= begin_ns) & (t_ns >= since_ns))
-            last = int(np.flatnonzero(t_ns <= until_ns + SECOND_NS // 2)[-1])
-            begin_ns += horizon_s * SECOND_NS
-            if len(before) < 2 or start_pose(made, before, drive.lever_m).hh > MAX_HEADING_VAR_RAD2:
+            until_ns = begin_ns + horizon_s * SECOND_NS + SECOND_NS // 2
+            inside = (t_ns >= begin_ns - since_ns) & (t_ns <= until_ns)
+            known = int((inside & (t_ns <= begin_ns)).sum())
+            part = KnownDrive(drive.wheels, drive.turn, drive.fixes.take(inside), drive.lever_m)
+            begin_ns += horizon_s * SECOND_NS // 2
+            start = _start(part, known, found, made)
+            if start is None:
                 continue
-            there = predicted(found, made, before, drive.lever_m, int(t_ns[last]))
-            apart = there.mean[:2] - xy_m[last]
-            (xx, xy), (_, yy) = there.cov[:2, :2].tolist()
-            nees = float(apart @ np.linalg.solve(there.cov[:2, :2] + cov, apart))
+            there = part.reckon(start, found.car, known)
+            heading = float(there.heading_rad[-1])
+            cos, sin = math.cos(heading), math.sin(heading)
+            turned = np.array([[cos, sin], [-sin, cos]])
+            along_m, across_m = turned @ (there.xy_m[-1] - part.fixes.xy_m[-1])
+            cov = turned @ (there.cov_m2[-1] + np.eye(2) * found.fix_sd_m**2) @ turned.T
+            apart = np.array([along_m, across_m])
+            nees = float(apart @ np.linalg.solve(cov, apart))
+            along_sd_m, across_sd_m = np.sqrt(np.diagonal(cov)).tolist()
             yield Prediction(
-                name, fit, horizon_s, nees, float(np.hypot(*apart)), major_axis_m(xx, xy, yy)
+                name,
+                *numbers,
+                horizon_s,
+                nees,
+                float(along_m),
+                along_sd_m,
+                float(across_m),
+                across_sd_m,
             )
 
 
-def predicted(
-    found: OdometryFit,
-    made: Increments,
-    before: Fixes,
-    lever_m: tuple[float, float],
-    at_ns: int,
-) -> PoseBelief:
-    """Run the filter through known positions, and on to a time; the antenna's pose there."""
-    # A start without knowledge, at a good point of linearisation.
-    start = start_pose(made, before, lever_m)
-    sd = np.array([START_SD_M, START_SD_M, START_SD_RAD, 1.0])
-    mean = np.array([start.x_m, start.y_m, start.heading_rad, 0.0])
-    belief = PoseBelief(int(before.t_ns[0]), mean, np.diag(sd**2))
-    constants = replace(found.constants, cross=np.zeros_like(found.constants.cross))
-    updates = PositionUpdates(lever_m, gate_nis=math.inf)
-    updates.add(before)
-    inside = (made.stop_ns > belief.t_ns) & (made.start_ns <= at_ns)
-    columns = {f.name: getattr(made, f.name)[inside] for f in fields(made)}
-    some = Increments(**columns)
-    by = effects(some, found.settings, constants.names)
-    state = TrackState(belief, constants=constants)
-    rows = np.array([at_ns])
-    poses = advance_pose(state, some, TrackSettings(), NO_HEADINGS, rows, updates, by).poses
-    xx, xy, xh, yy, yh, hh = poses.cov_xyh[0].tolist()
-    x, y, heading = float(poses.x_m[0]), float(poses.y_m[0]), float(poses.heading_rad[0])
-    axle = State(x, y, heading, 0.0, xx, xy, xh, 0.0, yy, yh, 0.0, hh, 0.0, 0.0)
-    return unpack_belief(at_ns, at_point(axle, *lever_m))
+def _start(part: KnownDrive, known: int, found: OdometryFit, made: Increments) -> State | None:
+    """A start without knowledge at a good point of linearisation; None if the heading is unknown.
+
+    While a car stands or creeps, the positions' own error looks like motion.
+    """
+    if known < 2:
+        return None
+    first = part.fixes.take(slice(0, known))
+    cov = np.tile(np.eye(2) * found.fix_sd_m**2, (known, 1, 1))
+    at = start_pose(made, Fixes(first.t_ns, first.xy_m, cov), part.lever_m)
+    path = path_of(made, first.t_ns, int(first.t_ns[0]))
+    reach_m2 = max(float(np.var(path.x_m) + np.var(path.y_m)), 1e-9)
+    wander_m2 = found.wander_m_per_sqrt_s**2 * float(part.seconds[known - 1]) / 12.0
+    if at.hh + wander_m2 / reach_m2 > MAX_HEADING_VAR_RAD2:
+        return None
+    xy, heading = START_SD_M**2, START_SD_RAD**2
+    pose = at.x_m, at.y_m, at.heading_rad, 0.0
+    return State(*pose, xy, 0.0, 0.0, 0.0, xy, 0.0, 0.0, heading, 0.0, 1.0)
 
 
 def tested(name: str, drive: KnownDrive, given: OdometrySettings, fit: int) -> list[Prediction]:
@@ -159,7 +163,7 @@ def tested(name: str, drive: KnownDrive, given: OdometrySettings, fit: int) -> l
                 # The first start of a part needs the positions before it.
                 begin_ns = int(edges[other]) - round(START_S * 1e9)
                 there = _part(drive, begin_ns, int(edges[other + 1]))
-                found += predictions(name, fit + k, there, car)
+                found += predictions(name, (fit + k, fit + other), there, car)
     return found
 
 
@@ -224,21 +228,66 @@ def _motion(kind: str, seed: int) -> TrueMotion:
 
 def table(found: Sequence[Prediction]) -> Iterator[str]:
     """Yield a row for each drive and horizon."""
-    yield f"{'drive':24} horizon   fits  predictions   NEES   95 %           error   ellipse"
+    yield (
+        f"{'drive':24} horizon  parts  predictions   NEES   95 %           "
+        "along (s.d.), across (s.d.), m"
+    )
     for name in dict.fromkeys(one.drive for one in found):
         for horizon_s in HORIZONS_S:
             of = [one for one in found if (one.drive, one.horizon_s) == (name, horizon_s)]
             if not of:
                 continue
             nees = float(np.mean([one.nees for one in of]))
-            fits = len({one.fit for one in of})
-            low, high = mean_band(2, fits)
-            error_m = math.sqrt(float(np.mean([one.error_m**2 for one in of])))
-            axis_m = float(np.mean([one.axis_m for one in of]))
+            low, high = resampled(of)
+            columns = [(one.along_m, one.along_sd_m, one.across_m, one.across_sd_m) for one in of]
+            along, along_sd, across, across_sd = np.sqrt(np.mean(np.square(columns), axis=0))
+            parts = len({(one.fit, one.part) for one in of})
             yield (
-                f"{name:24} {horizon_s:5} s {fits:6} {len(of):12} {nees:6.2f}   {low:4.2f} to "
-                f"{high:4.2f} {error_m:7.2f} m {axis_m:7.2f} m"
+                f"{name:24} {horizon_s:5} s {parts:6} {len(of):12} {nees:6.2f}   {low:4.2f} to "
+                f"{high:5.2f} {along:8.2f} ({along_sd:.2f}) {across:8.2f} ({across_sd:.2f})"
             )
+
+
+def resampled(of: Sequence[Prediction]) -> tuple[float, float]:
+    """Return the 95 % interval of the mean NEES by resampling parts, and predictions in them."""
+    rng = np.random.default_rng(0)
+    groups: dict[tuple[int, int], list[float]] = {}
+    for one in of:
+        groups.setdefault((one.fit, one.part), []).append(one.nees)
+    parts = [np.array(values) for values in groups.values()]
+    means = []
+    for _ in range(RESAMPLES):
+        drawn = [parts[i] for i in rng.integers(0, len(parts), len(parts))]
+        means.append(np.concatenate([rng.choice(part, len(part)) for part in drawn]).mean())
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def udacity(file: Path) -> tuple[str, KnownDrive, OdometrySettings]:
+    """Read a drive of Udacity's challenge 2: speed, steering wheel and GNSS at the pictures' times.
+
+    The car is a Lincoln MKZ. Latitude and longitude are stored as 32-bit numbers, half a metre.
+    """
+    with file.open(encoding="utf-8", newline="") as text:
+        rows = [row for row in csv.DictReader(text) if row["frame_id"] == "center_camera"]
+    t_ns = np.array([int(row["timestamp"]) for row in rows])
+    names = ("speed", "angle", "lat", "long", "alt")
+    columns = {name: np.array([float(row[name]) for row in rows]) for name in names}
+    speed, angle, lat, long, alt = columns.values()
+    origin = (float(lat[0]), float(long[0]), float(alt[0]))
+    xy_m = geodetic_to_enu(lat, long, alt, origin)[:, :2]
+    seconds = np.arange(t_ns[0], t_ns[-1], SECOND_NS)
+    at = np.searchsorted(t_ns, seconds)
+    car = replace(
+        odometry_settings(Vehicle(version=1)),
+        wheelbase_m=2.85,
+        track_width_m=1.58,
+        steering_ratio=14.8,
+    )
+    fixes = Fixes(t_ns[at], xy_m[at], np.tile(np.eye(2), (len(at), 1, 1)))
+    wheels = WheelSamples(t_ns, np.column_stack([speed, speed]))
+    drive = KnownDrive(wheels, TurnSignal(t_ns, angle, "steering"), fixes, (0.0, 0.0))
+    return f"Udacity {file.stem}", drive, car
 
 
 def main() -> None:
@@ -249,12 +298,15 @@ def main() -> None:
     parser.add_argument("--simulated", type=int, default=20, help="number of simulated drives")
     parser.add_argument("--first-seed", type=int, default=0, help="seed of the first of them")
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
+    parser.add_argument("--udacity", type=Path, nargs="*", default=[], help="interpolated.csv")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     found: list[Prediction] = []
     if args.data is not None:
         for name, drive, car in real_drives(args.data, args.work):
             found += tested(name, drive, car, 0)
+    for file in args.udacity:
+        found += tested(*udacity(file), 0)
     car = replace(
         odometry_settings(Vehicle(version=1)), track_width_m=TRACK_WIDTH_M, wheelbase_m=WHEELBASE_M
     )

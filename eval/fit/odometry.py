@@ -15,9 +15,9 @@ from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.eval.pipeline.pose import odometry_settings, turn_signal_of
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import circular_mean, wrap_all
-from crosscue.localization.constants import TURN_PARAMETERS, Constants
+from crosscue.localization.constants import NO_CONSTANTS, TURN_PARAMETERS
 from crosscue.localization.fit.compass import persistence
-from crosscue.localization.fit.known_drive import KnownDrive, whitened
+from crosscue.localization.fit.known_drive import Car, KnownDrive, whitened
 from crosscue.localization.fit.odometry import FIX_DELAY, TURN_NOISE, OdometryFit
 from crosscue.localization.fit.odometry import fit_odometry as fit_parameters
 from crosscue.localization.odometry import OdometrySettings
@@ -167,6 +167,7 @@ class FittedOdometry(Result):
                 "positions": one.fit.fixes,
                 "outliers": one.fit.outliers,
                 "position_sd_m": one.fit.fix_sd_m,
+                "position_wander_m_per_sqrt_s": one.fit.wander_m_per_sqrt_s,
                 "residual_rms": one.fit.residual_rms,
                 "before": asdict(one.before),
                 "after": asdict(one.after),
@@ -198,8 +199,8 @@ def _source(one: SourceFit) -> list[str]:
     fit, before, after = one.fit, one.before, one.after
     width = max(len(name) for name in [*(v.parameter for v in fit.fitted), "gyro_bias_radps"])
     lines = [
-        f"turns from {fit.source}: {fit.fixes} positions of s.d. {fit.fix_sd_m:.2f} m, "
-        f"{fit.outliers} outliers"
+        f"turns from {fit.source}: {fit.fixes} positions of s.d. {fit.fix_sd_m:.2f} m, whose error "
+        f"wanders by {fit.wander_m_per_sqrt_s:.2f} m in a second; {fit.outliers} outliers"
     ]
     lines += [
         f"  {value.parameter:{width}}  {value.value:.6g} +- {value.sd:.2g}  (was {value.given:.6g})"
@@ -365,8 +366,10 @@ def _middle_ns(drive: KnownDrive) -> int:
 def _fitted(drive: KnownDrive, given: OdometrySettings, reference: ReferencePositions) -> SourceFit:
     half = drive.until(_middle_ns(drive)) if len(drive.fixes) else drive
     fit = fit_parameters(half, given)
-    before = _errors(drive, given, fit, None, 0.0)
-    after = _errors(drive, fit.settings, fit, fit.constants, fit.value(FIX_DELAY))
+    before = _errors(
+        drive, fit, fit.car._replace(settings=given, constants=NO_CONSTANTS, delay_s=0.0)
+    )
+    after = _errors(drive, fit, fit.car)
     if reference.heading_rad is None:
         return SourceFit(fit, before, after)
     yaw_rad, sd_rad = _yaw(half, fit, reference)
@@ -383,14 +386,8 @@ def _check_held_out(fitted: SourceFit) -> None:
         )
 
 
-def _errors(
-    drive: KnownDrive,
-    settings: OdometrySettings,
-    fit: OdometryFit,
-    constants: Constants | None,
-    delay_s: float,
-) -> OdometryErrors:
-    found = drive.reckon(fit.start, settings, constants, delay_s)
+def _errors(drive: KnownDrive, fit: OdometryFit, car: Car) -> OdometryErrors:
+    found = drive.reckon(fit.start, car)
     fixes = drive.fixes
     apart = np.hypot(*(found.xy_m - fixes.xy_m).T)
     cov = np.tile(np.eye(2) * fit.fix_sd_m**2, (len(fixes), 1, 1))

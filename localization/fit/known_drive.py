@@ -8,7 +8,14 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.localization.constants import Constants, effects, predict_constants
+from crosscue.localization.constants import (
+    NO_CONSTANTS,
+    Constants,
+    effects,
+    predict_constants,
+    update_constants,
+)
+from crosscue.localization.ekf import pack_belief, unpack_belief, update_point
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import (
     Increments,
@@ -42,6 +49,7 @@ class Steps(NamedTuple):
         turn_rad: Shape (M,).
         distance_var_m2: Shape (M,).
         turn_var_rad2: Shape (M,).
+        wander_var_m2: Shape (M,): growth of the variance of the positions' own error, per axis.
     """
 
     at_fix: Int64s
@@ -49,6 +57,7 @@ class Steps(NamedTuple):
     turn_rad: Floats
     distance_var_m2: Floats
     turn_var_rad2: Floats
+    wander_var_m2: Floats
 
 
 class Predicted(NamedTuple):
@@ -63,6 +72,24 @@ class Predicted(NamedTuple):
     xy_m: Floats
     heading_rad: Floats
     cov_m2: Floats
+
+
+class Car(NamedTuple):
+    """A car and the positions that are known of it.
+
+    Attributes:
+        settings: Odometry settings.
+        constants: Errors of the settings.
+        delay_s: Delay of the positions' timestamps.
+        fix_sd_m: S.d. of the positions.
+        wander_m_per_sqrt_s: S.d. of the change of the positions' own error in one second.
+    """
+
+    settings: OdometrySettings
+    constants: Constants = NO_CONSTANTS
+    delay_s: float = 0.0
+    fix_sd_m: float = 0.0
+    wander_m_per_sqrt_s: float = 0.0
 
 
 class KnownDrive:
@@ -95,6 +122,7 @@ class KnownDrive:
             knots.append(np.linspace(before, after, parts + 1)[1:])
             at.append(np.array([-1] * (parts - 1) + [k]))
         self.knots_s, self.at_fix = np.concatenate(knots), np.concatenate(at)
+        self.dt_s = np.diff(self.knots_s, prepend=0.0)
 
     @property
     def fix_sd_m(self) -> float:
@@ -107,7 +135,11 @@ class KnownDrive:
         return KnownDrive(self.wheels, self.turn, before, self.lever_m)
 
     def steps(
-        self, settings: OdometrySettings, drift_radps2: float = 0.0, delay_s: float = 0.0
+        self,
+        settings: OdometrySettings,
+        drift_radps2: float = 0.0,
+        delay_s: float = 0.0,
+        wander_m_per_sqrt_s: float = 0.0,
     ) -> Steps:
         """Compute the odometry between the positions.
 
@@ -116,6 +148,7 @@ class KnownDrive:
             drift_radps2: Drift of the gyro's bias, whose value in the settings is that in the
                 middle of the drive.
             delay_s: Delay of the positions' timestamps.
+            wander_m_per_sqrt_s: S.d. of the change of the positions' own error in one second.
         """
         turn = self.turn
         if turn is not None and drift_radps2:
@@ -123,7 +156,9 @@ class KnownDrive:
             turn = TurnSignal(turn.t_ns, turn.values - drift_radps2 * middle_s, turn.kind)
         made = integrate(self.wheels, settings, turn).increments
         columns = made.distance_m, made.turn_rad, made.distance_var_m2, made.turn_var_rad2
-        return Steps(self.at_fix, *(self._between(made, column, delay_s) for column in columns))
+        summed = [self._between(made, column, delay_s) for column in columns]
+        summed.append(wander_m_per_sqrt_s**2 * self.dt_s)
+        return Steps(self.at_fix, *summed)
 
     def _between(self, made: Increments, column: Floats, delay_s: float) -> Floats:
         """Sum a column of increments over each arc."""
@@ -140,36 +175,33 @@ class KnownDrive:
         made = self.increments(settings)
         return start_pose(made, self.fixes, self.lever_m)
 
-    def reckon(
-        self,
-        start: State,
-        settings: OdometrySettings,
-        constants: Constants | None,
-        delay_s: float = 0.0,
-    ) -> Predicted:
+    def reckon(self, start: State, car: Car, updated: int = 0) -> Predicted:
         """Dead reckoning with constant errors of the odometry as states of the filter.
 
         Args:
             start: State of the rear axle at the first position.
-            settings: Odometry settings of the car.
-            constants: Constants at the first position, with their covariance with the start.
-            delay_s: Delay of the positions' timestamps.
+            car: The car, with its constants at the first position.
+            updated: Number of positions, from the first on, that update the filter.
         """
-        steps = self.steps(settings, delay_s=delay_s)
-        if constants is None:
-            return self.follow(start, steps)
-        made = self.increments(settings)
-        by = effects(made, settings, constants.names)
+        steps = self.steps(car.settings, 0.0, car.delay_s, car.wander_m_per_sqrt_s)
+        made, constants = self.increments(car.settings), car.constants
+        by = effects(made, car.settings, constants.names)
         arcs = np.zeros((len(self.knots_s), *by.shape[1:]))
         for i, k in np.ndindex(by.shape[1:]):
-            arcs[:, i, k] = self._between(made, by[:, i, k], delay_s)
-        rows = zip(*(column.tolist() for column in steps), strict=True)
-        dt_s = np.diff(self.knots_s, prepend=self.knots_s[0]).tolist()
-        state, found = start, []
-        for (at_fix, *step), arc_by, seconds in zip(rows, arcs, dt_s, strict=True):
-            state, constants = predict_constants(state, constants, (*step, 0.0), arc_by, seconds)
-            if at_fix >= 0:
-                found.append(at_point(state, *self.lever_m))
+            arcs[:, i, k] = self._between(made, by[:, i, k], car.delay_s)
+        rows = zip(*(column.tolist() for column in steps), arcs, self.dt_s.tolist(), strict=True)
+        state, found, cov_m2 = start, [], car.fix_sd_m**2 * np.eye(2)
+        for at_fix, *step, wander_var, arc_by, dt_s in rows:
+            state, constants = predict_constants(state, constants, (*step, 0.0), arc_by, dt_s)
+            state = _wandered(state, wander_var)
+            if at_fix < 0:
+                continue
+            seen = at_point(state, *self.lever_m)
+            found.append(seen)
+            if at_fix < updated:
+                before = unpack_belief(0, state)
+                after = update_point(before, self.fixes.xy_m[at_fix], cov_m2, self.lever_m).belief
+                state, constants = pack_belief(after), update_constants(constants, before, after)
         return _predicted(np.array(found))
 
     def follow(self, start: State, steps: Steps, cov_m2: Floats | None = None) -> Predicted:
@@ -203,13 +235,14 @@ def _follow(
     found: Floats,
 ) -> int:
     """Write the state at each position into ``found``; return their number."""
-    at_fix, distance_m, turn_rad, distance_var_m2, turn_var_rad2 = steps
+    at_fix, distance_m, turn_rad, distance_var_m2, turn_var_rad2, wander_var_m2 = steps
     ahead_m, left_m = lever_m
     count = 0
     for row in range(len(at_fix)):
         state = predict_pose(
             state, distance_m[row], turn_rad[row], distance_var_m2[row], turn_var_rad2[row], 0.0
         )
+        state = _wandered(state, wander_var_m2[row])
         k = at_fix[row]
         if k < 0:
             continue
@@ -222,6 +255,12 @@ def _follow(
             weighed = _weighed(seen, x, y, cov_m2[k, 0, 0], cov_m2[k, 0, 1], cov_m2[k, 1, 1])
             state = at_point(weighed, -ahead_m, -left_m)
     return count
+
+
+def _wandered(state: State, var_m2: float) -> State:
+    """Let the positions' own error wander; the filter's position includes it."""
+    x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
+    return State(x, y, heading, speed, xx + var_m2, xy, xh, xv, yy + var_m2, yh, yv, hh, hv, vv)
 
 
 def _weighed(seen: State, x: float, y: float, var_x: float, cov_xy: float, var_y: float) -> State:

@@ -27,7 +27,7 @@ from crosscue.localization.angles import wrap
 from crosscue.localization.constants import EFFECTS, TURN_PARAMETERS, Constants
 from crosscue.localization.fit.compass import NotObservable, persistence
 from crosscue.localization.fit.front_wheels import front_wheels
-from crosscue.localization.fit.known_drive import GATE_NIS, KnownDrive, Steps, whitened
+from crosscue.localization.fit.known_drive import GATE_NIS, Car, KnownDrive, Steps, whitened
 from crosscue.localization.odometry import OdometrySettings
 from crosscue.localization.pose_filter import State
 from crosscue.replay.columns import Floats
@@ -43,6 +43,8 @@ DETERMINED: Final = 0.5
 # Minimum s.d. of a position of the rear axle, because the body leans and slips, and levers are
 # measured by hand. Without it, a smooth track would count as perfect, and its sway as turns.
 MIN_FIX_SD_M: Final = 0.1
+# Fraction of it that limits the search for the most likely noise.
+LEAST: Final = 0.05
 # S.d. of a direction without information, in units of the plausible deviation.
 NO_INFORMATION_SD: Final = 1e5
 # S.d. in those units above which a parameter has no effect on the drive.
@@ -59,6 +61,10 @@ DERIVATIVE_STEP: Final = 1e-4
 # differs.
 TYPICAL: Final = OdometrySettings(track_width_m=1.5)
 NOISE_FACTOR: Final = 3.0
+# The same for the change of the positions' own error in one second: from a smoothed track of some
+# centimetres to a phone among high buildings.
+TYPICAL_WANDER_M: Final = 0.05
+WANDER_FACTOR: Final = 10.0
 # Positions and distance with which anything is observable; more is judged by the parameters' s.d.
 MIN_FIXES: Final = 5
 MIN_DISTANCE_M: Final = 20.0
@@ -135,6 +141,7 @@ class OdometryFit:
         start_ns: Time of the first position.
         constants: Errors of the parameters, as states of a filter that starts with ``start``.
         fix_sd_m: S.d. of the positions, by the residuals.
+        wander_m_per_sqrt_s: S.d. of the change of the positions' own error in one second.
         residual_rms: Root mean square of the whitened residuals; 1 if consistent.
         fixes: Number of positions used.
         outliers: Number of positions further off than 99.9 % of good positions.
@@ -148,9 +155,16 @@ class OdometryFit:
     start_ns: int
     constants: Constants
     fix_sd_m: float
+    wander_m_per_sqrt_s: float
     residual_rms: float
     fixes: int
     outliers: int
+
+    @property
+    def car(self) -> Car:
+        """The car, for dead reckoning on a drive with the same positions."""
+        delay_s = self.value(FIX_DELAY)
+        return Car(self.settings, self.constants, delay_s, self.fix_sd_m, self.wander_m_per_sqrt_s)
 
     def value(self, parameter: str, otherwise: float = 0.0) -> float:
         """Return a fitted value, or ``otherwise`` if it is not observable."""
@@ -173,7 +187,7 @@ def fit_odometry(drive: KnownDrive, given: OdometrySettings) -> OdometryFit:
     names = _free(drive, given)
     # Large noise at first: a filter that trusts a wrong bias diverges, and derivatives are useless.
     loud = {n: WIDE * getattr(TYPICAL, n) for n in ("slip_per_sqrt_m", TURN_NOISE[drive.source])}
-    fit = _Fit(drive, names, _changed(given, loud), 1.0)
+    fit = _Fit(drive, names, _changed(given, loud), 1.0, WIDE * TYPICAL_WANDER_M)
     values = fit.solve(fit.first_guess())
     fit = replace(fit, given=given)
     values = fit.solve(values)
@@ -245,6 +259,7 @@ class _Fit:
     names: tuple[str, ...]
     given: OdometrySettings
     fix_scale: float
+    wander_m_per_sqrt_s: float
 
     def first_guess(self) -> Values:
         start = self.drive.start(self.given)
@@ -260,7 +275,8 @@ class _Fit:
 
     def _steps(self, values: Values, noise: Values) -> Steps:
         car = _changed(self.settings(values), noise)
-        return self.drive.steps(car, values.get(DRIFT, 0.0), values.get(FIX_DELAY, 0.0))
+        drift, delay_s = values.get(DRIFT, 0.0), values.get(FIX_DELAY, 0.0)
+        return self.drive.steps(car, drift, delay_s, self.wander_m_per_sqrt_s)
 
     def _seen(self, values: Values, steps: Steps, fix_scale: float) -> tuple[Floats, Floats]:
         x, y, heading = (values[name] for name in START)
@@ -352,48 +368,58 @@ class _Fit:
 
         slip, turn = self._noises()
         min_scale = MIN_FIX_SD_M / self.drive.fix_sd_m
-        current = (getattr(self.given, slip), getattr(self.given, turn), self.fix_scale)
-        typical = np.log([getattr(TYPICAL, name) for name in (slip, turn)])
+        current = (*self._noise(), self.fix_scale)
+        typical = np.log([getattr(TYPICAL, slip), getattr(TYPICAL, turn), TYPICAL_WANDER_M])
+        factor = np.log([NOISE_FACTOR, NOISE_FACTOR, WANDER_FACTOR])
         # Variances are linear in the noise's, so odometry is integrated thrice and not hundredfold.
         silent = self._steps(values, {slip: 0.0, turn: 0.0})
         by_slip = self._steps(values, {slip: 1.0, turn: 0.0}).distance_var_m2
         by_turn = self._steps(values, {slip: 0.0, turn: 1.0}).turn_var_rad2
 
         def unlikely(logs: Floats) -> float:
-            slip_var, turn_var, _ = np.exp(2.0 * logs)
+            slip_var, turn_var, wander_var, _ = np.exp(2.0 * logs)
             steps = silent._replace(
                 distance_var_m2=silent.distance_var_m2
                 + slip_var * (by_slip - silent.distance_var_m2),
                 turn_var_rad2=silent.turn_var_rad2 + turn_var * (by_turn - silent.turn_var_rad2),
+                wander_var_m2=wander_var * self.drive.dt_s,
             )
-            white, log_det = self._seen(values, steps, max(math.exp(logs[2]), min_scale))
+            # Not the least s.d.: larger than the residuals, it would leave no noise to be seen.
+            white, log_det = self._seen(values, steps, max(math.exp(logs[3]), LEAST * min_scale))
             nis = np.sum(white**2, axis=1)
             far = np.sqrt(np.maximum(nis * GATE_NIS, 0.0))
             robust = np.where(nis > GATE_NIS, 2.0 * far - GATE_NIS, nis)
             # Positions cannot tell small noise from none, but a car has some.
-            apart = (logs[:2] - typical) / math.log(NOISE_FACTOR)
+            apart = (logs[:3] - typical) / factor
             return 0.5 * float(np.sum(robust + log_det) + np.sum(apart**2))
 
         first = np.log(np.maximum(current, _MIN_SD))
-        simplex = np.vstack([first, first + np.diag([-1.0, -1.0, -1.0])])
-        options = {"xatol": 0.02, "fatol": 0.02, "maxfev": 200, "initial_simplex": simplex}
+        simplex = np.vstack([first, first + np.diag([-1.0] * 4)])
+        options = {"xatol": 0.02, "fatol": 0.02, "maxfev": 300, "initial_simplex": simplex}
         logs = minimize(unlikely, first, method="Nelder-Mead", options=options).x
-        for i in range(2 if is_upper else 0):
-            step = 0.05 * np.eye(3)[i]
+        for i in range(3 if is_upper else 0):
+            step = 0.05 * np.eye(4)[i]
             limit = unlikely(logs) + 0.5
             while logs[i] < _LOUD and unlikely(logs + step) < limit:
                 logs = logs + step
-        *noise, scale = np.exp(logs)
-        given = _changed(self.given, dict(zip((slip, turn), map(float, noise), strict=True)))
-        return replace(self, given=given, fix_scale=max(float(scale), min_scale))
+        *noise, wander, scale = np.exp(logs).tolist()
+        given = _changed(self.given, dict(zip((slip, turn), noise, strict=True)))
+        return replace(
+            self, given=given, fix_scale=max(scale, min_scale), wander_m_per_sqrt_s=wander
+        )
 
     def _noises(self) -> tuple[str, str]:
         return "slip_per_sqrt_m", TURN_NOISE[self.drive.source]
 
+    def _noise(self) -> tuple[float, float, float]:
+        slip, turn = (float(getattr(self.given, name)) for name in self._noises())
+        return slip, turn, self.wander_m_per_sqrt_s
+
     def is_like(self, other: _Fit) -> bool:
         """Whether the noise is about the same."""
-        pairs = [(getattr(self.given, n), getattr(other.given, n)) for n in self._noises()]
-        pairs.append((self.fix_scale, other.fix_scale))
+        pairs = zip(
+            (*self._noise(), self.fix_scale), (*other._noise(), other.fix_scale), strict=True
+        )
         return all(abs(a - b) <= SETTLED * max(abs(a), abs(b), _MIN_SD) for a, b in pairs)
 
     def _units(self) -> Floats:
@@ -451,9 +477,11 @@ def _result(
     settings = fit.settings(values)
     span_ns = int(drive.fixes.t_ns[0]), int(drive.fixes.t_ns[-1])
     front = front_wheels(drive.wheels, drive.increments(settings), settings, span_ns)
-    constant = tuple(name for name in names if name in EFFECTS)
-    rows = [names.index(name) for name in constant]
-    cross = np.vstack([cov[np.ix_(at, rows)], np.zeros(len(rows))])
+    # Positions that are early by some time are wheel speeds that are late by it.
+    rows = [i for i, name in enumerate(names) if name in EFFECTS or name == FIX_DELAY]
+    sign = np.array([-1.0 if names[i] == FIX_DELAY else 1.0 for i in rows])
+    constant = tuple("wheel_delay_s" if names[i] == FIX_DELAY else names[i] for i in rows)
+    cross = np.vstack([cov[np.ix_(at, rows)], np.zeros(len(rows))]) * sign
     # Its own s.d. is no drift.
     drift_var = max(values.get(DRIFT, 0.0) ** 2 - sd.get(DRIFT, 0.0) ** 2, 0.0) * drive.seconds[-1]
     return OdometryFit(
@@ -472,11 +500,12 @@ def _result(
         constants=Constants(
             constant,
             np.zeros(len(rows)),
-            cov[np.ix_(rows, rows)],
+            cov[np.ix_(rows, rows)] * np.outer(sign, sign),
             cross,
             np.array([drift_var if name == BIAS else 0.0 for name in constant]),
         ),
         fix_sd_m=fit.fix_scale * drive.fix_sd_m,
+        wander_m_per_sqrt_s=fit.wander_m_per_sqrt_s,
         residual_rms=float(np.sqrt(np.mean(white**2))),
         fixes=len(drive.fixes),
         outliers=int((np.sum(white**2, axis=1) > GATE_NIS).sum()),

@@ -53,6 +53,7 @@ ConstantName: TypeAlias = Literal[
     "wheelbase_m",
     "right_wheel_scale",
     "track_width_m",
+    "wheel_delay_s",
 ]
 
 

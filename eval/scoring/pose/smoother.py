@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -42,6 +42,8 @@ class SmootherScore:
         filter_nees_xyh: Consistency of the filter.
         smoother_nees_xyh: Consistency of the smoother.
         range: Errors of the range filter and of its smoother, by reference.
+        without_constants: True if the filter had constant errors of the odometry as states, which
+            the smoother does not know.
     """
 
     poses: int
@@ -54,6 +56,7 @@ class SmootherScore:
     filter_nees_xyh: NeesSummary
     smoother_nees_xyh: NeesSummary
     range: Mapping[str, FilterAndSmoother]
+    without_constants: bool = False
 
 
 def score_smoother(
@@ -102,7 +105,8 @@ def score_smoother(
         vehicle,
         truth,
     )
-    result = _compared(true, filtered, smoothed, ranges)
+    has_constants = vehicle.odometry.constants is not None
+    result = replace(_compared(true, filtered, smoothed, ranges), without_constants=has_constants)
     folder = run.file("score")
     folder.mkdir(exist_ok=True)
     write_text(folder / "smoother.json", strict_json(asdict(result)) + "\n")
@@ -165,6 +169,11 @@ def smoother_text(result: SmootherScore) -> str:
             f"{result.filter_end_m:.3f} and {result.smoother_end_m:.3f} m,",
             f"  mean NEES {result.filter_nees_xyh.mean:.2f} and "
             f"{result.smoother_nees_xyh.mean:.2f} (3 is consistent)",
+            *(
+                ["  the smoother does not know [odometry.constants], which the filter estimates"]
+                if result.without_constants
+                else []
+            ),
             *(
                 f"range to {name}, filter and smoother, {one.rows} rows: rmse "
                 f"{one.filter_rmse_m:.2f} and {one.smoother_rmse_m:.2f} m, mean NEES "

@@ -66,8 +66,9 @@ def test_vehicle_file_states_the_constant_errors(fitted: FittedOdometry, files: 
 
     assert vehicle.odometry.constants is not None
     assert constants is not None
-    assert constants.names[:3] == ("wheel_scale", "gyro_bias_radps", "yaw_rate_scale")
-    np.testing.assert_allclose(constants.cov[:3, :3], fit.constants.cov, rtol=1e-6)
+    names = ("wheel_scale", "gyro_bias_radps", "yaw_rate_scale", "wheel_delay_s")
+    assert constants.names[:4] == names
+    np.testing.assert_allclose(constants.cov[:4, :4], fit.constants.cov, rtol=1e-6)
     assert odometry_constants(crosscue.load_vehicle(files.vehicle), Signal.YAW_RATE) is None
 
 

@@ -14,7 +14,9 @@ from crosscue.eval.recording import save_rrd as save_recording
 from crosscue.eval.report.summary import pose_summary, scores_text
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
+from crosscue.eval.scoring.pose.errors import summarise_nees
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
+from crosscue.eval.scoring.pose.smoother import SmootherScore, smoother_text
 from crosscue.eval.scoring.runs import pooled_scores
 from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.replay.columns import Block
@@ -80,7 +82,7 @@ def test_perfect_run_has_no_error_and_full_accounting(tmp_path: Path) -> None:
 def test_scores_of_a_drive_without_pictures_name_no_frames(tmp_path: Path) -> None:
     run, truth, _ = _scored(tmp_path)
 
-    printed = scores_text(pooled_scores([score_run(run.path, truth, has_figures=False).one]))
+    printed = scores_text(pooled_scores([score_run(run.path, truth, has_figures=False).scored.one]))
 
     assert printed == "drives     1, without pictures: no cue, belief or range to score"
 
@@ -192,3 +194,13 @@ def test_score_reports_compared_body_and_assumed_mounting(tmp_path: Path) -> Non
     assert "compared at the camera, 2.00 m ahead" in text
     assert "x_m: unknown to the truth" in text
     assert "by hand" in text
+
+
+def test_smoother_says_that_it_does_not_know_constant_errors() -> None:
+    nees = summarise_nees(np.ones(3), 3)
+    known = SmootherScore(3, 1.0, 1.0, 0.1, 0.1, 1.0, 1.0, nees, nees, {})
+
+    assert "[odometry.constants]" not in smoother_text(known)
+    assert "does not know [odometry.constants]" in smoother_text(
+        replace(known, without_constants=True)
+    )
