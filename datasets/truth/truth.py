@@ -26,7 +26,6 @@ from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.validation_errors import explain
 from crosscue.results import Result, json_key
 
-VERSION: Final = 1
 FILE: Final = "truth.json"
 MAX_BYTES: Final = 256 * MIB
 

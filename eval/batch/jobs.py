@@ -330,7 +330,8 @@ def state_of(job: Job) -> JobState:
         CrosscueError: A log cannot be examined.
     """
     entry = read_entry(job.run)
-    if not _holds_anything(job.run):
+    inside = job.run.iterdir() if job.run.is_dir() else ()
+    if all(path.name == FAILURE for path in inside):
         return JobState.MISSING
     if not job.run.joinpath(MANIFEST).exists():
         return JobState.CUT_SHORT
@@ -344,11 +345,6 @@ def state_of(job: Job) -> JobState:
         and isinstance(entry.get("exit_status"), int)
     )
     return JobState.DONE if is_same else JobState.OTHER
-
-
-def is_done(job: Job) -> bool:
-    """Return whether a complete run of the same, unchanged logs and settings exists."""
-    return state_of(job) is JobState.DONE
 
 
 def _check_unique(jobs: Sequence[Job]) -> None:
@@ -390,10 +386,6 @@ def _inputs(job: Job) -> dict[str, object]:
 def _manifest_hash(job: Job) -> str:
     RunFolder(job.run).manifest()
     return hashlib.sha256(door.read(job.run / MANIFEST, MAX_MANIFEST_BYTES)).hexdigest()
-
-
-def _holds_anything(folder: Path) -> bool:
-    return folder.is_dir() and any(entry.name != FAILURE for entry in folder.iterdir())
 
 
 def worker_crashed(done: JobOutcome[R], attempts: int, how: str) -> JobOutcome[R]:

@@ -16,7 +16,6 @@ from crosscue.eval.batch.jobs import (
     JobState,
     exit_status_of,
     in_turn,
-    is_done,
     run_many,
     state_of,
 )
@@ -80,7 +79,7 @@ def test_second_start_processes_only_missing_drives(tmp_path: Path) -> None:
     assert [done.error is None for done in first] == [True, False, True, True]
     assert [done.is_earlier for done in second] == [True, False, True, True]
     assert [done.exit_status for done in second] == [0, 0, 3, 0]
-    assert all(is_done(job) for job in jobs)
+    assert all(state_of(job) is JobState.DONE for job in jobs)
     for i in (0, 2, 3):
         assert tree(jobs[i].run) == before[jobs[i].name]
 
