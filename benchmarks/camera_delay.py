@@ -2,7 +2,7 @@
 
 Run it as ``python -m benchmarks.camera_delay [COUNT]``. It reads the sequences with poses of
 ``$CROSSCUE_DATA`` (or ``../shared/data``), whose yaw rate and speed are the signals, and simulated
-drives of ``tests/localization/test_camera_delay.py``. The true delay of the real pictures is not
+drives. The true delay of the real pictures is not
 known; it is taken to be 0. The noise of the model was chosen with the real drives in view.
 """
 
@@ -12,6 +12,8 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import cv2
 import numpy as np
@@ -29,6 +31,7 @@ from crosscue.localization.camera_delay import (
 )
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import parse
+from support.picture_motion import pictures, speed, yaw_rate
 
 NAMES = ("kitti_right_turn", "kitti_t_junction", "pandaset_002")
 MAX_S = 0.25
@@ -116,19 +119,16 @@ def main(count: int) -> None:
         for number, signal in enumerate(("yaw rate", "speed")):
             printed(f"{name}, {signal}", [(true, found[number]) for true, found in results])
         printed(f"{name}, mean", [(true, mean_delay(found)) for true, found in results])
-    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "localization"))
-    import test_camera_delay as simulated
-
     rng = np.random.default_rng(2)
     for signal in ("yaw rate", "speed"):
         pairs: list[tuple[float, CameraDelay | None]] = []
         for seed in range(1000, 1000 + 2 * count):
             delay_s = float(rng.uniform(-MAX_S, MAX_S))
-            seen = simulated.pictures(seed, delay_s)
+            motion = pictures(seed, delay_s)
             if signal == "yaw rate":
-                pairs.append((delay_s, delay_by_yaw_rate(seen, *simulated.yaw_rate(seed, 25.0))))
+                pairs.append((delay_s, delay_by_yaw_rate(motion, *yaw_rate(seed, 25.0))))
             else:
-                pairs.append((delay_s, delay_by_speed(seen, *simulated.speed(seed))))
+                pairs.append((delay_s, delay_by_speed(motion, *speed(seed))))
         printed(f"simulated, {signal}", pairs)
 
 

@@ -15,7 +15,7 @@ from typing import Final
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.runs import judge_run
-from crosscue.eval.studies.intersections.contact_sheet import write_sheet
+from crosscue.eval.studies.intersections.figures import write_sheet
 
 RUNS: Final = (1, 4, 6, 9)
 # Quality of the JPEG, low so that its page loads quickly.

@@ -69,7 +69,7 @@ def decode_seconds() -> None:
     settings = SceneSettings("L800", 1)
     _, _, world = world_of(settings)
     shown = Renderer(world, settings.camera, settings.picture).picture(5.0)
-    coded = jpeg(shown, settings.picture.jpeg_quality)
+    coded = jpeg(shown.rgb, settings.picture.jpeg_quality)
     picture = Encoded("jpeg", memoryview(coded))
     print(f"{'JPEG of 1280 x 720':22} {'decoded':>10} {'ours, ms':>9} {'full, ms':>9} {'ratio':>6}")
     for width in WIDTHS:

@@ -53,7 +53,7 @@ def main() -> None:
                 began = time.process_time()
                 picture = renderer.picture(t_s, k)
                 drawing.append(time.process_time() - began)
-                spent += cpu_s(lambda picture=picture: jpeg(picture, 90))  # type: ignore[misc]
+                spent += cpu_s(lambda picture=picture: jpeg(picture.rgb, 90))  # type: ignore[misc]
             coding.append(spent / len(times))
         draw, code = statistics.median(drawing), statistics.median(coding)
         print(

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from crosscue.eval.batch.engine import engine_of
 
+from crosscue.eval.batch.ray_jobs import engine_of
 from crosscue.eval.failures.find import failures_unlabelled
 from crosscue.eval.failures.order import ranked
 from crosscue.eval.failures.record import APART_NS, Failure
@@ -27,7 +27,7 @@ from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.scoring.runs import judge_scene
 from crosscue.eval.scoring.scene.cues import is_wrong
 from crosscue.eval.scoring.scene.ranges import sds_off
-from crosscue.eval.studies.layouts.run import SEEN_BY
+from crosscue.eval.studies.layouts.run import PERCEPTION
 from crosscue.eval.studies.layouts.settings import LayoutStudy
 from crosscue.eval.studies.simulated_drives import run_drives
 from crosscue.replay.columns import Int64s
@@ -101,7 +101,7 @@ def main() -> None:
     parser.add_argument("--top", type=int, default=50)
     args = parser.parse_args()
     study = LayoutStudy("faults", args.blocks, 1, 2, layouts_from=args.layouts_from)
-    imager, detectors = SEEN_BY["faults"]
+    imager, detectors, _ = PERCEPTION["faults"]
     done = run_drives(args.output, study.scenes(), detectors, engine_of(1, None), imager=imager)
     names = [one.job.name for one in done if one.error is None]
     drives = [

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
-from crosscue.datasets.scenes.drive import SceneFiles, refuse_other_drive, write_scene
+from crosscue.datasets.scenes.drive import SceneFiles, jpeg, refuse_other_drive, write_scene
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 from crosscue.replay.errors import OutputError, UsageError
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from crosscue.datasets.simulated.log_files import DriveFiles
 
 PUBLISHED_RUNS: Final = 10
+SHEET_QUALITY: Final = 82
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,12 +188,12 @@ def simulate_approaches(
 
 
 def _drawn(sheet: Path, wanted: Sequence[SceneSettings], *, overwrite: bool) -> ContactSheet:
-    from crosscue.datasets.scenes.single_frames import contact_sheet, sheet_jpeg
+    from crosscue.datasets.scenes.single_frames import contact_sheet
 
     if sheet.exists() and not overwrite:
         raise OutputError(f"{sheet}: exists; give another name or --overwrite")
     columns = len({(one.run, one.seed) for one in wanted})
-    write_bytes(sheet, sheet_jpeg(contact_sheet(wanted, columns)))
+    write_bytes(sheet, jpeg(contact_sheet(wanted, columns), SHEET_QUALITY))
     return ContactSheet(sheet, tuple(one.name for one in wanted))
 
 

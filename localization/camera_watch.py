@@ -26,6 +26,9 @@ BESIDE_NS: Final = 8_000_000_000
 SIGMAS: Final = 4.0
 # S.d. of a mean over seconds that slopes, loads and textures of the road explain.
 ROAD_SD: Final = {"pitch": math.radians(0.05), "yaw": math.radians(0.05), "height": 0.02}
+# S.d. of an error that stays the same over a drive, such as that of the optical center: it widens
+# values, not steps. On two real drives the angles are off by up to 0.2 degrees.
+SAME_SD: Final = {"pitch": math.radians(0.12), "yaw": math.radians(0.12), "height": 0.02}
 LEAST_STEP: Final = {"pitch": math.radians(0.25), "yaw": math.radians(0.25), "height": 0.1}
 # Successive measurements that share an error.
 CORRELATED: Final = 4
@@ -97,11 +100,7 @@ def windows_of(value: str, t_ns: Int64s, measured: Floats) -> list[MountingWindo
     for one in np.unique(number).tolist():
         mine = number == one
         if mine.sum() >= MIN_MEASURED:
-            mean, sd = _mean(value, measured[mine])
-            span = t_ns[mine]
-            found.append(
-                MountingWindow(value, int(span[0]), int(span[-1]), mean, sd, int(mine.sum()))
-            )
+            found.append(_window(value, t_ns[mine], measured[mine]))
     return found
 
 
@@ -110,9 +109,13 @@ def whole(value: str, t_ns: Int64s, measured: Floats) -> MountingWindow | None:
     known = np.isfinite(measured)
     if known.sum() < MIN_MEASURED:
         return None
-    mean, sd = _mean(value, measured[known])
-    span = t_ns[known]
-    return MountingWindow(value, int(span[0]), int(span[-1]), mean, sd, int(known.sum()))
+    return _window(value, t_ns[known], measured[known])
+
+
+def _window(value: str, t_ns: Int64s, measured: Floats) -> MountingWindow:
+    mean, sd = _mean(value, measured)
+    sd = math.hypot(sd, SAME_SD[value] * (abs(mean) if value == "height" else 1.0))
+    return MountingWindow(value, int(t_ns[0]), int(t_ns[-1]), mean, sd, len(measured))
 
 
 def steps_of(value: str, t_ns: Int64s, measured: Floats) -> list[MountingStep]:

@@ -30,6 +30,7 @@ from crosscue.replay.columns import Bytes, Floats
 CORNERS: Final = 500
 APART_PX: Final = 10
 MIN_CORNERS: Final = 20
+TRAVEL_CORNERS: Final = 60
 # Width above which a picture is reduced by halves.
 WIDEST_PX: Final = 1300
 # Max distance between a corner and where it returns when followed back.
@@ -113,6 +114,53 @@ class _View(NamedTuple):
     boxes_px: Floats
 
 
+class Travel(NamedTuple):
+    """Motion of a camera between two pictures, in the axes half-way between both.
+
+    Attributes:
+        left_rad: Angle of its axis to the left of the direction of travel.
+        below_rad: Angle of its axis below the direction of travel.
+        turned_rad: Rotation between the pictures, to the left.
+        points: Number of corners followed.
+    """
+
+    left_rad: float
+    below_rad: float
+    turned_rad: float
+    points: int
+
+
+def travel_between(
+    before: Bytes, after: Bytes, focal_px: float, center_px: tuple[float, float]
+) -> Travel | None:
+    """Estimate a camera's direction of travel: while a car drives straight, the vanishing point.
+
+    Args:
+        before: Grey picture, shape (H, W), uint8.
+        after: The next one, of the same size.
+        focal_px: Focal length in pixels of these pictures.
+        center_px: Optical center in them.
+
+    Returns:
+        The motion, or None if too few corners can be followed or they do not move.
+    """
+    import cv2
+
+    nothing = np.empty((0, 4))
+    first, second = _followed(_View(0, before, nothing), _View(0, after, nothing))
+    if len(first) < TRAVEL_CORNERS or np.median(np.hypot(*(second - first).T)) < PARALLAX_PX:
+        return None
+    before_rays, after_rays = (_rays(one, focal_px, center_px) for one in (first, second))
+    ahead = np.array([1.0, 0.0, 0.0])
+    rotation, _ = _fitted(before_rays, after_rays, np.eye(3), ahead, focal_px, is_free=False)
+    rotation, along = _fitted(
+        before_rays, after_rays, rotation, ahead, focal_px, is_free=True, direction_sd=ASIDE_SD
+    )
+    x, y, z = _rotated(0.5 * np.asarray(cv2.Rodrigues(rotation)[0], np.float64)) @ along
+    turned_rad = -math.atan2(rotation[1, 0], rotation[0, 0])
+    return Travel(-math.atan2(y, x), math.atan2(z, math.hypot(x, y)), turned_rad, len(first))
+
+
 @dataclass(slots=True)
 class VisualOdometry:
     """Motion of the car from picture to picture; it holds the previous picture.
@@ -181,11 +229,7 @@ class VisualOdometry:
         )
         if not math.isfinite(focal_px):
             return standing if is_standing else nothing
-        to_body = [
-            np.column_stack([(points - np.array(center_px)) / focal_px, np.ones(len(points))])
-            @ BODY.T
-            for points in (first, second)
-        ]
+        to_body = [_rays(points, focal_px, center_px) for points in (first, second)]
         ahead = self._attitude().T @ np.array([1.0, 0.0, 0.0])
         if is_standing:
             self.expansion = _expansion(to_body[0], to_body[1], ahead)
@@ -305,6 +349,7 @@ def _fitted(
     focal_px: float,
     *,
     is_free: bool,
+    direction_sd: float = DIRECTION_SD,
 ) -> tuple[Floats, Floats]:
     """Fit the rotation, and the direction of travel if it is free."""
     second = second / np.linalg.norm(second, axis=1, keepdims=True)
@@ -324,7 +369,7 @@ def _fitted(
             aside, up = np.array([-along[1], along[0], 0.0]), np.array([-along[2], 0.0, along[0]])
             by_direction = np.cross(second, rays) / lengths
             prior = np.zeros((2, 5))
-            prior[0, 3], prior[1, 4] = scale / ASIDE_SD, scale / DIRECTION_SD
+            prior[0, 3], prior[1, 4] = scale / ASIDE_SD, scale / direction_sd
             off = along - rotation @ ahead
             slope = np.vstack(
                 [np.column_stack([slope, by_direction @ aside, by_direction @ up]), prior]
@@ -342,6 +387,12 @@ def _fitted(
         if np.linalg.norm(change) < 1e-7:
             break
     return rotation, rotation.T @ along
+
+
+def _rays(points: Floats, focal_px: float, center_px: tuple[float, float]) -> Floats:
+    """Rays of pixels in the axes of the camera's body, with 1 ahead."""
+    flat = (points - np.array(center_px)) / focal_px
+    return np.asarray(np.column_stack([flat, np.ones(len(points))]) @ BODY.T, np.float64)
 
 
 def _expansion(first: Floats, second: Floats, ahead: Floats) -> float:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.rendering.render import PictureSettings, RenderedFrame, Renderer
@@ -128,16 +129,16 @@ def picture_times(world: World, settings: SceneSettings) -> Int64s:
     return np.arange(int(motion.t_ns[0]), int(motion.t_ns[-1]), step, dtype=np.int64)
 
 
-def jpeg(picture: RenderedFrame, quality: int) -> bytes:
+def jpeg(rgb: NDArray[np.uint8], quality: int) -> bytes:
     """Encode a picture as JPEG."""
     import cv2
 
-    bgr = np.ascontiguousarray(picture.rgb[..., ::-1])
+    bgr = np.ascontiguousarray(rgb[..., ::-1])
     return bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
 
 
 def _photograph(picture: RenderedFrame, settings: PictureSettings) -> bytes:
-    return jpeg(picture, settings.jpeg_quality)
+    return jpeg(picture.rgb, settings.jpeg_quality)
 
 
 PHOTOGRAPHS: Final = Imager("", pictures, _photograph, "jpeg")

@@ -160,7 +160,8 @@ def any_layout(seed: int) -> Layout:
     """Return a random intersection that is not in Table 6, for training and variety."""
     rng = np.random.default_rng([seed, 0x1A])
     arms = str(rng.choice(["all", "t", "no_left", "no_right"], p=[0.5, 0.26, 0.12, 0.12]))
-    control = str(rng.choice(["stop_sign", "traffic_light", "none"], p=[0.5, 0.35, 0.15]))
+    kinds = get_args(Control)
+    control: Control = kinds[int(rng.choice(3, p=[0.5, 0.35, 0.15]))]
     one_way = str(rng.choice(["", "left", "right"], p=[0.6, 0.2, 0.2]))
     if arms in ("no_left", "no_right"):
         one_way = ""
@@ -169,11 +170,7 @@ def any_layout(seed: int) -> Layout:
     return Layout(
         name=f"L{seed}",
         seed=1000 + seed,
-        control="traffic_light"
-        if control == "traffic_light"
-        else "stop_sign"
-        if control == "stop_sign"
-        else "none",
+        control=control,
         has_left=arms != "no_left",
         has_right=arms != "no_right",
         has_ahead=arms != "t",

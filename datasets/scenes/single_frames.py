@@ -7,11 +7,10 @@ from a folder: ``images/NAME.jpg`` with ``masks/NAME.png``, white for road.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,6 @@ from crosscue.detectors.overlay import write_label
 from crosscue.replay.columns import Bytes, Floats
 from crosscue.replay.errors import EmptyResultError, LogError, UsageError
 from crosscue.replay.files.whole_file import write_bytes
-from crosscue.replay.processes import in_processes
 
 from .drive import jpeg
 from .scene_truth import DriveAnnotations
@@ -68,15 +66,8 @@ def render_frames(settings: SceneSettings, count: int, folder: Path) -> DriveAnn
         objects.add(t_ns, picture, tags, -picture.view.rear_axle[0])
         name = f"{settings.name}-{number:03d}.jpg"
         objects.images[-1]["file_name"] = name
-        write_bytes(folder / name, jpeg(picture, settings.picture.jpeg_quality))
+        write_bytes(folder / name, jpeg(picture.rgb, settings.picture.jpeg_quality))
     return objects
-
-
-def frames(
-    runs: Sequence[SceneSettings], count: int, folder: Path, workers: int = 1
-) -> Iterator[DriveAnnotations]:
-    """Yield ``render_frames`` for each run, in order; several runs are rendered in parallel."""
-    return in_processes(partial(render_frames, count=count, folder=folder), runs, workers)
 
 
 def merge_annotations(parts: Sequence[DriveAnnotations]) -> DriveAnnotations:
@@ -86,17 +77,10 @@ def merge_annotations(parts: Sequence[DriveAnnotations]) -> DriveAnnotations:
         images, annotations = len(whole.images), len(whole.annotations)
         whole.images += [{**image, "id": image["id"] + images} for image in part.images]
         whole.annotations += [
-            _moved(annotation, images, annotations) for annotation in part.annotations
+            {**row, "id": row["id"] + annotations, "image_id": row["image_id"] + images}
+            for row in part.annotations
         ]
     return whole
-
-
-def _moved(annotation: dict[str, Any], images: int, annotations: int) -> dict[str, Any]:
-    return {
-        **annotation,
-        "id": annotation["id"] + annotations,
-        "image_id": annotation["image_id"] + images,
-    }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,14 +131,6 @@ def render_road_frames(settings: SceneSettings, count: int, size_px: tuple[int, 
     return RoadFrames(np.stack(pixels), np.stack(road))
 
 
-def rendered(
-    runs: Sequence[SceneSettings], count: int, size_px: tuple[int, int]
-) -> Iterator[RoadFrames]:
-    """Yield ``render_road_frames`` for each run."""
-    for settings in runs:
-        yield render_road_frames(settings, count, size_px)
-
-
 def shrunk(picture: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
     """Resize a picture; each pixel is the mean of the pixels that it covers."""
     import cv2
@@ -164,23 +140,22 @@ def shrunk(picture: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.u
 
 # Distance of the pictures before the intersection.
 BEFORE_M: Final = 25.0
+# Width and height of a picture in the sheet; it is rendered as in a drive and resized.
+SHEET_PX: Final = (192, 108)
 # Central fraction of each picture's width and height that is shown; the rest is mostly sky.
 SHOWN: Final = 0.7
 
 
-def contact_sheet(
-    runs: Sequence[SceneSettings], columns: int, width_px: int = 192
-) -> NDArray[np.uint8]:
+def contact_sheet(runs: Sequence[SceneSettings], columns: int) -> NDArray[np.uint8]:
     """Return pictures of all runs, ``columns`` in a row, each with its name in a corner.
 
     Args:
         runs: Runs, row by row.
         columns: Number of pictures in a row.
-        width_px: Width of a picture in the sheet; it is rendered as in a drive and resized.
     """
     import cv2
 
-    high = width_px * 9 // 16
+    width_px, high = SHEET_PX
     rows = -(-len(runs) // columns)
     sheet = np.full((rows * high, columns * width_px, 3), 255, np.uint8)
     for place, settings in enumerate(runs):
@@ -200,14 +175,6 @@ def contact_sheet(
 def _middle(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     y, x = (round(side * (1.0 - SHOWN) / 2.0) for side in rgb.shape[:2])
     return np.ascontiguousarray(rgb[y : rgb.shape[0] - y, x : rgb.shape[1] - x])
-
-
-def sheet_jpeg(sheet: NDArray[np.uint8]) -> bytes:
-    """Encode a sheet as JPEG."""
-    import cv2
-
-    bgr = np.ascontiguousarray(sheet[..., ::-1])
-    return bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 82])[1])
 
 
 SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp")

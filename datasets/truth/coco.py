@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from crosscue.detectors.training.annotations import coco_rows, coco_tree
 from crosscue.replay.errors import AnnotationError
-from crosscue.replay.files.bounded import read_at_most
-from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import MIB
 
@@ -27,19 +27,11 @@ def read_coco(path: Path) -> Annotations:
     Raises:
         AnnotationError: The file does not exist, is not COCO, or has invalid references.
     """
-    try:
-        content = read_at_most(path, MAX_BYTES)
-        if content is None:
-            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split it")
-        tree = json_tree(content)
-    except (OSError, ValueError) as error:
-        raise AnnotationError(f"{path}: not JSON ({error}); expected a COCO file") from None
-    if not isinstance(tree, dict):
-        raise AnnotationError(f"{path}: expected an object with images, annotations and categories")
+    tree = coco_tree(path, MAX_BYTES)
     labels = _labels(tree, path)
     pictures = _pictures(tree, path)
     things: dict[int, list[Annotation]] = {number: [] for number in pictures}
-    for place, row in enumerate(_rows(tree, "annotations", path)):
+    for place, row in enumerate(coco_rows(tree, "annotations", path)):
         where = f"annotations.{place}"
         image, label = _key(row.get("image_id")), labels.get(_key(row.get("category_id")))
         if image not in things:
@@ -62,13 +54,6 @@ def read_coco(path: Path) -> Annotations:
     )
 
 
-def _rows(tree: Mapping[str, Any], name: str, path: Path) -> list[Mapping[str, Any]]:
-    rows = tree.get(name)
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise AnnotationError(f"{path}: {name}: expected a list of objects as in COCO files")
-    return rows
-
-
 def _key(value: object) -> int:
     """Return an id, or an id that no row has if the value is not an id."""
     return value if isinstance(value, int) and not isinstance(value, bool) else -1
@@ -76,7 +61,7 @@ def _key(value: object) -> int:
 
 def _labels(tree: Mapping[str, Any], path: Path) -> dict[int, str]:
     labels: dict[int, str] = {}
-    for place, row in enumerate(_rows(tree, "categories", path)):
+    for place, row in enumerate(coco_rows(tree, "categories", path)):
         number, name = _key(row.get("id")), row.get("name")
         if number < 0 or number in labels or not isinstance(name, str) or name in labels.values():
             raise AnnotationError(
@@ -88,7 +73,7 @@ def _labels(tree: Mapping[str, Any], path: Path) -> dict[int, str]:
 
 def _pictures(tree: Mapping[str, Any], path: Path) -> dict[int, Picture]:
     pictures: dict[int, Picture] = {}
-    for place, row in enumerate(_rows(tree, "images", path)):
+    for place, row in enumerate(coco_rows(tree, "images", path)):
         where = f"{path}: images.{place}"
         number, name, t_ns = _key(row.get("id")), row.get("file_name"), row.get("t_ns")
         if number < 0 or number in pictures or not isinstance(name, str):

@@ -109,17 +109,17 @@ def read_training_coco(path: Path, folder: Path, classes: Sequence[str]) -> Labe
         AnnotationError: The file is not a COCO file, or the folder does not exist.
         SchemaError: All pictures are missing, or no annotation is of the selected classes.
     """
-    tree = _tree(path)
+    tree = coco_tree(path)
     if not folder.is_dir():
         raise AnnotationError(
             f"{folder}: not a folder; expected the folder with the images of {path.name}"
         )
     left_out: Counter[str] = Counter()
-    names = {row["id"]: row["name"] for row in _rows(tree, "categories", path) if "id" in row}
+    names = {row["id"]: row["name"] for row in coco_rows(tree, "categories", path) if "id" in row}
     if not set(classes) & set(names.values()):
         has = ", ".join(sorted(str(name) for name in names.values())[:20])
         raise SchemaError(f"{path}: no class of {', '.join(classes)}; it has: {has or 'none'}")
-    pictures = _pictures(_rows(tree, "images", path), folder, left_out)
+    pictures = _pictures(coco_rows(tree, "images", path), folder, left_out)
     if not pictures:
         raise SchemaError(
             f"{path}: none of its pictures is in {folder}; name the folder of its images"
@@ -127,7 +127,7 @@ def read_training_coco(path: Path, folder: Path, classes: Sequence[str]) -> Labe
     numbers = {name: i for i, name in enumerate(classes)}
     objects: dict[Any, list[TrainingObject]] = {key: [] for key in pictures}
     decoys: dict[Any, list[Box]] = {key: [] for key in pictures}
-    for row in _rows(tree, "annotations", path):
+    for row in coco_rows(tree, "annotations", path):
         found = _labelled(row, pictures, names, numbers, left_out)
         if isinstance(found, TrainingObject):
             objects[row["image_id"]].append(found)
@@ -147,11 +147,16 @@ def _why(left_out: Counter[str]) -> str:
     return f"; left out: {reported}" if reported else ""
 
 
-def _tree(path: Path) -> Mapping[str, Any]:
+def coco_tree(path: Path, max_bytes: int = MAX_BYTES) -> Mapping[str, Any]:
+    """Read the tree of a COCO file.
+
+    Raises:
+        AnnotationError: The file does not exist, is too large, or has another content.
+    """
     try:
-        content = read_at_most(path, MAX_BYTES)
+        content = read_at_most(path, max_bytes)
         if content is None:
-            raise AnnotationError(f"{path}: more than {MAX_BYTES:,} bytes of annotations; split it")
+            raise AnnotationError(f"{path}: more than {max_bytes:,} bytes of annotations; split it")
         tree = json_tree(content)
     except OSError as error:
         raise AnnotationError(f"{path}: {error.strerror}; expected a COCO file") from None
@@ -162,7 +167,12 @@ def _tree(path: Path) -> Mapping[str, Any]:
     return tree
 
 
-def _rows(tree: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
+def coco_rows(tree: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a list of a COCO file.
+
+    Raises:
+        AnnotationError: It is not a list of objects.
+    """
     rows = tree.get(key)
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise AnnotationError(f"{path}: {key}: expected a list of objects, as COCO files have")

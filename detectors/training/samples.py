@@ -142,7 +142,7 @@ class Sampler:
         if rng.random() < self._window.mirror:
             warp[0] = -warp[0]
             warp[0, 2] += self._window.width_px
-        pixels = recoloured(_warped(read_bgr(picture), warp, self._window), rng)
+        pixels = recoloured(_warped(read_bgr(picture), warp, self._window, 114), rng)
         return _sample(pixels, picture, warp, self._window)
 
 
@@ -174,7 +174,7 @@ def _corner(
     return np.asarray(np.clip(corner, low, high))
 
 
-def _warped(pixels: Bytes, warp: Floats, window: SampleSettings) -> Bytes:
+def _warped(pixels: Bytes, warp: Floats, window: SampleSettings, border: int) -> Bytes:
     import cv2
 
     return np.asarray(
@@ -184,7 +184,7 @@ def _warped(pixels: Bytes, warp: Floats, window: SampleSettings) -> Bytes:
             (window.width_px, window.height_px),
             flags=cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
-            borderValue=(114, 114, 114),
+            borderValue=(border, border, border),
         ),
         np.uint8,
     )
@@ -228,7 +228,8 @@ def _sample(
         if one.is_crowd or not _may_be_inside(one, warp, window):
             continue
         whole = mask_of(one, picture.size_px)
-        mask = _warped_mask(whole, warp, window)
+        grey = _warped(whole.astype(np.uint8) * 255, warp, window, 0)
+        mask = np.asarray(grey >= 128, np.uint8)
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
         if not len(rows):
             continue
@@ -262,15 +263,3 @@ def _may_be_inside(one: TrainingObject, warp: Floats, window: SampleSettings) ->
     return bool(
         across[1] > 0 and across[0] < window.width_px and down[1] > 0 and down[0] < window.height_px
     )
-
-
-def _warped_mask(mask: NDArray[np.bool_], warp: Floats, window: SampleSettings) -> Bytes:
-    import cv2
-
-    grey = cv2.warpAffine(
-        mask.astype(np.uint8) * 255,
-        _to_middles(warp),
-        (window.width_px, window.height_px),
-        flags=cv2.INTER_LINEAR,
-    )
-    return np.asarray(np.asarray(grey) >= 128, np.uint8)

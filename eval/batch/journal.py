@@ -61,11 +61,6 @@ def error_of(run: Path) -> str | None:
     return error if isinstance(error, str) else None
 
 
-def has_journal(folder: Path) -> bool:
-    """Return whether a batch of drives has written to this folder of runs."""
-    return (folder / JOURNAL).is_dir()
-
-
 def names_in(folder: Path) -> set[str]:
     """Return the names of the drives that have an entry or are planned in a folder of runs."""
     journal = folder / JOURNAL
@@ -201,7 +196,7 @@ def drives_of_folder(folder: Path) -> tuple[DriveStatus, ...]:
             f"{folder}: no such folder; expected the one that replay writes to"
         )
     complete = {path.parent.name for path in folder.glob(f"*/{MANIFEST}")} - {MERGED}
-    if not (complete or has_journal(folder)):
+    if not (complete or (folder / JOURNAL).is_dir()):
         raise UnreadableRunError(
             f"{folder}: no batch of drives; expected the folder that replay writes many drives to"
         )

@@ -125,7 +125,7 @@ class Demo(Result):
         """Yield what was found, the scores and the summary of the replay."""
         whose = "our annotations" if self.drive.attribution else "the truth of the simulation"
         yield f"against {whose}:"
-        for sentence in judged_sentences(self.scored.scored.one):
+        for sentence in judged_sentences(self.scored.one):
             yield wrapped(sentence, min(terminal_width(), 80), lead="")
         yield ""
         yield repr(self.scored)

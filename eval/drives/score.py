@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,27 +32,10 @@ from crosscue.eval.scoring.runs import (
 from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.processes import in_processes
-from crosscue.results import Result
+from crosscue.results import HIDDEN, Result
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-
-@dataclass(frozen=True, slots=True)
-class Scored:
-    """A scored run, whose files are written.
-
-    Attributes:
-        one: The run, compared with its truth.
-        metrics: Contents of its ``metrics.json``.
-        report: Its page.
-        smoothed: Comparison of smoothers with the filters, if requested.
-    """
-
-    one: RunScored
-    metrics: dict[str, Any]
-    report: Path
-    smoothed: SmootherScore | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +77,7 @@ class ScoreWork:
     has_figures: bool = True
     without_images: bool = False
 
-    def __call__(self, path: Path) -> Scored:
+    def __call__(self, path: Path) -> ScoredRun:
         """Score one run and write its files.
 
         Raises:
@@ -114,9 +97,9 @@ class ScoreWork:
                 folder.file(FOLDER), [one], scores, metrics, has_figures=self.has_figures
             )
             remember_truth(folder, truth_path, any_log=self.any_log)
-        return Scored(one, metrics, report, smoothed)
+        return ScoredRun(one, metrics, report, smoothed)
 
-    def attempt(self, path: Path) -> Scored | Failed:
+    def attempt(self, path: Path) -> ScoredRun | Failed:
         """Score one run; return a ``CrosscueError`` as a result."""
         try:
             return self(path)
@@ -174,19 +157,21 @@ class ScoredRun(Result):
     """Scores of a run; its text is the output of ``crosscue score``.
 
     Attributes:
-        scored: The run, compared with its truth.
-        metrics: Every metric by name, as in ``metrics.json``.
+        one: The run, compared with its truth.
+        metrics: Contents of its ``metrics.json``.
         report: Page with the scores.
+        smoothed: Comparison of smoothers with the filters, if requested.
     """
 
-    scored: Scored
-    metrics: Mapping[str, Any]
+    one: RunScored = field(metadata=HIDDEN)
+    metrics: dict[str, Any]
     report: Path
+    smoothed: SmootherScore | None = None
 
     @property
     def headline(self) -> str:
         """Folder and most important numbers, in one line."""
-        return headline(str(self.scored.one.run.path), metric_values(self.metrics))
+        return headline(str(self.one.run.path), metric_values(self.metrics))
 
     @property
     def cues(self) -> pa.Table:
@@ -194,7 +179,7 @@ class ScoredRun(Result):
         import pyarrow as pa
 
         rows = []
-        for name, cue in pooled_scores([self.scored.one]).cues.items():
+        for name, cue in pooled_scores([self.one]).cues.items():
             row: dict[str, object] = {"cue": name}
             for what, fraction in (("precision", cue.precision), ("recall", cue.recall)):
                 row |= {
@@ -209,7 +194,7 @@ class ScoredRun(Result):
     @property
     def curves(self) -> pa.Table:
         """Probability of each feature and true distance, one row per step."""
-        return curve_table([self.scored.one.judged])
+        return curve_table([self.one.judged])
 
     @property
     def true_track(self) -> pa.Table:
@@ -220,17 +205,16 @@ class ScoredRun(Result):
         """
         import pyarrow as pa
 
-        _, track = load_truth(self.scored.one.truth_path)
+        _, track = load_truth(self.one.truth_path)
         columns = {f"{axis}_m": track.xyz_m[:, i] for i, axis in enumerate("xyz")}
         return pa.table({"t_ns": track.t_ns, **columns})
 
     def lines(self) -> Iterator[str]:
         """Yield the scores of cues, approaches and ranges, and of the pose."""
-        one = self.scored.one
-        yield scores_text(pooled_scores([one]), one.why_no_pose)
-        if one.pose is not None:
+        yield scores_text(pooled_scores([self.one]), self.one.why_no_pose)
+        if self.one.pose is not None:
             yield ""
-            yield pose_summary(one.pose)
+            yield pose_summary(self.one.pose)
 
 
 def score_run(
@@ -270,12 +254,11 @@ def score_run(
         limits=of.folder.limits,
         has_figures=has_figures,
     )
-    scored = work(of.path)
-    return ScoredRun(scored, scored.metrics, scored.report)
+    return work(of.path)
 
 
 def score_each(
     paths: Sequence[Path], work: ScoreWork, workers: int = 1
-) -> Iterator[Scored | Failed]:
+) -> Iterator[ScoredRun | Failed]:
     """Score runs and yield the results in order, with ``workers`` processes."""
     return in_processes(work.attempt, paths, workers)

@@ -119,7 +119,7 @@ class ScoredRuns(Result):
     @property
     def metrics_by_run(self) -> dict[str, Mapping[str, Any]]:
         """Metrics of each run, by its folder."""
-        return {str(one.scored.one.run.path): one.metrics for one in self.runs}
+        return {str(one.one.run.path): one.metrics for one in self.runs}
 
     def lines(self) -> Iterator[str]:
         """Yield what was found, then the scores."""
@@ -127,7 +127,7 @@ class ScoredRuns(Result):
 
     def brief(self) -> str:
         """Return the text without ``--verbose``: all of it with attribution or smoother."""
-        has_more = bool(self.attribution) or any(one.scored.smoothed for one in self.runs)
+        has_more = bool(self.attribution) or any(one.smoothed for one in self.runs)
         return repr(self) if has_more else Result.brief(self)
 
     def closing(self) -> Iterator[str]:
@@ -140,15 +140,15 @@ class ScoredRuns(Result):
 
 def _lines_of_one(found: ScoredRuns) -> list[str]:
     (run,) = found.runs
-    one = run.scored.one
+    one = run.one
     lines = [f"run        {visible(str(one.run.path))}"]
     lines += [reported_line("", visible(sentence)) for sentence in judged_sentences(one)]
     lines += [] if found.is_whole else _account(found)
     lines += ["", *_scores(found, one.why_no_pose)]
     if one.pose is not None:
         lines += ["", pose_summary(one.pose)]
-    if run.scored.smoothed is not None:
-        lines.append(smoother_text(run.scored.smoothed))
+    if run.smoothed is not None:
+        lines.append(smoother_text(run.smoothed))
     notices = one.run.drive_manifest().notices
     notes = [reported_line("note", visible(text)) for text in notices]
     return [*lines, "", *(_account(found) if found.is_whole else []), *notes]
@@ -186,7 +186,7 @@ def _scores(found: ScoredRuns, why_no_pose: str) -> list[str]:
 
 
 def _ones(found: ScoredRuns) -> list[RunScored]:
-    return [run.scored.one for run in found.runs]
+    return [run.one for run in found.runs]
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,7 +312,7 @@ def _scored(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> Scor
             if is_many:
                 emit(CrosscueError(f"{one_line(one.error)}; this run is left out"))
         else:
-            scored.append(ScoredRun(one, one.metrics, one.report))
+            scored.append(one)
             if is_many:
                 emit(scored[-1].headline)
         emit(Progress("scoring", len(scored) + len(failed), len(paths), "runs"))
@@ -330,7 +330,7 @@ def _scored(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> Scor
     tree = found.metrics
     results = check_gates(bounds, metric_values(tree), tree["coverage"]["not_scored"])
     suite = f"{len(paths)} runs" if is_many else str(paths[0])
-    place = folder or scored[0].scored.one.run.file(FOLDER)
+    place = folder or scored[0].one.run.file(FOLDER)
     write_junit(place / "junit.xml", results, suite)
     return replace(found, gates=results)
 
@@ -345,7 +345,7 @@ def _one(
 ) -> ScoredRuns:
     """Return the scores of one run, with the attribution added to its files."""
     (run,) = runs
-    one, metrics, report = run.scored.one, run.scored.metrics, run.report
+    one, metrics, report = run.one, run.metrics, run.report
     scores = pooled_scores([one], settings)
     worth = _attribution([one], metrics, settings) if has_attribution else {}
     if worth:
@@ -365,7 +365,7 @@ def _pool(
     has_figures: bool,
 ) -> ScoredRuns:
     """Return the scores of all runs together, written to ``output`` if it is not None."""
-    ones = [run.scored.one for run in runs]
+    ones = [run.one for run in runs]
     scores = pooled_scores(ones, settings)
     tree = metrics_of(ones, scores)
     tree["coverage"]["failed"] = {str(path): str(error) for path, error in failed.items()}

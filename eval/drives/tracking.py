@@ -2,38 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from crosscue.eval.report.mlflow_sink import Experiment, Tracked, open_experiment
 from crosscue.eval.runs.tags import read_tags
 from crosscue.eval.scoring.metric_values import metric_values
 
-
-class Scores(Protocol):
-    """Result of ``score_runs``."""
-
-    @property
-    def runs(self) -> Sequence[Any]:
-        """The scored runs."""
-        ...
-
-    @property
-    def metrics(self) -> Mapping[str, Any]:
-        """Metrics of all runs together."""
-        ...
-
-    @property
-    def report(self) -> Path | None:
-        """Page of all runs together."""
-        ...
-
-    @property
-    def is_many(self) -> bool:
-        """True if several runs were to be scored."""
-        ...
+if TYPE_CHECKING:
+    from .score_runs import ScoredRuns
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +21,7 @@ class MlflowSink:
 
     experiment: Experiment
 
-    def log(self, found: Scores) -> tuple[str, ...]:
+    def log(self, found: ScoredRuns) -> tuple[str, ...]:
         """Log each scored run as a run of the experiment, and one more for all together.
 
         Scores become metrics. The run's tags, its drive's identity and crosscue's version become
@@ -53,7 +32,7 @@ class MlflowSink:
         """
         runs = []
         for scored in found.runs:
-            one = scored.scored.one
+            one = scored.one
             manifest = one.run.drive_manifest()
             tags = {
                 "crosscue.run": str(one.run.path),

@@ -14,7 +14,7 @@ from crosscue.eval.failures.site import MARKER, RunWork, by_run, site_entries, w
 from crosscue.eval.pipeline.run import moved_to, open_run
 from crosscue.eval.recording.view import save_recording
 from crosscue.eval.runs import owned
-from crosscue.replay.errors import CrosscueError, EmptyResultError, OutputError, UsageError
+from crosscue.replay.errors import CrosscueError, EmptyResultError, UsageError
 from crosscue.replay.files.whole_file import cannot_write
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.processes import in_processes
@@ -123,7 +123,7 @@ def browse(
         OutputError: The folder is not empty, or cannot be written.
     """
     folder, has_recordings = Path(output), settings.has_recordings
-    _check_place(folder, settings.overwrite)
+    owned.check_place(folder, MARKER, overwrite=settings.overwrite)
     moved = moved_to(settings.logs)
     chosen, found = _given(runs, settings)
     if not chosen:
@@ -156,19 +156,6 @@ def browse(
     return Site(
         folder / "index.html", len(entries), len(pictures), bare, tuple(sorted(set(reasons))), found
     )
-
-
-def _check_place(folder: Path, overwrite: bool) -> None:
-    try:
-        there = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
-    except OSError as error:
-        raise cannot_write(folder, error) from None
-    if there and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file; give another folder")
-    if there and not overwrite:
-        raise OutputError(f"{folder}: holds files already; give another folder or --overwrite")
-    if there:
-        owned.refuse_others(folder, owned.of_list(folder / MARKER))
 
 
 def _given(

@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.eval.report.html import style_of
 from crosscue.eval.report.svg_plot import Panel, SvgChart
+from crosscue.eval.runs.tables.log_time import LABELS
+from crosscue.replay.vehicle.fusion import NOT_FEATURES
 
 from .record import Failure
 
@@ -21,12 +24,8 @@ AROUND_S: Final = 6.0
 WIDTH: Final = 560.0
 LANES: Final = 8
 THRESHOLD: Final = 0.9
-STYLES: Final = {"intersection": "s0", "left": "s1", "right": "s2", "straight": "s3"}
 # Max gap that a line is drawn across, seconds.
 BREAK_S: Final = 1.0
-NOT_FEATURES: Final = frozenset(
-    {"t_ns", "approach", "established", "not_believed", "segment", "log_t_ns"}
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,15 +61,15 @@ def belief_around(rows: ChartTables, failure: Failure) -> Markup | None:
     drawing.rect(left, panel.top, max(right - left, 1.0), panel.height, "span")
     drawing.axes(panel, "seconds from the failure", "", y_ticks=[0.0, 0.5, 1.0])
     drawing.rule(panel.left, panel.y(THRESHOLD), panel.right, panel.y(THRESHOLD), "line dash")
-    names = [name for name in rows.belief.column_names if name not in NOT_FEATURES]
+    names = [name for name in rows.belief.column_names if name not in (*NOT_FEATURES, *LABELS)]
     breaks = np.flatnonzero(np.diff(t_s[near]) > BREAK_S) + 1
     times = np.insert(t_s[near], breaks, np.nan)
     for name in names:
         values = rows.belief[name].to_numpy(zero_copy_only=False).astype(np.float64)[near]
-        style = f"line {STYLES.get(name, 's4')}{' thick' if name == failure.what else ''}"
+        style = f"line {style_of(name)}{' thick' if name == failure.what else ''}"
         drawing.curve(panel, times, np.insert(values, breaks, np.nan), style)
     drawing.rule(panel.x(0.0), panel.top, panel.x(0.0), panel.bottom, "line now")
-    drawing.legend(10, 14, [(f"line {STYLES.get(name, 's4')}", name) for name in names])
+    drawing.legend(10, 14, [(f"line {style_of(name)}", name) for name in names])
     for lane, (name, found_s) in enumerate(lanes):
         y = panel.bottom + 46 + 15.0 * lane
         drawing.text(panel.left - 6, y, name.replace("_", " "), anchor="end")

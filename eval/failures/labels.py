@@ -110,7 +110,7 @@ def export(
     chosen = read_failures(Path(failures)) if isinstance(failures, Path | str) else failures
     where = str(failures) if given else "failures"
     folder, kind = Path(output), LABEL_FORMATS[to]
-    _check_place(folder, overwrite)
+    owned.check_place(folder, INDEX, overwrite=overwrite)
     moved = moved_to(logs)
     made = folder.with_name(f".{folder.name}.partial")
     by_run: dict[str, set[int]] = {}
@@ -153,16 +153,6 @@ def export(
     return ExportedLabels(
         folder / file.name, to, len(found.pictures), boxes, found.labels, left_out, failed
     )
-
-
-def _check_place(folder: Path, overwrite: bool) -> None:
-    there = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
-    if there and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file; give another folder")
-    if there and not overwrite:
-        raise OutputError(f"{folder}: holds files already; give another folder or --overwrite")
-    if there:
-        owned.refuse_others(folder, owned.of_list(folder / INDEX))
 
 
 def _together(where: str, runs: Sequence[ExportedRun]) -> Annotations:

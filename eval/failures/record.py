@@ -96,6 +96,15 @@ class About:
     start_ns: int
     end_ns: int
 
+    @property
+    def shared(self) -> dict[str, Any]:
+        """The attributes of every failure of the approach."""
+        return {
+            "approach": self.approach,
+            "intersection": self.intersection,
+            "conditions": self.conditions,
+        }
+
 
 def distance_bin(distance_m: float | None) -> str:
     """Return the name of the bin of a distance."""
@@ -111,26 +120,18 @@ def failure_schema() -> pa.Schema:
     """Return the schema of a table of failures."""
     import pyarrow as pa
 
-    return pa.schema(
-        [
-            pa.field("run", pa.string(), nullable=False),
-            pa.field("kind", pa.string(), nullable=False),
-            pa.field("level", pa.string(), nullable=False),
-            pa.field("what", pa.string(), nullable=False),
-            pa.field("cause", pa.string(), nullable=False),
-            pa.field("reported", pa.string(), nullable=False),
-            pa.field("t_ns", pa.int64(), nullable=False),
-            pa.field("at_s", pa.float64(), nullable=False),
-            pa.field("start_ns", pa.int64(), nullable=False),
-            pa.field("end_ns", pa.int64(), nullable=False),
-            pa.field("frames", pa.int64(), nullable=False),
-            pa.field("approach", pa.int64()),
-            pa.field("intersection", pa.string(), nullable=False),
-            pa.field("conditions", pa.list_(pa.string()), nullable=False),
-            pa.field("distance_m", pa.float64()),
-            pa.field("severity", pa.float64(), nullable=False),
-        ]
-    )
+    types = {
+        "str": pa.string(),
+        "int": pa.int64(),
+        "float": pa.float64(),
+        "tuple[str, ...]": pa.list_(pa.string()),
+    }
+    columns = []
+    for one in fields(Failure):
+        name = str(one.type).removesuffix(" | None")
+        kind = types.get(name, pa.string())
+        columns.append(pa.field(one.name, kind, nullable=name != str(one.type)))
+    return pa.schema(columns)
 
 
 def failure_table(failures: Sequence[Failure]) -> pa.Table:

@@ -10,7 +10,7 @@ from crosscue.eval.catalog import compare, many_runs
 from crosscue.eval.catalog.query.catalog import catalog
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.report.junit import cases_text
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.remote.address import is_remote
 from crosscue.verb import Option
@@ -21,6 +21,7 @@ def compare_runs(
     second: Run | Path | str,
     tolerances: Sequence[str] = (),
     junit: Path | str | None = None,
+    output: Path | str | None = None,
 ) -> compare.Comparison:
     """Compare the settings, tables and metrics of two runs.
 
@@ -29,6 +30,7 @@ def compare_runs(
         second: The run to judge.
         tolerances: Allowed deterioration of metrics: ``0.01``, ``2%`` or ``PATTERN=0.01``.
         junit: JUnit file to write, with a test case per judged metric that fails if it is worse.
+        output: Page to write, with pictures of the largest differences.
 
     Raises:
         UsageError: A tolerance is not valid, or a run is a URL.
@@ -40,7 +42,8 @@ def compare_runs(
             raise UsageError(f"{one}: a run on a store; use --runs and --against, or copy it")
     paths = [one.path if isinstance(one, Run) else Path(one) for one in (first, second)]
     before, after = (compare.open_scored(path) for path in paths)
-    return _reported(compare.compare_runs(before, after, allowed), junit)
+    found = compare.compare_runs(before, after, allowed)
+    return _reported(found, junit, output, paths[:1], paths[1:])
 
 
 def compare_many(
@@ -49,6 +52,7 @@ def compare_many(
     folder: Path | str | None = None,
     tolerances: Sequence[str] = (),
     junit: Path | str | None = None,
+    output: Path | str | None = None,
 ) -> compare.Comparison:
     """Compare many runs with others of the same drives: better, worse or undecided.
 
@@ -61,12 +65,14 @@ def compare_many(
         folder: Folder of all runs, or its URL, to which the queries apply.
         tolerances: As in ``compare_runs``.
         junit: As in ``compare_runs``.
+        output: As in ``compare_runs``.
 
     Raises:
         UsageError: A query is not valid or has no ``folder``, or a side has two runs of one drive.
         RunError: A side has no scored run.
     """
     allowed = [compare.read_tolerance(text) for text in tolerances]
+    here: tuple[tuple[Path, ...], tuple[Path, ...]] = ((), ())
     if folder is not None and is_remote(folder):
         # Runs on a store have no folders, so their metrics are read from their catalog.
         found = catalog(folder)
@@ -77,7 +83,7 @@ def compare_many(
     else:
         here = (_selected(against, folder), _selected(runs, folder))
         judged = many_runs.compare_many(*here, allowed)
-    return _reported(judged, junit)
+    return _reported(judged, junit, output, *here)
 
 
 def compare_command(
@@ -88,6 +94,8 @@ def compare_command(
     against: Annotated[str | None, Option(metavar="QUERY")] = None,
     tolerance: Annotated[Sequence[str], Option(metavar="T")] = (),
     junit: Path | None = None,
+    output: Annotated[Path | None, Option(metavar="HTML")] = None,
+    overwrite: bool = False,
 ) -> compare.Comparison:
     """Compare two runs, with tolerances.
 
@@ -110,7 +118,7 @@ def compare_command(
     crosscue score -o wrote for several runs can be compared as well.
 
     Examples:
-        crosscue compare runs/before runs/after
+        crosscue compare runs/before runs/after -o compare.html
         crosscue compare runs/before runs/after --tolerance 1% 'cues.*.precision=0.02'
         crosscue compare runs --runs "tags['model'] = 'new'" --against "tags['model'] = 'old'"
 
@@ -121,19 +129,34 @@ def compare_command(
         against: Selects the runs to compare them with.
         tolerance: Allowed deterioration of metrics: 0.01, 2% or PATTERN=0.01.
         junit: Write a JUnit file with a test case per judged metric.
+        output: Write a page, with pictures of the largest differences.
+        overwrite: Replace an existing page.
     """
+    if output is not None and output.exists() and not overwrite:
+        raise OutputError(f"{output}: exists; give another name or --overwrite")
     if runs is None and against is None:
         if second is None:
             raise UsageError("compare: expected two runs, or --runs and --against")
-        return compare_runs(first, second, tolerance, junit)
+        return compare_runs(first, second, tolerance, junit, output)
     if runs is None or against is None or second is not None:
         raise UsageError("compare: expected one folder with both --runs and --against")
-    return compare_many(runs, against, first, tolerance, junit)
+    return compare_many(runs, against, first, tolerance, junit, output)
 
 
-def _reported(found: compare.Comparison, junit: Path | str | None) -> compare.Comparison:
+def _reported(
+    found: compare.Comparison,
+    junit: Path | str | None,
+    output: Path | str | None,
+    before: Sequence[Path],
+    after: Sequence[Path],
+) -> compare.Comparison:
+    """Write the files that were asked for."""
     if junit is not None:
         write_text(Path(junit), cases_text(found.cases(), "compare", "comparison"))
+    if output is not None:
+        from .compare_page import write_compare_page
+
+        write_compare_page(Path(output), found, before, after)
     return found
 
 

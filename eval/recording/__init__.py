@@ -72,7 +72,7 @@ def save_rrd(
     camera = run_camera(run) if part.shows("cameras") else None
     has_scene = any(part is not None for part in (scene.cues, scene.ranges, scene.belief))
     topic = None if camera is None else camera.topic.name
-    shown = ViewData(topic, pose, known[0] is not None, has_scene, longest_m(scene), part)
+    shown = ViewData(topic, pose, has_scene, longest_m(scene), part)
     layout = blueprint(shown)
     first_ns = int(scene.frames_ns[0]) if len(scene.frames_ns) else 0
     time = time_of(first_ns if pose is None else int(pose["t_ns"][0]))

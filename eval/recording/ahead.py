@@ -26,6 +26,8 @@ from .layout import ASIDE_M, BEHIND_M, FAR_M
 from .scene_rows import SceneRows
 
 HALF_ROAD_M: Final = 9.0
+# Distance of the labels of metres from the edge, so that they are not cut off.
+LABEL_M: Final = 5.0
 LANE_POINTS: Final = 13
 FRAMES_HELD: Final = 1024
 KINDS: Final[Mapping[int, str]] = {0: "car", 1: "truck", 2: "bike", 3: "person", 4: "bicycle"}
@@ -59,7 +61,7 @@ def _log_ground(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
     tens = np.arange(0.0, FAR_M + 1.0, 10.0)
     lines = [above(np.array([x, x]), np.array([-ASIDE_M, ASIDE_M])) for x in tens]
     recording.log("ahead/grid", rr.LineStrips2D(lines, colors=[FAINT], radii=[0.08]), static=True)
-    marks = above(tens, np.full(len(tens), ASIDE_M - 2.5))
+    marks = above(tens, np.full(len(tens), ASIDE_M - LABEL_M))
     recording.log(
         "ahead/metres",
         rr.Points2D(

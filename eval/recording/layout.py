@@ -31,7 +31,6 @@ class ViewData:
     Attributes:
         camera: Topic of the camera, or None.
         pose: Columns of the pose, or None.
-        has_truth: True if the true track is drawn.
         has_scene: True if there are ranges, beliefs or cues.
         longest_m: The largest range, including its band.
         part: The time span and the views recorded.
@@ -39,7 +38,6 @@ class ViewData:
 
     camera: str | None
     pose: Mapping[str, NDArray[np.float64]] | None
-    has_truth: bool
     has_scene: bool
     longest_m: float = FAR_M
     part: RecordingSpan = WHOLE
@@ -108,7 +106,7 @@ def _cues() -> rrb.View:
 def _ahead() -> rrb.View:
     return rrb.Spatial2DView(
         origin="ahead",
-        name="Ahead of the vehicle (m)",
+        name="Ahead (m)",
         visual_bounds=rrb.VisualBounds2D(x_range=[-ASIDE_M, ASIDE_M], y_range=[-FAR_M, BEHIND_M]),
     )
 
@@ -126,7 +124,7 @@ def _belief() -> rrb.View:
 def _ranges(longest_m: float) -> rrb.View:
     return rrb.TimeSeriesView(
         origin="/".join(RANGE),
-        name="Range (m): start red, end yellow, 2-sigma bands thin, truth green",
+        name="Range (m)",
         axis_x=rrb.TimeAxis(view_range=_whole()),
         # A legend of eight lines would cover the curves.
         axis_y=rrb.ScalarAxis(range=(0.0, longest_m)),
@@ -187,7 +185,7 @@ def _whole() -> rrb.TimeRange:
 def _plan(shown: ViewData, pose: Mapping[str, NDArray[np.float64]]) -> rrb.View:
     return rrb.Spatial3DView(
         origin="plan",
-        name="Map, truth in green" if shown.has_truth else "Map",
+        name="Map",
         line_grid=rrb.LineGrid3D(visible=True),
         eye_controls=_from_above(pose),
     )

@@ -38,8 +38,9 @@ PARKED: Final = (190, 130, 255)
 HATCH_ROWS: Final = 4
 # Length of an arrow as a multiple of the step from one frame to the next.
 ARROW_STEPS: Final = 4.0
-# Min width of an object with a permanent label, as a fraction of the picture's width.
-LABELLED: Final = 0.03
+# Min width of an object with a permanent label, as a fraction of the picture's width; labels of
+# smaller ones would cover each other, and appear under the pointer.
+LABELLED: Final = 0.1
 SIDES: Final = ("left", "straight", "right")
 
 
@@ -99,7 +100,7 @@ class Overlays:
     def _objects(self, found: Detections) -> None:
         for box, text, row in _report_text(found):
             colour = self._colour(found, row)
-            is_far = box[2] - box[0] < LABELLED * found.size_px[0]
+            is_far = colour == QUIET or box[2] - box[0] < LABELLED * found.size_px[0]
             (self.far if is_far else self.objects).add(box, colour, text)
             for line in rle.outline(found.masks[row], found.size_px, box):
                 self.outlines.add(line, colour)
@@ -189,7 +190,9 @@ def log_styles(recording: rr.RecordingStream) -> None:
     for entity, width in (("outlines", 1.5), ("road", 0.6), ("regions", 1.2)):
         style = rr.LineStrips2D.from_fields(radii=[_points(width)])
         recording.log(f"camera/{entity}", style, static=True)
-    recording.log("camera/cars", rr.Arrows2D.from_fields(radii=[_points(2.5)]), static=True)
+    recording.log(
+        "camera/cars", rr.Arrows2D.from_fields(radii=[_points(2.5)], show_labels=False), static=True
+    )
 
 
 def _points(width: float) -> float:

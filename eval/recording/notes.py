@@ -21,6 +21,8 @@ COLOURS: Final = (
     "ego vehicle's own motion removed",
     "- ahead of the vehicle: red bar the start, yellow bar the end of the intersection with its "
     "2-sigma band; white lines are the Mobileye's",
+    "- range: red to the start, yellow to the end, thin the 2-sigma bands; s.d. is that of the "
+    "heading, the ellipse its full major axis",
 )
 
 

@@ -29,10 +29,10 @@ FOUND: Final = "found"
 ONE_FRAME_NS: Final = 100_000_000
 # Plots of the pose and their titles.
 POSE: Final[Mapping[str, str]] = {
-    "speed": "Speed (m/s)",
-    "heading": "Heading (deg)",
-    "heading_sd": "Heading s.d. (deg)",
-    "ellipse": "2-sigma ellipse, full major axis (m)",
+    "speed": "Speed m/s",
+    "heading": "Heading deg",
+    "heading_sd": "s.d. deg",
+    "ellipse": "Ellipse m",
 }
 NOT_IN_BELIEF: Final = (*NOT_FEATURES, *LABELS)
 
@@ -124,7 +124,8 @@ def log_cues(recording: rr.RecordingStream, time: DriveTime, scene: SceneRows) -
         counts = rows["count"].to_numpy()[first]
         at, is_found = _changes(t_ns, counts > 0, scene.frames_ns, scene.gaps_ns)
         entity = [*CUES, cue]
-        style = rr.StateConfiguration(values=[FOUND], labels=[FOUND], colors=[of_cue(cue)])
+        # No text: the viewer cuts it off in a short bar, and the view's title says it.
+        style = rr.StateConfiguration(values=[FOUND], labels=[" "], colors=[of_cue(cue)])
         recording.log(rr.new_entity_path([*entity]), style, static=True)
         recording.send_columns(
             rr.new_entity_path([*entity]),

@@ -11,10 +11,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final, TypeAlias
 
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree, strict_json
-from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.files.whole_file import cannot_write, write_text
 from crosscue.replay.safe_text import visible
 
 MAX_LIST_BYTES: Final = 256 << 20
@@ -54,6 +54,25 @@ def replace_folder(made: Path, folder: Path, is_ours: IsOurs) -> None:
         remove(folder, is_ours)
         folder.rmdir()
     made.rename(folder)
+
+
+def check_place(folder: Path, marker: str, *, overwrite: bool) -> None:
+    """Refuse an output folder that holds anything, or, to be overwritten, what is not ours.
+
+    Raises:
+        OutputError: The folder is a file, or holds files and may not be overwritten.
+        UsageError: It holds files that its marker does not list.
+    """
+    try:
+        there = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+    except OSError as error:
+        raise cannot_write(folder, error) from None
+    if there and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file; give another folder")
+    if there and not overwrite:
+        raise OutputError(f"{folder}: holds files already; give another folder or --overwrite")
+    if there:
+        refuse_others(folder, of_list(folder / marker))
 
 
 def files_in(folder: Path) -> Iterator[str]:

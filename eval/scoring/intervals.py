@@ -15,9 +15,10 @@ effective number of rows (Korn, Graubard, *Survey Methodology* 24, 1998), which 
 has fewer degrees of freedom, by the clusters' kurtosis (Satterthwaite, *Biometrics Bulletin* 2,
 1946).
 
-From twelve clusters on, intervals of fractions cover 93 to 97 % (``benchmarks/interval_coverage``).
-With four to six, it depends on the correlation within clusters, which they hardly show: 98 to 99 %
-at 0.05, 90 to 96 % at 0.6 (fractions of 0.5 and 0.8). A smaller quantile would lower both.
+From twelve clusters on, intervals of fractions cover 93 to 97 % for correlations within clusters of
+up to 0.4, and at most 98 % beyond (``benchmarks/interval_coverage``). With four to six, coverage
+depends on the correlation, which so few hardly show: 96 to 99 % at 0.05, 90 to 95 % at 0.6
+(fractions of 0.5 and 0.8). A smaller quantile would lower both.
 """
 
 from __future__ import annotations

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 from crosscue.datasets.scenes.scene_truth import DriveAnnotations
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
-from crosscue.datasets.scenes.single_frames import frames, merge_annotations
+from crosscue.datasets.scenes.single_frames import merge_annotations, render_frames
 from crosscue.datasets.simulated.log_files import SOURCE
 from crosscue.eval.training.inputs import check_place, training_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
+from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
 from crosscue.results import Result
 from crosscue.verb import Option
@@ -79,7 +81,8 @@ def render_training_frames(
         raise OutputError(f"{target}: exists; give another folder")
     check_place(images / "any")
     parts: list[DriveAnnotations] = []
-    for part in frames(wanted, per_layout, images, workers):
+    render = partial(render_frames, count=per_layout, folder=images)
+    for part in in_processes(render, wanted, workers):
         parts.append(part)
         emit(Progress("rendering", len(parts), len(wanted), "runs"))
     whole = merge_annotations(parts)

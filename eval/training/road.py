@@ -10,7 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
-from crosscue.datasets.scenes.single_frames import RoadFrames, concatenate_frames, rendered
+from crosscue.datasets.scenes.single_frames import (
+    RoadFrames,
+    concatenate_frames,
+    render_road_frames,
+)
 from crosscue.eval.training.inputs import Device, check_place, layouts_of, training_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.made_of import made_of
@@ -318,7 +322,7 @@ def _rendered(names: list[str], size: Size, settings: RoadTrainingSettings) -> R
             for run in range(1, 11)
         ]
     parts: list[RoadFrames] = []
-    for part in rendered(runs, settings.per_layout, size):
-        parts.append(part)
+    for run in runs:
+        parts.append(render_road_frames(run, settings.per_layout, size))
         emit(Progress("rendering", len(parts), len(runs), "runs"))
     return concatenate_frames(parts)

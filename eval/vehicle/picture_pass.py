@@ -15,9 +15,13 @@ import numpy as np
 
 from crosscue.detectors.base import View
 from crosscue.detectors.images import decode, encoded, lose
-from crosscue.detectors.ranging.travel_direction import Travel, travel_between
 from crosscue.localization.camera_delay import PictureMotion
-from crosscue.localization.visual_odometry import VisualOdometry, VisualStep
+from crosscue.localization.visual_odometry import (
+    Travel,
+    VisualOdometry,
+    VisualStep,
+    travel_between,
+)
 from crosscue.replay.base import EVERYTHING, Log, Selection, name_of
 from crosscue.replay.columns import Bytes, Floats, Images, Int64s
 from crosscue.replay.errors import LogError

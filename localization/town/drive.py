@@ -240,7 +240,7 @@ def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Dri
         moved = move(p, vehicle, lane, wanted_mps(p, streets, route, vehicle))
         distance_m = moved.travelled_m - vehicle.travelled_m
         vehicle, reading, noise = measure_step(p, vehicle, moved, noise)
-        route = advance_turn(route, arcs, lane, distance_m)
+        route = advance_turn(route, lane, distance_m)
         belief = estimate(p, belief, reading)
         if steps < len(log.steps):
             _keep(log.steps[steps], vehicle, reading, belief)

@@ -193,7 +193,8 @@ def lane_of(
     """Position of the vehicle relative to its lane."""
     c, s = math.cos(vehicle.heading_rad), math.sin(vehicle.heading_rad)
     if route.arc < route.arcs:
-        x, y, heading, curvature, _ = _arc_at(arcs, route.arc)
+        arc_ahead = arcs[route.arc]
+        x, y, heading, curvature = arc_ahead[0], arc_ahead[1], arc_ahead[2], arc_ahead[3]
         radius = 1.0 / curvature
         out_x = vehicle.x_m - (x - radius * math.sin(heading))
         out_y = vehicle.y_m - (y + radius * math.cos(heading))
@@ -207,11 +208,7 @@ def lane_of(
     return Lane(across + p.lane_offset_m, street_c * s - street_s * c, 0.0)
 
 
-def _arc_at(arcs: NDArray[np.float64], i: int) -> tuple[float, float, float, float, float]:
-    return arcs[i, 0], arcs[i, 1], arcs[i, 2], arcs[i, 3], arcs[i, 4]
-
-
-def advance_turn(route: Route, arcs: NDArray[np.float64], lane: Lane, distance_m: float) -> Route:
+def advance_turn(route: Route, lane: Lane, distance_m: float) -> Route:
     """Advance along the arc of a turn, if the vehicle is on one."""
     if route.arc == route.arcs:
         return route

@@ -192,7 +192,7 @@ PAST_THE_DOOR: Final[dict[str, str]] = {
     "eval/check.py": NAMED,
     "eval/cli.py": PACKAGE,
     "eval/failures/record.py": NEW,
-    "eval/fit/ranges/pairs.py": HANDLE,
+    "eval/fit/ranges/fit.py": HANDLE,
     "eval/fit/vehicle_output.py": NAMED,
     "eval/fit/detector/fit.py": NAMED,
     "eval/logs/log.py": LOGS,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from crosscue.datasets.truth import truth
 from crosscue.detectors.catalog.card import read_card
-from crosscue.eval.fit.ranges.pairs import range_pairs
+from crosscue.eval.fit.ranges.fit import range_pairs
 from crosscue.eval.scoring.gates import load_gates
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.files.bounded import read_at_most

@@ -42,6 +42,7 @@ _WANTED: Final = "give a CSV or COCO file of boxes, or a drive's folder"
 
 # Boxes (x0, y0, x1, y1) in pixels by label.
 Boxes = dict[str, list[tuple[float, float, float, float]]]
+MAX_OBJECTS_BYTES: Final = 512 * MIB
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,9 +154,6 @@ def _box(row: dict[str, str], where: str) -> tuple[float, float, float, float]:
     if not all(map(math.isfinite, (x0, y0, x1, y1))) or x0 >= x1 or y0 >= y1:
         raise AnnotationError(f"{where}: box {x0}, {y0}, {x1}, {y1}: expected x0 < x1 and y0 < y1")
     return x0, y0, x1, y1
-
-
-MAX_OBJECTS_BYTES: Final = 512 * MIB
 
 
 def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[SignPicture]:

@@ -29,9 +29,8 @@ from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN
 from crosscue.verb import Option
 
-from .report import SHEET, TABLES, write_study
+from .report import SHEET, TABLES, StudyScores, write_study
 from .settings import IntersectionStudy
-from .tables import StudyScores
 
 # Settings of scores that are compared with the published distances.
 AS_PUBLISHED: Final = ScoreSettings(detection="published")

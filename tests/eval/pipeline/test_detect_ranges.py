@@ -11,7 +11,7 @@ import pytest
 from crosscue.datasets.truth.truth import Truth, save
 from crosscue.detectors.ranging.height_to_range import FAMILIES, fit_range, range_of
 from crosscue.eval.cli import run
-from crosscue.eval.fit.ranges.pairs import pairs_of_run, pairs_of_truth
+from crosscue.eval.fit.ranges.fit import pairs_of_run, pairs_of_truth
 from crosscue.replay.vehicle.vehicle import RangeCurve
 
 

@@ -82,7 +82,7 @@ def test_each_frame_has_picture_marks_and_belief_on_the_timeline(
 def test_labels_are_plain_text_and_entity_paths_are_fixed(tmp_path: Path) -> None:
     path = _saved_recording(tmp_path)
 
-    labels = _cells(path, "/camera/objects", "labels")
+    labels = _cells(path, "/camera/far_objects", "labels")
     assert labels[0][-1] == f"{LABEL} 0.50"
     assert {entity.split("/")[1] for entity in _rows(path)} == {
         "ahead",
@@ -155,3 +155,22 @@ def test_used_landmarks_are_labelled_on_the_map(tmp_path: Path) -> None:
         if chunk.entity_path == "/plan/landmarks"
     ]
     assert "wall 1" in str(found)
+
+
+def test_states_have_no_text_and_small_or_unsure_boxes_no_label(tmp_path: Path) -> None:
+    run = scene_run(tmp_path / "drive")
+    save_rrd(run, tmp_path / "run.rrd")
+
+    labels = {"/cues/stop_sign": ":labels", "/camera/cars": ":show_labels"}
+    found: dict[str, list[object]] = {}
+    for chunk in RrdReader(tmp_path / "run.rrd").stream():
+        ending = labels.get(chunk.entity_path)
+        if ending is not None and chunk.is_static:
+            batch = chunk.to_record_batch()
+            names = [name for name in batch.schema.names if name.endswith(ending)]
+            found.setdefault(chunk.entity_path, []).extend(
+                batch[name].to_pylist() for name in names
+            )
+    # The viewer would cut text off in short bars, and labels of arrows would cover each other.
+    assert found["/cues/stop_sign"] == [[[" "]]]
+    assert found["/camera/cars"] == [[[False]]]

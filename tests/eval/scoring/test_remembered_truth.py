@@ -26,7 +26,7 @@ def test_failures_and_score_use_the_truth_of_the_last_score(scored: tuple[Path, 
 
     assert told
     assert crosscue.failures(run).failures == told
-    assert crosscue.score_run(run).scored.one.truth_path.samefile(truth)
+    assert crosscue.score_run(run).one.truth_path.samefile(truth)
 
 
 def test_changed_truth_is_refused_until_the_run_is_scored_again(

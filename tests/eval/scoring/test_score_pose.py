@@ -82,7 +82,7 @@ def test_perfect_run_has_no_error_and_full_accounting(tmp_path: Path) -> None:
 def test_scores_of_a_drive_without_pictures_name_no_frames(tmp_path: Path) -> None:
     run, truth, _ = _scored(tmp_path)
 
-    printed = scores_text(pooled_scores([score_run(run.path, truth, has_figures=False).scored.one]))
+    printed = scores_text(pooled_scores([score_run(run.path, truth, has_figures=False).one]))
 
     assert printed == "drives     1, without pictures: no cue, belief or range to score"
 

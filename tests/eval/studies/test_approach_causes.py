@@ -10,7 +10,7 @@ import pytest
 from crosscue.eval.failures.causes import Finding, approach_findings
 from crosscue.eval.scoring.scene.approaches import ApproachResult
 from crosscue.eval.scoring.scene.cues import CueFrames
-from crosscue.eval.studies.intersections.tables import condition_costs
+from crosscue.eval.studies.intersections.report import condition_costs
 
 FRAMES = 40
 DISTANCE_M = np.linspace(90.0, 0.0, FRAMES)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from crosscue.detectors.ranging.travel_direction import travel_between
+from crosscue.localization.visual_odometry import travel_between
 from crosscue.replay.columns import Bytes, Floats
 
 FOCAL_PX, SIZE_PX = 600.0, (640, 400)
