@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Final
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.catalog.architectures import WEIGHTS_SUFFIXES
 from crosscue.detectors.catalog.card import read_card
-from crosscue.detectors.catalog.class_names import class_names_given
+from crosscue.detectors.catalog.class_names import COCO_80, COCO_90, class_names_given
 from crosscue.detectors.catalog.draft import Draft, draft_card_text
 from crosscue.detectors.catalog.places import card_named
 from crosscue.detectors.catalog.recognise import closed, guesses, plausible, read_interface
@@ -249,7 +249,9 @@ def _guess(path: Path, model: Interface, kind: str | None, names: int) -> Guess:
         found = [guess for guess in found if guess.settings["kind"] == kind]
     if len(found) > 1:
         found = plausible(path, model, found)
-        found = [one for one in found if names and one.class_count == names] or found
+        # COCO's numbers of classes, unless the user says otherwise.
+        counts = (names,) if names else (len(COCO_80), len(COCO_90))
+        found = [one for one in found if one.class_count in counts] or found
     if len(found) == 1:
         return found[0]
     if not found:

@@ -142,7 +142,8 @@ def _classes(
     usual = COCO_90 if guess.numbers_as_coco else COCO_80
     for known in (COCO_80, COCO_90) if not is_road else ():
         if count == len(known) or (count is None and known is usual):
-            assumed.append(f"the {len(known)} classes are COCO's, in its order")
+            unsaid = "" if count else "; the file does not say how many it has (--class-names FILE)"
+            assumed.append(f"the {len(known)} classes are COCO's, in its order{unsaid}")
             return known
     if count == len(COCO_90) + 1 and not is_road:
         assumed.append("the 91 classes are COCO's numbers, 0 unused")

@@ -157,7 +157,18 @@ def _of_tflite(content: bytes, path: Path) -> Interface:
         tuple(map(tensor, net.get_output_details())),
         metadata,
         class_names(metadata) or names,
+        _suppressed_classes(net),
     )
+
+
+def _suppressed_classes(net: Any) -> int | None:
+    """Number of classes that TFLite_Detection_PostProcess is given, without the background."""
+    for operation in net._get_ops_details():
+        if operation["op_name"] == "TFLite_Detection_PostProcess":
+            scores = operation["inputs"][1]
+            shapes = (one["shape"] for one in net.get_tensor_details() if one["index"] == scores)
+            return int(next(shapes)[-1]) - 1
+    return None
 
 
 def _appended(content: bytes) -> tuple[dict[str, str], tuple[str, ...]]:

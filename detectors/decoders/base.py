@@ -77,12 +77,14 @@ class Interface:
         outputs: Outputs, in the file's order.
         metadata: Text by key, as stored by the exporter.
         class_names: Class names from the metadata; empty if missing.
+        class_count: Number of classes that TFLite's suppression is given; None without it.
     """
 
     inputs: tuple[Tensor, ...]
     outputs: tuple[Tensor, ...]
     metadata: Mapping[str, str]
     class_names: tuple[str, ...] = ()
+    class_count: int | None = None
 
     @property
     def layout(self) -> str | None:
@@ -175,14 +177,21 @@ def named(outputs: Outputs, name: str | None, key: str = "name") -> Array:
 
 
 def output_rows(output: Array, columns: int, what: str) -> Floats:
-    """Convert an output (1, N, columns) to a table (N, columns), float64.
+    """Convert an output (1, N, columns), with any number of axes of 1, to a table, float64.
 
     Raises:
         ValueError: The output has another shape.
     """
-    if output.ndim != 3 or output.shape[0] != 1 or output.shape[2] != columns:
+    rows = table_rows(output.shape)
+    if rows is None or output.shape[-1] != columns:
         raise ValueError(f"expected (1, N, {columns}) for {what}, got {output.shape}")
-    return np.asarray(output[0], np.float64)
+    return np.asarray(output.reshape(rows, columns), np.float64)
+
+
+def table_rows(shape: Sequence[int | str | None]) -> int | None:
+    """Number of rows of a table (N, columns) or (1, N, columns); None if variable or no table."""
+    rows = shape[-2] if len(shape) > 1 and all(side == 1 for side in shape[:-2]) else None
+    return rows if isinstance(rows, int) else None
 
 
 def is_called(model: Interface, *names: str) -> bool:

@@ -55,8 +55,9 @@ class NanodetOutput(BoxOutput):
             (STRIDES[:3], "NanoDet", 0.5),
         ):
             cells = cell_count((width, height), strides, round_up=True)
-            # Networks with a table over the cells of three strides are usually of the YOLO family.
-            is_known = len(strides) == 4 or model.outputs[0].name == "output"
+            # Networks with a table over the cells of three strides are usually of the YOLO family;
+            # 112 columns are COCO's 80 classes and 32.
+            is_known = len(strides) == 4 or model.outputs[0].name == "output" or columns == 112
             if rows == cells and columns > 32 and is_known:
                 return Guess(
                     {"kind": "nanodet", "strides": strides, "center": center},

@@ -25,6 +25,7 @@ from .base import (
     named,
     output_rows,
     static,
+    table_rows,
 )
 
 STRIDES: Final = (8, 16, 32, 64)
@@ -62,20 +63,20 @@ class PicodetOutput(BoxOutput):
     @classmethod
     def recognise(cls, model: Interface, /) -> Guess | None:
         width, height = model.declared_px
-        tables = [out for out in model.outputs if len(out.shape) == 3]
+        tables = [out for out in model.outputs if table_rows(out.shape) is not None]
         strides = STRIDES[: len(tables) // 2]
         if width is None or height is None or len(tables) not in (6, 8):
             return None
         wanted = [cell_count((width, height), (s,), round_up=True) for s in strides]
-        by_cells = [[out for out in tables if static(out.shape, 1) == n] for n in wanted]
+        by_cells = [[out for out in tables if table_rows(out.shape) == n] for n in wanted]
         if any(len(pair) != 2 for pair in by_cells):
             return None
-        columns = sorted({static(out.shape, 2) or 0 for out in tables})
+        columns = sorted({static(out.shape, -1) or 0 for out in tables})
         if len(columns) != 2 or 32 not in columns:
             return None
         classes = next(n for n in columns if n != 32)
-        # NanoDet's exporter names its outputs so.
-        is_nanodet = all("_pred_stride_" in out.name for out in tables)
+        # PicoDet has four strides, and NanoDet before Plus three.
+        is_nanodet = len(strides) == 3
         return Guess(
             {
                 "kind": "picodet",
@@ -130,5 +131,5 @@ def _expected(logits: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _with(by_cells: list[list[Tensor]], columns: int) -> tuple[str, ...]:
     return tuple(
-        next(out.name for out in pair if static(out.shape, 2) == columns) for pair in by_cells
+        next(out.name for out in pair if static(out.shape, -1) == columns) for pair in by_cells
     )

@@ -95,7 +95,7 @@ def _of_tflite(model: Interface) -> Guess | None:
             settings = {"kind": "ssd-tensorflow", **dict(zip(_KEYS, names, strict=True))}
             return Guess(
                 {**settings, "first_class": 0, "overlap": 1.0},
-                len(model.class_names) or None,
+                len(model.class_names) or model.class_count,
                 (f"its outputs are called {begin}, as TensorFlow's detection API names them",),
                 ("class numbers start at 0 (--first-class)",),
                 {

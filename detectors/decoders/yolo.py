@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
+    GRID_STRIDES,
     Array,
     BoxCandidates,
     BoxOutput,
@@ -18,17 +19,21 @@ from .base import (
     Outputs,
     Size,
     best_class,
+    cell_count,
     from_centers,
     grid_cells,
     named,
     output_rows,
     sigmoid,
     static,
+    table_rows,
 )
 
 PICTURE: Final = {"colour": "rgb", "fit": "letterbox-center", "scale": (1 / 255,) * 3}
 YOLOX_PICTURE: Final = {"colour": "bgr", "fit": "letterbox"}
 _COEFFICIENTS: Final = 32
+# Strides of networks with three anchors per cell: most, small ones, and those for large inputs.
+_ANCHORED: Final = (GRID_STRIDES, (16, 32), (8, 16, 32, 64))
 
 
 class _CentersOutput(BoxOutput):
@@ -43,40 +48,45 @@ class _CentersOutput(BoxOutput):
 
 
 class YoloV5Output(_CentersOutput):
-    """YOLOv5, v7: one output (1, N, 5 + classes): center, size, objectness, class scores."""
+    """YOLOv3, v5, v7: (1, N, 5 + classes): center, size, objectness, class scores."""
 
     kind: Literal["yolov5"]
     name: str | None = None
     """Name of the output; by default the only output."""
+    heads: tuple[str, ...] = ()
+    """Names of the outputs, where each stride has its own."""
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         classes = len(self.classes)
-        table = output_rows(named(outputs, self.name), 5 + classes, f"{classes} classes")
+        rows = [named(outputs, name) for name in self.heads or (self.name,)]
+        table = np.vstack([output_rows(one, 5 + classes, f"{classes} classes") for one in rows])
         best, numbers = best_class(table[:, 5:])
         return BoxCandidates(self._corners(table, size_px), table[:, 4] * best, numbers)
 
     @override
     @classmethod
     def recognise(cls, model: Interface, /) -> Guess | None:
-        output = next((out for out in model.outputs if len(out.shape) == 3), None)
-        columns = None if output is None else static(output.shape, 2)
+        heads = _heads(model)
+        output = next((out for out in model.outputs if heads or len(out.shape) == 3), None)
+        columns = None if output is None else static(output.shape, -1)
         if (
             output is None
             or columns is None
             or columns < 6
-            or any(len(out.shape) == 4 for out in model.outputs)
+            or (not heads and any(len(out.shape) == 4 for out in model.outputs))
         ):
             return None
-        rows, cells = static(output.shape, 1), grid_cells(model)
+        rows, cells = None if heads else static(output.shape, 1), grid_cells(model)
         # Three anchors per cell; one if the network decodes the boxes of YOLOX itself.
-        if rows is not None and (rows <= columns or (cells and rows not in (cells, 3 * cells))):
+        if rows is not None and (rows <= columns or (cells and rows not in _row_counts(model))):
             return None
         names = len(model.class_names)
         if names and names != columns - 5:
             return None
         why = f"rows of {columns}: 5 and {columns - 5} classes"
-        settings = {"kind": "yolov5", "name": output.name}
+        settings: dict[str, object] = {"kind": "yolov5"}
+        settings |= {"heads": heads} if heads else {"name": output.name}
         if rows is not None and rows == cells and not names:
             return Guess(
                 settings,
@@ -203,6 +213,23 @@ def _columns(output: Array, rows: int) -> NDArray[np.float64]:
     if output.ndim != 3 or output.shape[:2] != (1, rows):
         raise ValueError(f"expected (1, {rows}, N) for these classes, got {output.shape}")
     return np.asarray(output[0].T, np.float64)
+
+
+def _row_counts(model: Interface) -> tuple[int, ...]:
+    """Numbers of rows that a table over the cells of an input may have."""
+    width, height = model.declared_px
+    if not width or not height:
+        return ()
+    three = (3 * cell_count((width, height), strides) for strides in _ANCHORED)
+    return cell_count((width, height), GRID_STRIDES), *three
+
+
+def _heads(model: Interface) -> tuple[str, ...]:
+    """Names of several outputs that together have three rows for each cell; else empty."""
+    rows = [table_rows(out.shape) or 0 for out in model.outputs]
+    columns = {static(out.shape, -1) for out in model.outputs}
+    is_whole = len(columns) == 1 and sum(rows) in _row_counts(model)[1:]
+    return tuple(out.name for out in model.outputs) if len(rows) > 1 and is_whole else ()
 
 
 def _transposed(model: Interface) -> tuple[str, int] | None:

@@ -16,10 +16,13 @@ from .base import (
     Outputs,
     Size,
     best_class,
+    cell_count,
     cell_grid,
     from_centers,
     named,
+    output_rows,
     static,
+    table_rows,
 )
 from .fastestdet import BGR_UNIT
 
@@ -32,7 +35,10 @@ Anchors = tuple[tuple[float, float], ...]
 
 
 class YoloFastestV2Output(BoxOutput):
-    """For each stride (1, h, w, 15 + classes): 3 boxes, 3 objectness scores, class scores."""
+    """For each stride (1, h, w, 15 + classes): 3 boxes, 3 objectness scores, class scores.
+
+    One output has the rows of all strides, (cells, 15 + classes).
+    """
 
     kind: Literal["yolo-fastestv2"]
     names: tuple[str, ...]
@@ -43,13 +49,22 @@ class YoloFastestV2Output(BoxOutput):
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
-        if not len(self.names) == len(self.strides) == len(self.anchors_px):
+        count = len(self.strides)
+        if len(self.names) not in (1, count) or len(self.anchors_px) != count:
             raise ValueError("names, strides and anchors_px: expected equally many")
-        parts = [
-            self._of_stride(named(outputs, name, "names"), size_px, stride, np.array(anchors))
-            for name, stride, anchors in zip(self.names, self.strides, self.anchors_px, strict=True)
+        grids = [named(outputs, name, "names") for name in self.names]
+        if len(grids) < count:
+            sides = [(size_px[1] // stride, size_px[0] // stride) for stride in self.strides]
+            rows = output_rows(grids[0], 15 + len(self.classes), "the cells of all strides")
+            parts = np.split(rows, np.cumsum([h * w for h, w in sides])[:-1])
+            if len(parts[-1]) != sides[-1][0] * sides[-1][1]:
+                raise ValueError(f"expected the cells of strides {self.strides}, got {len(rows)}")
+            grids = [part.reshape(1, *side, -1) for part, side in zip(parts, sides, strict=True)]
+        found = [
+            self._of_stride(grid, size_px, stride, np.array(anchors))
+            for grid, stride, anchors in zip(grids, self.strides, self.anchors_px, strict=True)
         ]
-        boxes, scores, classes = (np.concatenate(part) for part in zip(*parts, strict=True))
+        boxes, scores, classes = (np.concatenate(part) for part in zip(*found, strict=True))
         return BoxCandidates(boxes, scores, classes)
 
     def _of_stride(
@@ -75,11 +90,12 @@ class YoloFastestV2Output(BoxOutput):
     def recognise(cls, model: Interface, /) -> Guess | None:
         width, height = model.declared_px
         shapes = [out.shape for out in model.outputs]
-        if len(shapes) != 2 or not height or not width or len(shapes[0]) != 4:
+        if len(shapes) > 2 or not height or not width:
             return None
-        columns = static(shapes[0], 3)
+        columns = static(shapes[0], -1)
         wanted = {(1, height // s, width // s, columns) for s in _STRIDES}
-        if columns is None or columns < 16 or set(shapes) != wanted:
+        is_joined = table_rows(shapes[0]) == cell_count((width, height), _STRIDES)
+        if columns is None or columns < 16 or not (set(shapes) == wanted or is_joined):
             return None
         ordered = sorted(model.outputs, key=lambda out: -(static(out.shape, 1) or 0))
         return Guess(

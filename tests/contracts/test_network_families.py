@@ -17,7 +17,17 @@ from crosscue.detectors.decoders.base import Size, decoder_name
 from crosscue.detectors.decoders.table import DECODERS
 from crosscue.detectors.networks.model_detector import build
 from crosscue.replay.errors import VehicleError
-from support.decoder_samples import BOX, CLASS, CLASSES, EVERY, SCORE, SIZE, TALL, export
+from support.decoder_samples import (
+    BOX,
+    CLASS,
+    CLASSES,
+    EVERY,
+    SCORE,
+    SIZE,
+    TALL,
+    export,
+    nanodet_of_coco,
+)
 from support.onnx_models import bright_box_model
 
 SIZES: Final = pytest.mark.parametrize("size", [SIZE, TALL], ids=["wide", "tall"])
@@ -92,6 +102,23 @@ def test_number_of_class_names_decides_between_families(tmp_path: Path) -> None:
         crosscue.draft_card(net)
 
     assert crosscue.draft_card(net, class_names=CLASSES).draft.kind == "pp-yoloe"
+
+
+@SIZES
+def test_number_of_coco_s_classes_decides_between_families(tmp_path: Path, size: Size) -> None:
+    """80 + 32 columns of NanoDet are 5 + 107 of YOLOX's."""
+    net = tmp_path / "net.onnx"
+    net.write_bytes(export(nanodet_of_coco(size), size))
+
+    card = crosscue.draft_card(net)
+
+    assert card.draft.kind == "nanodet"
+    width, height = 2 * size[0], 2 * size[1]
+    frame = Frame(0, "", np.zeros((height, width, 3), np.uint8), (width, height))
+    (found,) = build(card=str(card.path))([frame])
+    assert isinstance(found, Detections)
+    np.testing.assert_allclose(found.boxes_px, [2.0 * BOX], atol=1e-3)
+    assert found.labels == ("car",)
 
 
 @pytest.mark.parametrize("shape", [(1000, 600), (600, 1000)], ids=["tall", "wide"])

@@ -6,10 +6,11 @@ import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from torchvision.models import get_model_weights
 
-from crosscue.detectors.base import DetectorChoice
+from crosscue.detectors.base import Detections, DetectorChoice
 from crosscue.detectors.catalog import entries, fetch, places
 from crosscue.detectors.catalog.card import ModelCard, WeightFile
 from crosscue.detectors.catalog.class_names import cue_label
@@ -62,6 +63,32 @@ def test_every_entry_describes_its_model_and_weights(name: str) -> None:
     assert card.files[0].name == card.weights
     assert card.files[0].sha256 == card.sha256
     assert len(set(card.output.classes)) == len(card.output.classes)
+
+
+@pytest.mark.parametrize("name", places.names())
+def test_thresholds_of_an_entry_have_counts_with_and_without_the_object(name: str) -> None:
+    card = entries.entry(name)
+
+    for label, one in card.scores.items():
+        for begin in (f"{label} found above {one.threshold}", f"{label} above {one.threshold} w"):
+            (shown,) = [each for each in card.evidence if each.metric.startswith(begin)]
+            assert shown.boxes
+            assert shown.low is not None
+            assert shown.high is not None
+            assert shown.low <= shown.value <= shown.high
+            assert shown.measured
+
+
+def test_run_uses_the_threshold_of_an_entry_unless_the_vehicle_file_has_one() -> None:
+    """A stop sign at 0.7 is below the threshold of yolox-nano, 0.75."""
+    card = entries.entry("yolox-nano")
+    known = {label: one.threshold for label, one in card.scores.items() if one.threshold}
+    box, score = np.array([[0.0, 0.0, 9.0, 9.0]]), np.array([0.7])
+    found = Detections(0, (9, 9), box, score, ("stop sign",), (b"",)).with_min_scores(known)
+
+    assert known["stop sign"] == 0.75
+    assert found.are_sure(None).tolist() == [False]
+    assert found.are_sure(0.6).tolist() == [True]
 
 
 @pytest.mark.parametrize("name", [name for name in places.names() if "rcnn" in name])

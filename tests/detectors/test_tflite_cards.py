@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 import crosscue
 from crosscue.detectors.base import Detections, Frame, RoadMask
 from crosscue.detectors.catalog.card import read_card
-from crosscue.detectors.decoders.base import Size, cell_grid
+from crosscue.detectors.catalog.draft import draft_card_text
+from crosscue.detectors.catalog.recognise import _suppressed_classes, guesses
+from crosscue.detectors.decoders.base import Interface, Size, Tensor, cell_grid
 from crosscue.detectors.networks.model_detector import build
 from support.data import shared
 from support.decoder_samples import BOX, CLASSES, SIZE, TALL, export
@@ -206,3 +209,32 @@ def test_data_set_file_without_names_is_refused(tmp_path: Path) -> None:
 
     with pytest.raises(crosscue.UsageError, match=r"data.yaml: expected class names under names"):
         crosscue.draft_card(net, class_names=tmp_path / "data.yaml")
+
+
+def test_number_of_classes_is_that_of_the_suppression() -> None:
+    """The operation is given a column for each class and one for the background."""
+    scores = {"index": 7, "shape": np.array([1, 1917, 6])}
+    operation = {"op_name": "TFLite_Detection_PostProcess", "inputs": [3, 7, 9]}
+    net = SimpleNamespace(
+        _get_ops_details=lambda: [{"op_name": "CONV_2D", "inputs": [1, 2]}, operation],
+        get_tensor_details=lambda: [{"index": 3, "shape": np.array([1, 1917, 4])}, scores],
+    )
+
+    assert _suppressed_classes(net) == 5
+    net._get_ops_details = list
+    assert _suppressed_classes(net) is None
+
+
+def test_suppressed_network_of_other_classes_asks_for_their_names(tmp_path: Path) -> None:
+    numbers = {"": (1, 9, 4), ":1": (1, 9), ":2": (1, 9), ":3": (1,)}
+    outputs = tuple(
+        Tensor(f"TFLite_Detection_PostProcess{end}", shape) for end, shape in numbers.items()
+    )
+    given = Tensor("image", (1, 224, 224, 3), is_bytes=True)
+    model = Interface((given,), outputs, {}, class_count=5)
+    (guess,) = guesses(model)
+    net = tmp_path / "net.tflite"
+    net.write_bytes(b"")
+
+    with pytest.raises(crosscue.UsageError, match="5 classes without names"):
+        draft_card_text(net, model, guess)

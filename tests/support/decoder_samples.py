@@ -167,6 +167,48 @@ def _nanodet_m(size: Size) -> Sample:
     return _picodet(size, (8, 16, 32))
 
 
+def _nanodet_m_old(size: Size) -> Sample:
+    """Tables without an axis for the picture, under the names of each other's tables."""
+    sample = _picodet(size, (8, 16, 32))
+    settings, names = sample.settings, (*sample.settings["scores"], *sample.settings["distances"])
+    renamed = dict(zip(names, "abcdef", strict=True))
+    changed = {key: tuple(map(renamed.get, settings[key])) for key in ("scores", "distances")}
+    return Sample(
+        {**settings, **changed},
+        {renamed[name]: values[0] for name, values in sample.outputs.items()},
+    )
+
+
+def nanodet_of_coco(size: Size) -> Sample:
+    """NanoDet before Plus, with one output; its 80 classes are COCO's."""
+    rows = np.zeros((1, cell_count(size, (8, 16, 32)), 80 + 32))
+    # Cell (7, 4) of stride 16 has its middle at (120, 72).
+    cell = cell_count(size, (8,)) + 4 * (size[0] // 16) + 7
+    rows[0, cell, :3], rows[0, cell, 80:] = _scores(), _logits(16, [20.0, 32.0, 100.0, 68.0])
+    return Sample({"kind": "nanodet", "strides": (8, 16, 32), "center": 0.5}, {"Identity": rows})
+
+
+def _yolo_heads(size: Size) -> Sample:
+    """YOLOv3-tiny with an output for each of its strides, 32 and 16."""
+    counts = {"outputs0": 3 * cell_count(size, (32,)), "outputs1": 3 * cell_count(size, (16,))}
+    heads = {name: np.zeros((1, 1, count, 8)) for name, count in counts.items()}
+    heads["outputs1"][0, 0, 7] = [*_centered(), 0.5, 0.0, 0.1, SCORE * 2]
+    return Sample({"kind": "yolov5", "heads": tuple(heads)}, dict(heads))
+
+
+def _yolov5_large(size: Size) -> Sample:
+    """YOLOv5's networks for large inputs have a fourth stride."""
+    rows = np.zeros((1, 3 * cell_count(size, (8, 16, 32, 64)), 8))
+    rows[0, 7] = [*_centered(), 0.5, 0.0, 0.1, SCORE * 2]
+    return Sample({"kind": "yolov5", "name": "output0"}, {"output0": rows})
+
+
+def _yolo_fastestv2_joined(size: Size) -> Sample:
+    grids = _yolo_fastestv2(size).outputs
+    rows = np.vstack([grids[name].reshape(-1, 18) for name in _FASTEST])
+    return Sample({"kind": "yolo-fastestv2", "names": ("845",)}, {"845": rows})
+
+
 def _nanodet(size: Size) -> Sample:
     strides = (8, 16, 32, 64)
     rows = np.zeros((1, cell_count(size, strides, round_up=True), 3 + 32))
@@ -333,6 +375,10 @@ _FAMILIES: Final[dict[str, Callable[[Size], Sample]]] = {
 # Other exports of these families.
 VARIANTS: Final[dict[str, Callable[[Size], Sample]]] = {
     "nanodet-m": _nanodet_m,
+    "nanodet-m, without the axis of pictures": _nanodet_m_old,
+    "yolov3-tiny, an output a stride": _yolo_heads,
+    "yolov5, four strides": _yolov5_large,
+    "yolo-fastestv2, one output": _yolo_fastestv2_joined,
     "damo-yolo": _damo_yolo,
     "pp-yoloe, one output": _pp_yoloe_joined,
     "efficient-nms, names of the plugin": _efficient_nms_plugin,
