@@ -18,6 +18,7 @@ from crosscue.replay.columns import Block, CanFrames, Messages, Table
 from crosscue.replay.errors import UnknownFormatError, UsageError
 from crosscue.replay.logs.copies import copies
 from crosscue.replay.logs.log_summary import LogSummary, summarise_log
+from crosscue.replay.losses import losses_heard
 from support.kitti_odometry_drive import kitti_odometry_drive
 from support.quality_logs import Drive, Streams, log_of, streams_of
 
@@ -166,3 +167,27 @@ def test_info_names_exact_copies() -> None:
     (sentence,) = [one for one in summary_of(streams).findings if "exact cop" in one]
 
     assert sentence.startswith(f"wheels: {len(wheels.t_s)} rows are exact copies")
+
+
+def test_lost_rows_of_a_used_topic_are_found(kitti: Path) -> None:
+    lines = (kitti.parent.parent / "poses" / "04.txt").read_text().splitlines()
+    lines[3] = "not a matrix"
+    (kitti.parent.parent / "poses" / "04.txt").write_text("\n".join(lines))
+
+    with losses_heard():
+        (row,) = crosscue.check(kitti, purposes=["pose"])
+
+    assert isinstance(row.result, LogCheck)
+    (finding,) = [one for one in row.result.findings if one.check == "damage"]
+    assert finding.text.startswith("odometry: 1 of")
+    assert row.exit_status in (1, 3)
+
+
+def test_info_shows_the_delay_that_the_vehicle_file_states(
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "car.toml").write_text("version = 1\n[camera]\ndelay_s = 0.025\n")
+
+    cli.run(["info", str(kitti), "--vehicle", str(tmp_path / "car.toml")])
+
+    assert "pictures   stamped +25 ms late (camera.delay_s)" in capsys.readouterr().out
