@@ -19,7 +19,7 @@ from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.vehicle.drafting.series import EARTH_RADIUS_M, Series
 
-from .drive import QualityDrive
+from .drive import QualityDrive, words_of
 
 Kind: TypeAlias = Literal["missing", "slow", "late", "damaged", "wrong"]
 Purpose: TypeAlias = Literal["pose", "cues", "range", "landmarks"]
@@ -165,13 +165,9 @@ def _streams(drive: QualityDrive) -> Iterator[tuple[str, tuple[str, ...], float,
     """Yield name, purposes, lowest rate, longest gap and times of what a run reads."""
     for signal, (purposes, rate_hz, gap_s) in NEEDS.items():
         if signal in drive.samples:
-            yield _words(signal), purposes, rate_hz, gap_s, drive.samples[signal].t_ns
+            yield words_of(signal), purposes, rate_hz, gap_s, drive.samples[signal].t_ns
     if drive.pictures is not None:
         yield "camera", SEEING, CAMERA_HZ, CAMERA_GAP_S, drive.pictures.t_ns
-
-
-def _words(signal: Signal) -> str:
-    return signal.name.lower().replace("_", " ")
 
 
 def _rates(drive: QualityDrive) -> Found:
@@ -269,7 +265,7 @@ def _faults(stamps: StampReport, name: str) -> Iterator[tuple[Kind, str]]:
 
 def _purposes(use: str) -> tuple[str, ...]:
     """Return the purposes of a topic by what it is used for."""
-    found = [set(purposes) for signal, (purposes, _, _) in NEEDS.items() if _words(signal) in use]
+    found = [set(purposes) for signal, (purposes, _, _) in NEEDS.items() if words_of(signal) in use]
     if use == "camera":
         found.append(set(SEEING))
     return tuple(one for one in PURPOSES if any(one in purposes for purposes in found)) or ("pose",)
@@ -342,26 +338,20 @@ def _frozen(drive: QualityDrive) -> Found:
 def _longest_same(drive: QualityDrive, t_ns: Int64s, values: Floats) -> tuple[float, int]:
     """Return the longest time with one value in motion, of a signal that usually changes."""
     same = np.diff(values) == 0.0
-    moving = drive.moving(t_ns[1:]) == 1.0
-    # A speed stays the same where it is frozen, so the others decide whether the car moves.
-    if not moving.any():
+    still = same & (drive.moving(t_ns[1:]) == 1.0)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
+    if not len(edges):
         return 0.0, 0
-    if not 0.0 < same.mean() < 0.98:
-        is_dead = bool(same.all()) and _varies(drive, t_ns, values)
-        return (float(t_ns[-1] - t_ns[0]) * 1e-9, int(t_ns[0])) if is_dead else (0.0, 0)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (same & moving).astype(np.int8), [0]])))
     starts, stops = edges[::2], edges[1::2]
-    if not len(starts) or 2.0 * np.mean(same[moving]) > 1.0 + np.mean(stops - starts > 50):
+    longest = int(np.argmax(stops - starts))
+    length = int(stops[longest] - starts[longest])
+    # A signal that never changes is a fault where GNSS shows that the car does.
+    gnss = drive.series(Signal.COURSE)
+    is_dead = bool(same.all()) and gnss is not None and float(np.ptp(gnss.values)) > 2.0
+    if not is_dead and (same.sum() - length > 0.5 * (len(same) - length) or same.all()):
         return 0.0, 0
-    lengths = t_ns[stops] - t_ns[starts]
-    longest = int(np.argmax(lengths))
-    return float(lengths[longest]) * 1e-9, int(t_ns[starts[longest]])
-
-
-def _varies(drive: QualityDrive, t_ns: Int64s, values: Floats) -> bool:
-    """Return whether another reading shows that a constant one should change."""
-    speed = drive.samples.get(Signal.COURSE)
-    return speed is not None and float(np.ptp(speed.values[:, 1])) > 2.0
+    begin_ns = int(t_ns[starts[longest]])
+    return (int(t_ns[stops[longest]]) - begin_ns) * 1e-9, begin_ns
 
 
 def _invalid(drive: QualityDrive) -> Found:
@@ -374,7 +364,7 @@ def _invalid(drive: QualityDrive) -> Found:
         columns = values[:, 2:] if signal is Signal.WHEEL_SPEEDS else values[:, :2]
         lost = float((~np.isfinite(columns)).any(axis=1).mean())
         if lost > LOST:
-            text = f"{_words(signal)}: {lost:.0%} of the readings are not numbers"
+            text = f"{words_of(signal)}: {lost:.0%} of the readings are not numbers"
             yield "damaged", purposes, text, "check the sensor, and what the log stores for invalid"
 
 
@@ -388,7 +378,7 @@ def _jumps(drive: QualityDrive) -> Found:
         near = (seconds > 0.0) & (seconds < STEP_S)
         jumps = int((near & (change > step) & (change > rate * seconds)).sum())
         if jumps:
-            text = f"{_words(signal)}: {jumps} jumps of more than {step:g} that no car can make"
+            text = f"{words_of(signal)}: {jumps} jumps of more than {step:g} that no car can make"
             yield "wrong", NEEDS[signal][0], text, "check its unit, and for invalid readings"
     position = drive.samples.get(Signal.POSITION)
     if position is not None and len(position.t_ns) > 1:

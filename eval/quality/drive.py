@@ -71,7 +71,7 @@ class QualityDrive:
     def used_topics(self) -> dict[str, str]:
         """What each topic that a run would read is used for, by its name."""
         names = {
-            source.topic.name: ", ".join(_words(signal) for signal in source.signals)
+            source.topic.name: ", ".join(words_of(signal) for signal in source.signals)
             for source in self.planned.sources
         }
         return names | ({self.camera: "camera"} if self.camera else {})
@@ -100,7 +100,7 @@ class QualityDrive:
             values = values[:, 2:].mean(axis=1)
         elif signal is Signal.COURSE:
             values = values[:, 1]
-        series = Series.of(_words(signal), found.t_ns, values)
+        series = Series.of(words_of(signal), found.t_ns, values)
         return series if len(series) > 1 else None
 
     def moving(self, t_ns: Int64s, least_mps: float = 1.0) -> Floats:
@@ -113,7 +113,8 @@ class QualityDrive:
         return np.where(known, np.interp(t_ns, speed.t_ns, moves), np.nan)
 
 
-def _words(signal: Signal) -> str:
+def words_of(signal: Signal) -> str:
+    """Return the name of a signal in words."""
     return signal.name.lower().replace("_", " ")
 
 
