@@ -195,7 +195,7 @@ def check(
     overwrite: bool = False,
     limits: LimitsGiven = DEFAULT_LIMITS,
 ) -> Checks:
-    """Say whether a log is good enough; check a vehicle file, truth, model, seal or run.
+    """Say whether a log is good enough; check a vehicle file, truth, model or run.
 
     A log is judged for each purpose: pose, cues, range and landmarks. A purpose is good, limited
     (exit status 3), or not possible (1); the report says what is missing, slow, late, damaged or
