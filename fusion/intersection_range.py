@@ -62,6 +62,20 @@ def predict(belief: RangeBelief, travelled_m: float, odometry_var_m2: float) -> 
     return RangeBelief(float(mean_m), float(var_m2))
 
 
+def range_noise_m2(travelled_m: float, odometry_var_m2: float, seconds: float) -> float:
+    """Variance that a range gains while the car travels: the process noise of every range.
+
+    Filters, beliefs over distance, tracks of lights and signs, the smoother and the fits take it
+    from the odometer, which calls this function; it is defined nowhere else.
+
+    Args:
+        travelled_m: Distance, negative in reverse.
+        odometry_var_m2: Variance of the distance by the odometry.
+        seconds: Time that the odometry covers.
+    """
+    return odometry_var_m2
+
+
 def nis(belief: RangeBelief, measured_m: float, sensor_var_m2: float) -> float:
     """Normalised innovation squared; chi-squared with one degree of freedom if consistent."""
     return (measured_m - belief.mean_m) ** 2 / (belief.var_m2 + sensor_var_m2)

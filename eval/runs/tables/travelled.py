@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.fusion.intersection_range import range_noise_m2
 from crosscue.replay.columns import Floats, Int64s
 
 from .parquet import TableFolder
@@ -26,7 +27,7 @@ class Way(NamedTuple):
 
     Attributes:
         distance_m: Signed distance, positive forward.
-        var_m2: Variance of the distance.
+        var_m2: Variance of the distance: what a range gains over it (``range_noise_m2``).
         turn_rad: Change of heading, counter-clockwise.
         covered_ns: Time covered by odometry or by assumed motion.
         assumed_ns: Part of that time for which the motion was assumed.
@@ -92,6 +93,7 @@ class Odometer:
                 break
             self._next += 1
         self.at_ns = t_ns
+        var = range_noise_m2(distance, var, covered * 1e-9)
         return Way(distance, var, turn, covered, assumed, assumed_m)
 
     def skip_to(self, t_ns: int) -> None:
