@@ -64,6 +64,7 @@ from crosscue.replay.signals.plan import pictures_only
 from crosscue.replay.time.segments import TimedLog, gaps_text, shift_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.versions import versions_and_commit
+from crosscue.verb import compared
 
 from .clocks import clock_rows
 from .drive_time import time_segments
@@ -88,10 +89,16 @@ class Detecting:
     """
 
     choices: tuple[DetectorChoice, ...]
-    cache: Path | None = None
+    cache: Path | None = field(default=None, compare=False)
     draw: int = 0
-    resume: bool = False
-    is_required: bool = False
+    resume: bool = field(default=False, compare=False)
+    is_required: bool = field(default=False, compare=False)
+
+    def as_json(self) -> dict[str, object]:
+        """Return the options that determine the result, as JSON values."""
+        options = compared(self)
+        options.pop("choices")
+        return {"detectors": [choice.as_row() for choice in self.choices], **options}
 
 
 def choices_of(vehicle: Vehicle) -> dict[str, DetectorChoice]:

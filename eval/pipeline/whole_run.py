@@ -67,8 +67,7 @@ def replay_drive(
             that the user named; the folder is unchanged.
         OutputError: The disk is full.
     """
-    database = None if landmarks is None else landmarks.path
-    mine = input_of(run, drive, detecting.choices, detecting.draw, database)
+    mine = _input(run, drive, detecting, landmarks)
     with locked(run):
         if detecting.resume and not overwrite:
             refuse_other_input(run, mine)
@@ -91,9 +90,17 @@ def detect_drive(drive: Drive, run: RunFolder, detecting: Detecting) -> DetectOu
     The folder is locked meanwhile, and cleared first. See ``detect`` for the errors.
     """
     with locked(run), staged(run) as new, nothing_left(new):
-        clear(new, input_of(run, drive, detecting.choices, detecting.draw))
+        clear(new, _input(run, drive, detecting))
         outcome = detect(with_camera_segments(drive), new, detecting)
     return replace(outcome, run=run)
+
+
+def _input(
+    run: RunFolder, drive: Drive, detecting: Detecting, landmarks: LandmarkDatabase | None = None
+) -> dict[str, object]:
+    """Return the content of ``input.json``."""
+    database = None if landmarks is None else str(landmarks.path.resolve())
+    return input_of(run, drive, {**detecting.as_json(), "landmarks": database})
 
 
 def _camera(

@@ -16,7 +16,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.detectors.base import DetectorChoice
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import INPUT, LOCK, MANIFEST, RunFolder
 from crosscue.replay.base import Log, origin
@@ -147,28 +146,18 @@ def reopened(run: RunFolder, row: LogRow) -> Log:
     return open_log(log_location(run, row), run.limits)
 
 
-def input_of(
-    run: RunFolder,
-    drive: Drive,
-    choices: Sequence[DetectorChoice],
-    draw: int = 0,
-    landmarks: Path | None = None,
-) -> dict[str, object]:
-    """Return the content of ``input.json``.
+def input_of(run: RunFolder, drive: Drive, options: Mapping[str, object]) -> dict[str, object]:
+    """Return the content of ``input.json``: all that determines a run.
 
     Args:
         run: The run.
         drive: The drive.
-        choices: Detectors, in order.
-        draw: Number of pictures drawn.
-        landmarks: The database with which frames are compared.
+        options: Options of the stages, by name, as JSON values.
     """
     settings = {
         "vehicle": drive.vehicle.model_dump(mode="json"),
         "selection": selection_record(drive.selection).as_json(),
-        "detectors": [choice.as_row() for choice in choices],
-        "draw": draw,
-        "landmarks": None if landmarks is None else str(landmarks.resolve()),
+        **options,
         "versions": versions(),
     }
     identity = identity_of_all([identity_of_log(log) for log in drive.logs])

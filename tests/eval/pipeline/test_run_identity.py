@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
 
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
+from crosscue.detectors.base import DetectorChoice
 from crosscue.eval.cli import run
+from crosscue.eval.pipeline.detect import Detecting
 from crosscue.eval.runs.manifest import FORMAT_VERSION
 from crosscue.replay.files.log_identity import of_row
 from support.trees import tree
@@ -114,3 +117,14 @@ def test_moved_logs_are_accepted_and_changed_logs_refused(
     assert "has changed since" in capsys.readouterr().err
     assert run([*estimate, "--logs", str(drives / "D-1")]) == 4
     assert run([*estimate, "--logs", str(tmp_path / "elsewhere")]) == 0
+
+
+def test_every_option_that_detects_differently_is_among_the_inputs_of_a_run() -> None:
+    """A resumed run compares them, so that a forgotten one would keep stale detections."""
+    plain = Detecting(())
+    other = {"choices": (DetectorChoice("lamp", "lamp"),), "draw": 3}
+    compared = {one.name for one in fields(Detecting) if one.compare}
+
+    assert other.keys() == compared
+    for name in compared:
+        assert replace(plain, **{name: other[name]}).as_json() != plain.as_json()
