@@ -7,7 +7,7 @@ stores, in ``estimate``, so a rule or its settings can change without a picture.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,6 +52,7 @@ from crosscue.eval.runs.manifest import (
     selection_record,
 )
 from crosscue.eval.runs.tables.labelled import LabelledSink
+from crosscue.eval.runs.tables.parquet import INT, REAL, TEXT, schema_of
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.replay.base import Log, Selection
 from crosscue.replay.columns import Block, Int64s, Topic
@@ -346,7 +347,7 @@ class DetectTables:
     _sinks: dict[str, LabelledSink] = field(default_factory=dict)
     _open: ExitStack = field(default_factory=ExitStack)
     roles: dict[str, DetectorRole] = field(default_factory=dict)
-    _held: dict[str, list[dict[str, object]]] = field(default_factory=dict)
+    _held: dict[str, dict[str, list[object]]] = field(default_factory=dict)
     _sizes: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
     _frame: int = -1
     _meanings: dict[str, str] = field(default_factory=dict)
@@ -365,7 +366,7 @@ class DetectTables:
                     continue
                 sink = LabelledSink(self.run, name, schema, timeline, clock)
                 self._sinks[name] = stack.enter_context(sink)
-                self._held[name] = []
+                self._held[name] = {}
             self._open = stack.pop_all()
         return self
 
@@ -394,43 +395,34 @@ class DetectTables:
             self.drive.vehicle.camera.check_size(result.size_px)
             self._meanings = label_meanings(self.drive.vehicle)
         again = self._duplicates(result.found)
-        self._held["frames"].append(
-            {
-                "frame": self._frame,
-                "t_ns": result.t_ns,
-                "camera": self.camera,
-                "width_px": result.size_px[0],
-                "height_px": result.size_px[1],
-            }
-        )
+        width, height = result.size_px
+        self._keep("frames", [result.t_ns], width_px=[width], height_px=[height])
         for number, (named, found, for_signs) in enumerate(
             zip(self.detectors, result.found, self.is_for_signs, strict=True)
         ):
             self.roles[named.name] = detector_role(found, for_signs)
             if isinstance(found, Detections):
-                self._held["detections"] += self._detection_rows(named.name, found, again[number])
+                self._keep_detections(named.name, found, again[number])
         road = next((one for one in result.found if isinstance(one, RoadMask)), None)
         if road is not None:
-            fractions = road_fractions(road, self.drive.vehicle.regions)
-            self._held["road"].append(
-                {
-                    "frame": self._frame,
-                    "t_ns": result.t_ns,
-                    "camera": self.camera,
-                    "fraction_left": fractions.left,
-                    "fraction_straight": fractions.straight,
-                    "fraction_right": fractions.right,
-                    "mask": road.mask,
-                    "mask_width_px": road.mask_size_px[0],
-                    "mask_height_px": road.mask_size_px[1],
-                }
-            )
+            self._keep_road(road)
         if self.visual is not None and (moved := self.visual(result)) is not None:
-            self._held[VISUAL].append(moved)
+            self._extend(VISUAL, {name: [value] for name, value in moved.items()})
         self.drawer(result.t_ns, result.picture, result.found)
-        for name, rows in self._held.items():
-            if len(rows) > 8192:
+        for name, columns in self._held.items():
+            if len(columns.get("t_ns", ())) > 8192:
                 self._write(name)
+
+    def _keep(self, table: str, times_ns: Sequence[int], **columns: Sequence[object]) -> None:
+        """Keep rows of the newest frame, as columns."""
+        n = len(times_ns)
+        first = {"frame": [self._frame] * n, "t_ns": times_ns, "camera": [self.camera] * n}
+        self._extend(table, {**first, **columns})
+
+    def _extend(self, table: str, columns: Mapping[str, Sequence[object]]) -> None:
+        held = self._held[table]
+        for name, values in columns.items():
+            held.setdefault(name, []).extend(values)
 
     def _duplicates(self, found: Sequence[Found]) -> dict[int, Int64s]:
         """Return by detector who keeps each of its detections.
@@ -446,100 +438,73 @@ class DetectTables:
             for k, one in zip(numbers, same, strict=True)
         }
 
-    def _detection_rows(
-        self, name: str, found: Detections, again: Int64s
-    ) -> list[dict[str, object]]:
-        rows: list[dict[str, object]] = []
-        heights_px, vehicle = found.measured().heights_px.tolist(), self.drive.vehicle
-        for i, label in enumerate(found.labels):
-            x0, y0, x1, y1 = found.boxes_px[i].tolist()
+    def _keep_detections(self, name: str, found: Detections, again: Int64s) -> None:
+        n, (width, height), vehicle = len(found), found.size_px, self.drive.vehicle
+        for label, mask in zip(found.labels, found.masks, strict=True):
             key = f"{name}: {label}"
             self.objects[key] = self.objects.get(key, 0) + 1
-            by_mask = self.masked if found.masks[i] else self._boxed
-            by_mask.setdefault(name, set()).add(label)
-            height = heights_px[i]
-            ranged = detection_range(vehicle, label, found.boxes_px[i], height, found.size_px)
-            rows.append(
-                {
-                    "frame": self._frame,
-                    "t_ns": found.t_ns,
-                    "camera": self.camera,
-                    "detector": name,
-                    "label": label,
-                    "score": float(found.scores[i]),
-                    "x0": x0,
-                    "y0": y0,
-                    "x1": x1,
-                    "y1": y1,
-                    "mask": found.masks[i] or None,
-                    "height_px": height,
-                    "lens": (found.lenses[i] or None) if found.lenses else None,
-                    "look": (found.looks[i] or None) if found.looks else None,
-                    "same_as": None if again[i] == KEPT else self.detectors[again[i]].name,
-                    "range_m": None if ranged is None else ranged.mean_m,
-                    "range_sd_m": None if ranged is None else ranged.sd_m,
-                    "picture_width_px": found.size_px[0],
-                    "picture_height_px": found.size_px[1],
-                }
-            )
-        return rows
+            (self.masked if mask else self._boxed).setdefault(name, set()).add(label)
+        heights_px = found.measured().heights_px.tolist()
+        ranges = [
+            detection_range(vehicle, label, box, high, found.size_px)
+            for label, box, high in zip(found.labels, found.boxes_px, heights_px, strict=True)
+        ]
+        corners = zip(("x0", "y0", "x1", "y1"), found.boxes_px.T.tolist(), strict=True)
+        self._keep(
+            "detections",
+            [found.t_ns] * n,
+            detector=[name] * n,
+            label=found.labels,
+            score=found.scores.tolist(),
+            **dict(corners),
+            mask=[mask or None for mask in found.masks],
+            height_px=heights_px,
+            lens=[one or None for one in found.lenses or ("",) * n],
+            look=[one or None for one in found.looks or ("",) * n],
+            same_as=[None if k == KEPT else self.detectors[k].name for k in again.tolist()],
+            range_m=[None if one is None else one.mean_m for one in ranges],
+            range_sd_m=[None if one is None else one.sd_m for one in ranges],
+            picture_width_px=[width] * n,
+            picture_height_px=[height] * n,
+        )
+
+    def _keep_road(self, road: RoadMask) -> None:
+        fractions = road_fractions(road, self.drive.vehicle.regions)
+        self._keep(
+            "road",
+            [road.t_ns],
+            fraction_left=[fractions.left],
+            fraction_straight=[fractions.straight],
+            fraction_right=[fractions.right],
+            mask=[road.mask],
+            mask_width_px=[road.mask_size_px[0]],
+            mask_height_px=[road.mask_size_px[1]],
+        )
 
     def _write(self, name: str) -> None:
-        rows, self._held[name] = self._held[name], []
-        if rows:
-            self._sinks[name].write({key: [row[key] for row in rows] for key in rows[0]})
+        columns, self._held[name] = self._held[name], {}
+        if columns.get("t_ns"):
+            self._sinks[name].write(columns)
 
 
 def detect_schemas() -> dict[str, pa.Schema]:
     """Return the schemas of the tables that this stage writes."""
-    import pyarrow as pa
-
-    number, text = pa.float64(), pa.string()
-    return {
-        VISUAL: visual_schema(),
-        "frames": pa.schema(
-            [
-                ("frame", pa.int64()),
-                ("t_ns", pa.int64()),
-                ("camera", text),
-                ("width_px", pa.int32()),
-                ("height_px", pa.int32()),
-            ]
-        ),
-        "detections": pa.schema(
-            [
-                ("frame", pa.int64()),
-                ("t_ns", pa.int64()),
-                ("camera", text),
-                ("detector", text),
-                ("label", text),
-                ("score", number),
-                ("x0", number),
-                ("y0", number),
-                ("x1", number),
-                ("y1", number),
-                ("mask", pa.binary()),
-                ("height_px", number),
-                ("lens", text),
-                ("look", text),
-                ("same_as", text),
-                ("range_m", number),
-                ("range_sd_m", number),
-                ("picture_width_px", pa.int32()),
-                ("picture_height_px", pa.int32()),
-            ]
-        ),
-        "road": pa.schema(
-            [
-                ("frame", pa.int64()),
-                ("t_ns", pa.int64()),
-                ("camera", text),
-                ("fraction_left", number),
-                ("fraction_straight", number),
-                ("fraction_right", number),
-                ("mask", pa.binary()),
-                ("mask_width_px", pa.int32()),
-                ("mask_height_px", pa.int32()),
-            ]
-        ),
+    frame = {"frame": INT, "t_ns": INT, "camera": TEXT}
+    found = ("score", "x0", "y0", "x1", "y1")
+    texts = ("lens", "look", "same_as")
+    fractions = ("fraction_left", "fraction_straight", "fraction_right")
+    columns = {
+        "frames": frame | dict.fromkeys(("width_px", "height_px"), "int32"),
+        "detections": frame
+        | {"detector": TEXT, "label": TEXT}
+        | dict.fromkeys(found, REAL)
+        | {"mask": "binary", "height_px": REAL}
+        | dict.fromkeys(texts, TEXT)
+        | dict.fromkeys(("range_m", "range_sd_m"), REAL)
+        | dict.fromkeys(("picture_width_px", "picture_height_px"), "int32"),
+        "road": frame
+        | dict.fromkeys(fractions, REAL)
+        | {"mask": "binary"}
+        | dict.fromkeys(("mask_width_px", "mask_height_px"), "int32"),
     }
+    return {VISUAL: visual_schema(), **{name: schema_of(one) for name, one in columns.items()}}

@@ -19,7 +19,7 @@ from crosscue.detectors.images import decode
 from crosscue.detectors.runner import FrameResult
 from crosscue.eval.runs.account import Line, line
 from crosscue.eval.runs.drive import Drive
-from crosscue.eval.runs.tables.parquet import TableFolder
+from crosscue.eval.runs.tables.parquet import INT, REAL, TableFolder, schema_of
 from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
 from crosscue.localization.visual_odometry import HEIGHT_SD, VisualOdometry, VisualStep
 from crosscue.replay.columns import Floats
@@ -106,18 +106,8 @@ def with_visual_scale(vehicle: Vehicle) -> Vehicle:
 
 def visual_schema() -> pa.Schema:
     """Return the schema of ``visual_odometry.parquet``."""
-    import pyarrow as pa
-
-    integers, flags = ("start_ns", "t_ns", "corners", "patches"), ("is_standing",)
-    return pa.schema(
-        [
-            (
-                name,
-                pa.int64() if name in integers else pa.bool_() if name in flags else pa.float64(),
-            )
-            for name in VisualStep._fields
-        ]
-    )
+    kinds = dict.fromkeys(VisualStep._fields, REAL) | {"is_standing": "bool"}
+    return schema_of(kinds | dict.fromkeys(("start_ns", "t_ns", "corners", "patches"), INT))
 
 
 @dataclass(frozen=True, slots=True)

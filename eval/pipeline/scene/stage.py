@@ -27,7 +27,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
-from crosscue.eval.runs.tables.parquet import TableFolder
+from crosscue.eval.runs.tables.parquet import INT, REAL, TEXT, TableFolder, schema_of
 from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.eval.runs.tables.travelled import Odometer, odometer_of
 from crosscue.fusion.approaches import Approaches, RangeRow, Step
@@ -396,38 +396,13 @@ class SceneTables:
 
     def flush(self) -> None:
         """Pass on all rows."""
-        for name, rows, columns in (
-            ("cues", self.cues, CUE_COLUMNS),
-            ("range", self.ranges, RANGE_COLUMNS),
-            ("belief", self.beliefs, self._belief_columns()),
-            ("ranged_objects", self.objects, OBJECT_COLUMNS),
-        ):
+        columns = scene_columns(self.features, gives_reasons=self.gives_reasons)
+        of_table = (self.cues, self.ranges, self.beliefs, self.objects)
+        for (name, names), rows in zip(columns.items(), of_table, strict=True):
             if rows:
                 parts = zip(*rows, strict=True)
-                self.sink(name, dict(zip(columns, map(list, parts), strict=True)))
+                self.sink(name, dict(zip(names, map(list, parts), strict=True)))
                 rows.clear()
-
-    def _belief_columns(self) -> tuple[str, ...]:
-        reasons = ("not_believed",) if self.gives_reasons else ()
-        return ("t_ns", "approach", *self.features, "established", *reasons)
-
-
-CUE_COLUMNS: Final = ("t_ns", "approach", "cue", "count")
-OBJECT_COLUMNS: Final = (
-    "t_ns",
-    "cue",
-    "object",
-    "facing",
-    "reference",
-    "range_m",
-    "var_m2",
-    "height_m",
-    "x0",
-    "y0",
-    "x1",
-    "y1",
-)
-RANGE_COLUMNS: Final = ("t_ns", "approach", "reference", "range_m", "var_m2", "measured_m")
 
 
 @contextmanager
@@ -458,48 +433,29 @@ def gives_reasons(vehicle: Vehicle) -> bool:
     return vehicle.fusion.kind == "persistent"
 
 
+def scene_columns(
+    features: Sequence[str] = FEATURES, *, gives_reasons: bool = False
+) -> dict[str, dict[str, str]]:
+    """Return the columns of the tables of the scene with their types, in the order of rows."""
+    step = {"t_ns": INT, "approach": INT}
+    return {
+        "cues": step | {"cue": TEXT, "count": INT},
+        "range": step
+        | {"reference": TEXT}
+        | dict.fromkeys(("range_m", "var_m2", "measured_m"), REAL),
+        "belief": step
+        | dict.fromkeys(features, REAL)
+        | {"established": "bool"}
+        | ({"not_believed": TEXT} if gives_reasons else {}),
+        "ranged_objects": {"t_ns": INT, "cue": TEXT, "object": INT, "facing": TEXT}
+        | {"reference": TEXT}
+        | dict.fromkeys(("range_m", "var_m2", "height_m", "x0", "y0", "x1", "y1"), REAL),
+    }
+
+
 def scene_schemas(
     features: Sequence[str] = FEATURES, *, gives_reasons: bool = False
 ) -> dict[str, pa.Schema]:
     """Return the schemas of the tables that this stage writes."""
-    import pyarrow as pa
-
-    number, integer, text = pa.float64(), pa.int64(), pa.string()
-    reasons = [("not_believed", text)] if gives_reasons else []
-    return {
-        "cues": pa.schema(
-            [("t_ns", integer), ("approach", integer), ("cue", text), ("count", integer)]
-        ),
-        "range": pa.schema(
-            [
-                ("t_ns", integer),
-                ("approach", integer),
-                ("reference", text),
-                ("range_m", number),
-                ("var_m2", number),
-                ("measured_m", number),
-            ]
-        ),
-        "belief": pa.schema(
-            [
-                ("t_ns", integer),
-                ("approach", integer),
-                *((name, number) for name in features),
-                ("established", pa.bool_()),
-                *reasons,
-            ]
-        ),
-        "ranged_objects": pa.schema(
-            [
-                ("t_ns", integer),
-                ("cue", text),
-                ("object", integer),
-                ("facing", text),
-                ("reference", text),
-                ("range_m", number),
-                ("var_m2", number),
-                ("height_m", number),
-                *((name, number) for name in ("x0", "y0", "x1", "y1")),
-            ]
-        ),
-    }
+    columns = scene_columns(features, gives_reasons=gives_reasons)
+    return {name: schema_of(found) for name, found in columns.items()}

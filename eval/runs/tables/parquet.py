@@ -21,6 +21,18 @@ if TYPE_CHECKING:
 GROUP_ROWS: Final = 8192
 
 
+INT: Final = "int64"
+REAL: Final = "double"
+TEXT: Final = "string"
+
+
+def schema_of(columns: Mapping[str, str]) -> pa.Schema:
+    """Return the schema of a table, from its columns with Arrow's names of their types."""
+    import pyarrow as pa
+
+    return pa.schema([pa.field(name, kind) for name, kind in columns.items()])
+
+
 @dataclass(frozen=True, slots=True)
 class TableFolder:
     """A folder of tables.
