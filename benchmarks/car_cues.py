@@ -38,7 +38,7 @@ def claims(run: RunFolder, vehicle: Vehicle) -> Iterator[tuple[int, str, float, 
     assert found is not None
     before: CarShapes | None = None
     rules = vehicle.cars
-    for frame in stored_frames(run, found.detectors):
+    for frame in stored_frames(run, found, vehicle):
         now = car_shapes(frame.objects, rules)
         if before is not None:
             pairs = pair_cars(before, now, rules)

@@ -132,7 +132,7 @@ def main() -> None:
     tracks, place = CarTracks(vehicle.camera, vehicle.cars), None
     missed: dict[str, list[Missed]] = {"oncoming": [], "outgoing": []}
     found: Counter[str] = Counter()
-    for frame, stored in enumerate(stored_frames(run, manifest.detected.detectors)):
+    for frame, stored in enumerate(stored_frames(run, manifest.detected, vehicle)):
         _, motion = ego(stored.t_ns)
         tracks(stored.objects, motion)
         cars = tracks.longer()

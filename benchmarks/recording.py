@@ -98,7 +98,7 @@ def frame_by_frame(run: RunFolder, path: Path) -> None:
     read_pictures(camera, picture)
     detected = run.drive_manifest().detected
     assert detected is not None
-    for frame in stored_frames(run, detected.detectors):
+    for frame in stored_frames(run, detected, detected.settings):
         recording.set_time("drive", timestamp=np.datetime64(frame.t_ns, "ns"))
         for found in frame.objects:
             classes = np.zeros(found.size_px[::-1], np.uint8)

@@ -117,9 +117,10 @@ def _things(
     run: RunFolder, times: frozenset[int], found: ExportedRun
 ) -> Mapping[int, tuple[Annotation, ...]]:
     """Return the detections above their detector's threshold, by time."""
-    detected = run.drive_manifest().detected
+    manifest = run.drive_manifest()
+    detected = manifest.detected
     things: dict[int, tuple[Annotation, ...]] = {}
-    for frame in stored_frames(run, detected.detectors) if detected is not None else ():
+    for frame in () if detected is None else stored_frames(run, detected, manifest.settings):
         if frame.t_ns not in times:
             continue
         kept = []

@@ -185,7 +185,7 @@ def _log_marks(
     has_odometry = run.file("measurements.parquet").exists()
     anchored = Anchored(run, manifest, marks) if has_odometry else None
     cues = CuePass(manifest.settings)
-    frames = stored_frames(run, detected.detectors, with_road_masks=True)
+    frames = stored_frames(run, detected, manifest.settings, with_road_masks=True)
     for number, frame in enumerate(frames):
         if anchored is None:
             marks.add(frame, cues(frame).objects)

@@ -102,10 +102,10 @@ def _likely(found: Found, counted: frozenset[str]) -> Found:
 
 
 def _found(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, FrameDetections]:
-    detected = run.drive_manifest().detected
-    if detected is None:
+    manifest = run.drive_manifest()
+    if manifest.detected is None:
         return {}
-    frames = stored_frames(run, detected.detectors, with_road_masks=True)
+    frames = stored_frames(run, manifest.detected, manifest.settings, with_road_masks=True)
     return {one.t_ns: one for one in frames if one.t_ns in wanted}
 
 

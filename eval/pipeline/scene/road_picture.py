@@ -86,7 +86,7 @@ def plans_of(run: RunFolder, wanted: Iterable[int]) -> Mapping[int, Bytes]:
         return {}
     roads, ego = Roads(vehicle, pitches_of(run)), EgoMotion(odometer_of(run))
     restarts, found = Restarts(vehicle, detected.timeline), {}
-    for frame in stored_frames(run, detected.detectors, with_road_masks=True):
+    for frame in stored_frames(run, detected, vehicle, with_road_masks=True):
         fresh_ns = restarts.before(frame.t_ns)
         if fresh_ns is not None:
             ego.restart(fresh_ns)

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from crosscue.detectors.base import is_repeated
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameCues, FrameDetections, Place
-from crosscue.detectors.cues.same_object import label_meanings
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.eval.pipeline.progress import report_time
 from crosscue.eval.pipeline.scene.looked_for import needing_masks, not_looked_for
@@ -185,12 +184,11 @@ class Scene:
         vehicle, timeline = self._drive.vehicle, self._drive.segments
         restarts = Restarts(vehicle, timeline)
         stored, regions = self._detected.settings, vehicle.regions
-        meanings = label_meanings(vehicle)
         frames = stored_frames(
             self._run,
-            self._detected.detectors,
+            self._detected,
+            vehicle,
             with_road_masks=regions.kind != "picture" or stored.regions != regions,
-            meanings=None if meanings == label_meanings(stored) else meanings,
         )
         for frame in frames:
             vehicle.camera.check_size(frame.size_px)

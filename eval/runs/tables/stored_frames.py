@@ -16,8 +16,9 @@ from crosscue.detectors.cues.observed import (
     RoadFractions,
     all_labels,
 )
-from crosscue.detectors.cues.same_object import KEPT, same_objects
-from crosscue.eval.runs.manifest import DetectorRow
+from crosscue.detectors.cues.same_object import KEPT, label_meanings, same_objects
+from crosscue.eval.runs.manifest import DetectManifest, DetectorRow
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .parquet import TableFolder
 
@@ -78,11 +79,7 @@ MASK: Final = ("mask", "mask_width_px", "mask_height_px")
 
 
 def stored_frames(
-    run: TableFolder,
-    detectors: Sequence[DetectorRow],
-    *,
-    with_road_masks: bool = False,
-    meanings: Mapping[str, str] | None = None,
+    run: TableFolder, detected: DetectManifest, vehicle: Vehicle, *, with_road_masks: bool = False
 ) -> Iterator[FrameDetections]:
     """Yield all frames of a run in the order of detection; memory holds one batch of rows.
 
@@ -90,14 +87,15 @@ def stored_frames(
 
     Args:
         run: A run with the tables of the detect stage.
-        detectors: The manifest's list of detectors, with name and role.
+        detected: Manifest of the detect stage.
+        vehicle: Settings, whose labels of cues decide which detections are of the same object.
         with_road_masks: Return road masks instead of road fractions of the regions.
-        meanings: Meanings of labels (``label_meanings``) by which objects are the same; by default
-            those with which they were detected.
 
     Raises:
         RunError: A table is missing or damaged.
     """
+    detectors, meanings = detected.detectors, label_meanings(vehicle)
+    is_changed = meanings != label_meanings(detected.settings)
     scores_of = {d.name: d.min_scores for d in detectors}
     objects = [d.name for d in detectors if d.role == DetectorRole.OBJECTS]
     signs = [d.name for d in detectors if d.role == DetectorRole.SIGNS]
@@ -116,7 +114,7 @@ def stored_frames(
             by_name: dict[str, list[tuple[Any, ...]]] = {}
             again: dict[str, list[tuple[Any, ...]]] = {}
             rows = found.of(frame)
-            if meanings is not None:
+            if is_changed:
                 rows = _compared(rows, detectors, meanings, t_ns, size)
             for row in rows:
                 (by_name if row[SAME_AS] is None else again).setdefault(row[0], []).append(row)

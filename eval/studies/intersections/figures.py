@@ -205,10 +205,11 @@ def _frame_near(one: RunScored) -> FrameDetections | None:
     if not np.isfinite(away).any():
         return None
     wanted = int(inside[int(np.nanargmin(away))])
-    detected = one.run.drive_manifest().detected
-    if detected is None:
+    manifest = one.run.drive_manifest()
+    if manifest.detected is None:
         return None
-    for frame in stored_frames(one.run, detected.detectors, with_road_masks=True):
+    frames = stored_frames(one.run, manifest.detected, manifest.settings, with_road_masks=True)
+    for frame in frames:
         if frame.t_ns == wanted:
             return frame
     return None

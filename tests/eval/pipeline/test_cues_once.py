@@ -16,6 +16,8 @@ from crosscue.detectors.cues import labelled
 from crosscue.detectors.cues.rules import rule_of
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import open_run
+from crosscue.eval.runs.tables.stored_frames import stored_frames
+from crosscue.replay.vehicle.vehicle import Vehicle, load
 from support.gap_drive import Clock, GreyNumber, write_drive
 
 # Tables of the run that a cue reaches.
@@ -156,3 +158,23 @@ def test_changed_cue_needs_no_picture_and_equals_a_new_replay(
     assert any(not again.table(name).equals(before[name]) for name in CUED)
     manifests = [one.drive_manifest() for one in (again, whole)]
     assert sorted(manifests[0].notices) == sorted(manifests[1].notices)
+
+
+def test_frames_are_read_with_the_labels_of_the_present_vehicle_file(
+    drive: Path, tmp_path: Path
+) -> None:
+    """Once a cue counts both, an octagon is the sign that the other detector found."""
+    plain = drive.with_name("car.toml").read_text()
+    shutil.copy(drive.with_name("simulated_car.dbc"), tmp_path)
+    (tmp_path / "new.toml").write_text(f"{plain}\n{CHANGES['labels of a cue']}")
+    _command("detect", drive, tmp_path / "run", drive.with_name("car.toml"))
+    stored = open_run(tmp_path / "run")
+    detected = stored.drive_manifest().detected
+    assert detected is not None
+
+    def octagons(vehicle: Vehicle) -> int:
+        frames = stored_frames(stored, detected, vehicle)
+        return sum(one.labels.count("octagon") for frame in frames for one in frame.objects)
+
+    assert octagons(detected.settings) > 20
+    assert octagons(load(tmp_path / "new.toml")) == 0
