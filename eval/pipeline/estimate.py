@@ -8,20 +8,17 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import TYPE_CHECKING
 
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
 from crosscue.eval.pipeline.scene.looked_for import detector_notices
-from crosscue.eval.pipeline.scene.outcome import SceneOutcome
 from crosscue.eval.runs.account import UNATTRIBUTED, Account, account, joined_accounts, reading_of
-from crosscue.eval.runs.candidates import candidate_rows
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, write_manifest, write_timings
 from crosscue.eval.runs.logs import log_names, log_rows
 from crosscue.eval.runs.manifest import (
-    ApproachRow,
     DetectManifest,
     EstimateCounts,
     EstimateManifest,
@@ -195,7 +192,7 @@ class EstimateStage:
             return self._drive
         return replace(self._drive, vehicle=with_visual_scale(self._drive.vehicle))
 
-    def finish(self, scene: SceneOutcome | None) -> Outcome:
+    def finish(self, scene: SceneSummary | None) -> Outcome:
         """Write account, timings and manifest.
 
         Raises:
@@ -231,7 +228,7 @@ class EstimateStage:
             pose=PoseSummary(
                 rows=tally.rows, travelled_m=tally.travelled_m, major_axis_m=tally.major_axis_m
             ),
-            scene=None if scene is None else scene_summary(scene),
+            scene=scene,
             detect=found,
         )
         write_manifest(run, manifest)
@@ -265,7 +262,7 @@ class EstimateStage:
         if what is not None:
             raise empty_result(what, self._drive.logs, self._drive.selection)
 
-    def _account(self, scene: SceneOutcome | None) -> Account:
+    def _account(self, scene: SceneSummary | None) -> Account:
         """Return the account of the run, with the detect stage's part if it has run."""
         accounts, found = reading_of(self._ledgers), self.found
         if found is None or scene is None:
@@ -347,20 +344,6 @@ def begin_again(run: RunFolder, found: DetectManifest | None) -> None:
         run.file(MANIFEST).unlink(missing_ok=True)
     else:
         write_manifest(run, found)
-
-
-def scene_summary(scene: SceneOutcome) -> SceneSummary:
-    """Return the scene in the form of the manifest."""
-    return SceneSummary(
-        frames=scene.frames,
-        positive=dict(scene.positive),
-        counts=dict(scene.counts),
-        without_odometry=scene.without_odometry,
-        approaches=tuple(ApproachRow(**asdict(one)) for one in scene.approaches),
-        candidates=candidate_rows(scene.candidates),
-        ranged=candidate_rows(scene.ranged),
-        not_looked_for=dict(scene.not_looked_for),
-    )
 
 
 def _camera_skips(run: RunFolder, camera: str) -> pa.Table:

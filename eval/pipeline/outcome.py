@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
 from crosscue.detectors.runner import FrameCounts
-from crosscue.eval.pipeline.scene.outcome import ApproachSummary, SceneOutcome
 from crosscue.eval.runs.account import Account, account_lines, details_of
-from crosscue.eval.runs.candidates import candidate_lines, candidate_rows, not_looked_lines
+from crosscue.eval.runs.candidates import candidate_lines, not_looked_lines
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.manifest import ApproachRow, SceneSummary
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.safe_text import terminal_width, visible, wrapped
 from crosscue.replay.time.segments import ONE_SEGMENT, TimeSegment
@@ -100,7 +100,7 @@ class Outcome(Result):
     landmark_counts: dict[str, int] = field(metadata=json_key("landmarks"))
     account: Account
     detected: DetectOutcome | None = field(default=None, metadata=HIDDEN)
-    scene: SceneOutcome | None = None
+    scene: SceneSummary | None = None
     segments: tuple[TimeSegment, ...] = field(default=ONE_SEGMENT.segments, metadata=HIDDEN)
 
     also: ClassVar = {"run": "run.path", "pose": "pose", "detected": "detection_counts"}
@@ -186,22 +186,22 @@ def _detected(outcome: Outcome) -> list[str]:
     return lines
 
 
-def _found(scene: SceneOutcome) -> list[str]:
+def _found(scene: SceneSummary) -> list[str]:
     """Return the output lines on approaches and cues."""
     seen = [f"{cue} {count:,}" for cue, count in scene.positive.items()]
     lines = [f"approach {_approach(one)}" for one in scene.approaches]
     return [*lines, f"cues     {', '.join(seen) or 'none'} (frames each, of {scene.frames:,})"]
 
 
-def _not_used(scene: SceneOutcome) -> list[str]:
+def _not_used(scene: SceneSummary) -> list[str]:
     """Return the output lines on detections that did not count, and cues not looked for."""
-    rows = candidate_rows(scene.candidates), candidate_rows(scene.ranged)
-    lines = [f"  skip   {sentence}" for sentence in candidate_lines(*rows)]
+    rows = candidate_lines(scene.candidates, scene.ranged)
+    lines = [f"  skip   {sentence}" for sentence in rows]
     lines += [f"  skip   {sentence}" for sentence in not_looked_lines(scene.not_looked_for)]
     return [*lines, *(f"  note   {n:,} x {what}" for what, n in scene.counts.items() if n)]
 
 
-def _approach(one: ApproachSummary) -> str:
+def _approach(one: ApproachRow) -> str:
     features = ", ".join(
         f"{feature} not seen" if feature in one.not_seen else f"{feature} {p:.2f}"
         for feature, p in one.probabilities.items()

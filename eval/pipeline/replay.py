@@ -10,12 +10,11 @@ from crosscue.detectors.result_cache import ResultCache
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.manifest import DetectManifest
+from crosscue.eval.runs.manifest import DetectManifest, SceneSummary
 from crosscue.localization.landmarks.database import LandmarkDatabase
 
 from .detect import Detecting, DetectStage
 from .estimate import Earlier, EstimateStage
-from .scene.outcome import SceneOutcome
 from .scene.stage import Scene, SceneTables, tables_of_scene
 
 
@@ -71,7 +70,7 @@ def observe(
     detected: DetectManifest,
     tables: SceneTables,
     without: frozenset[str] = frozenset(),
-) -> SceneOutcome:
+) -> SceneSummary:
     """Find cues, ranges and belief in a run's stored detections and odometry.
 
     No picture is opened and no log is read, so settings of cues, ranges and belief can be tried in

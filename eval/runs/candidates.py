@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Literal
 
 from crosscue.detectors.cues.candidates import BELOW_SCORE, NO_CURVE, TOO_LITTLE_ROAD, Candidates
@@ -30,15 +31,7 @@ class CandidateRow(Record):
 def candidate_rows(found: Mapping[str, Candidates]) -> dict[str, CandidateRow]:
     """Return candidates as rows of the manifest."""
     return {
-        cue: CandidateRow(
-            unit=one.unit,
-            setting=one.setting,
-            threshold=one.threshold,
-            seen=one.seen,
-            used=one.used,
-            skipped=dict(sorted(one.skipped.items())),
-            max_score=one.max_score,
-        )
+        cue: CandidateRow(**asdict(one) | {"skipped": dict(sorted(one.skipped.items()))})
         for cue, one in found.items()
     }
 

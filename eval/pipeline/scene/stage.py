@@ -21,9 +21,10 @@ from crosscue.eval.pipeline.progress import report_time
 from crosscue.eval.pipeline.scene.looked_for import needing_masks, not_looked_for
 from crosscue.eval.pipeline.scene.motion_ranges import MotionRanges, RangedObject
 from crosscue.eval.pipeline.scene.sign_ranges import MEASURED, SignRanges
+from crosscue.eval.runs.candidates import candidate_rows
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.manifest import DetectManifest
+from crosscue.eval.runs.manifest import ApproachRow, DetectManifest, SceneSummary
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
 from crosscue.eval.runs.tables.parquet import INT, REAL, TEXT, TableFolder, schema_of
@@ -37,7 +38,6 @@ from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .outcome import ApproachSummary, SceneOutcome
 from .roads import Roads, pitches_of
 
 if TYPE_CHECKING:
@@ -175,7 +175,7 @@ class Scene:
         self._frames = 0
         self._positive: Counter[str] = Counter()
         self._looked: set[str] = set()
-        self._summaries: dict[int, ApproachSummary] = {}
+        self._approach_rows: dict[int, ApproachRow] = {}
         self._before: FrameDetections | None = None
         self._ranges: tuple[RangeRow, ...] = ()
 
@@ -248,18 +248,21 @@ class Scene:
         self._sum_up(step)
         return step
 
-    def outcome(self) -> SceneOutcome:
+    def outcome(self) -> SceneSummary:
         """Return what the frames have shown."""
         cues, candidates = self._cues, self._cues.candidates
-        return SceneOutcome(
-            self._frames,
-            dict(sorted(self._positive.items())),
-            tuple(self._summaries.values()),
-            self._approaches.counts + self._motion.counts + cues.controls.counts + cues.notes(),
-            self._ego.without_odometry,
-            {cue: one for cue, one in candidates.items() if cue not in self._boxes_only},
-            self._signs.by_cue,
-            not_looked_for(
+        counts = self._approaches.counts + self._motion.counts + cues.controls.counts
+        return SceneSummary(
+            frames=self._frames,
+            positive=dict(sorted(self._positive.items())),
+            counts=dict(counts + cues.notes()),
+            without_odometry=self._ego.without_odometry,
+            approaches=tuple(self._approach_rows.values()),
+            candidates=candidate_rows(
+                {cue: one for cue, one in candidates.items() if cue not in self._boxes_only}
+            ),
+            ranged=candidate_rows(self._signs.by_cue),
+            not_looked_for=not_looked_for(
                 self._looked,
                 self._detected.detectors,
                 self._drive.vehicle.cue_labels(),
@@ -299,22 +302,34 @@ class Scene:
     def _sum_up(self, step: Step) -> None:
         if step.approach is None:
             return
-        is_new = step.approach not in self._summaries
-        one = self._summaries.setdefault(
-            step.approach, ApproachSummary(step.approach, step.t_ns, step.t_ns)
+        known = self._approach_rows.get(step.approach)
+        one = known or ApproachRow(
+            number=step.approach,
+            start_ns=step.t_ns,
+            end_ns=step.t_ns,
+            detected_ns=None,
+            detected_m=None,
+            reference=None,
+            probabilities={},
         )
-        one.end_ns = step.t_ns
-        one.probabilities = step.probabilities
-        one.not_seen = tuple(
-            name
-            for name, p in step.probabilities.items()
-            if p == self._priors[name] and (is_new or name in one.not_seen)
-        )
+        changed: dict[str, object] = {
+            "end_ns": step.t_ns,
+            "probabilities": dict(step.probabilities),
+            "not_seen": tuple(
+                name
+                for name, p in step.probabilities.items()
+                if p == self._priors[name] and (known is None or name in known.not_seen)
+            ),
+        }
         is_sure = step.probabilities.get(FEATURES[0], 0.0) > self._drive.vehicle.fusion.established
         if is_sure and step.ranges and one.detected_ns is None:
-            one.detected_ns = step.t_ns
-            one.detected_m = step.ranges[0].range_m
-            one.reference = str(step.ranges[0].reference)
+            first = step.ranges[0]
+            changed |= {
+                "detected_ns": step.t_ns,
+                "detected_m": first.range_m,
+                "reference": str(first.reference),
+            }
+        self._approach_rows[step.approach] = one.model_copy(update=changed)
 
 
 def intersection_place(ranges: Sequence[RangeRow], way_m: float, length_m: float) -> Place | None:
