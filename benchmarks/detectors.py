@@ -28,9 +28,10 @@ from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections
 from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.registry import chosen
-from crosscue.eval.pipeline.detect import detect_drive
+from crosscue.eval.pipeline.detect import Detecting
+from crosscue.eval.pipeline.whole_run import detect_drive
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import create
-from crosscue.replay.base import Selection
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import Vehicle
 
@@ -107,7 +108,7 @@ def detect_seconds(log_path: Path, run_path: Path, cache: Path) -> float:
     run = create(run_path, overwrite=True)
     began = time.perf_counter()
     with open_log(log_path) as log:
-        detect_drive([log], VEHICLE, run, Selection(), chosen("signs", {}), cache)
+        detect_drive(Drive([log], VEHICLE), run, Detecting(chosen("signs", {}), cache))
     return time.perf_counter() - began
 
 

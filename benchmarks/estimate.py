@@ -22,10 +22,10 @@ from crosscue.datasets.simulated.drive import DriveSettings, sense, true_motion,
 from crosscue.datasets.simulated.log_files import BUS, GYRO, MAGNETOMETER, sensor_blocks
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, DetectorChoice, Found, Frame, View
-from crosscue.eval.pipeline.detect import detect_drive
-from crosscue.eval.pipeline.whole_run import estimate_run
+from crosscue.eval.pipeline.detect import Detecting
+from crosscue.eval.pipeline.whole_run import detect_drive, estimate_run
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import create, open_run
-from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
@@ -132,7 +132,7 @@ def main() -> None:
         choice = DetectorChoice("busy", f"{__name__}:build")
         run = create(folder / "run", overwrite=False)
         with open_log(folder / "drive.mcap") as log:
-            detect_drive([log], vehicle, run, EVERYTHING, [choice])
+            detect_drive(Drive([log], vehicle), run, Detecting((choice,)))
         size = (folder / "drive.mcap").stat().st_size
         taken, cpu = [], []
         for _ in range(ROUNDS):

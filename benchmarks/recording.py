@@ -32,13 +32,13 @@ from crosscue.datasets.simulated.drive import DriveSettings, vehicle_text
 from crosscue.detectors import rle
 from crosscue.detectors.base import DetectorChoice
 from crosscue.detectors.images import Encoded
-from crosscue.eval.pipeline.detect import detect_drive
-from crosscue.eval.pipeline.whole_run import estimate_run
+from crosscue.eval.pipeline.detect import Detecting
+from crosscue.eval.pipeline.whole_run import detect_drive, estimate_run
 from crosscue.eval.recording import save_rrd
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create, open_run
 from crosscue.eval.runs.stored_images import read_pictures, run_camera
 from crosscue.eval.runs.tables.stored_frames import stored_frames
-from crosscue.replay.base import EVERYTHING
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.vehicle import parse
 
@@ -64,7 +64,8 @@ def make_run(folder: Path, minutes: float) -> tuple[RunFolder, float]:
     vehicle = parse(vehicle_text(settings, str(dbc)) + RANGES, "benchmark")
     run = create(folder / "run", overwrite=False)
     with open_log(folder / "drive.mcap") as log:
-        detect_drive([log], vehicle, run, EVERYTHING, [DetectorChoice("busy", "estimate:build")])
+        busy = Detecting((DetectorChoice("busy", "estimate:build"),))
+        detect_drive(Drive([log], vehicle), run, busy)
     estimate_run(open_run(run.path))
     return run, seconds
 

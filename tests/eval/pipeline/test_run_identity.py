@@ -122,9 +122,10 @@ def test_moved_logs_are_accepted_and_changed_logs_refused(
 def test_every_option_that_detects_differently_is_among_the_inputs_of_a_run() -> None:
     """A resumed run compares them, so that a forgotten one would keep stale detections."""
     plain = Detecting(())
-    other = {"choices": (DetectorChoice("lamp", "lamp"),), "draw": 3}
-    compared = {one.name for one in fields(Detecting) if one.compare}
+    changed = {
+        "choices": replace(plain, choices=(DetectorChoice("lamp", "lamp"),)),
+        "draw": replace(plain, draw=3),
+    }
 
-    assert other.keys() == compared
-    for name in compared:
-        assert replace(plain, **{name: other[name]}).as_json() != plain.as_json()
+    assert changed.keys() == {one.name for one in fields(Detecting) if one.compare}
+    assert all(one.as_json() != plain.as_json() for one in changed.values())
