@@ -2,17 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from crosscue.eval.report.mlflow_sink import Experiment, Tracked, open_experiment
 from crosscue.eval.runs.tags import read_tags
 from crosscue.eval.scoring.metric_values import metric_values
 
-if TYPE_CHECKING:
-    from .score_runs import ScoredRuns
+
+class Scores(Protocol):
+    """Result of ``score_runs``."""
+
+    @property
+    def runs(self) -> Sequence[Any]:
+        """The scored runs."""
+        ...
+
+    @property
+    def metrics(self) -> Mapping[str, Any]:
+        """Metrics of all runs together."""
+        ...
+
+    @property
+    def report(self) -> Path | None:
+        """Page of all runs together."""
+        ...
+
+    @property
+    def is_many(self) -> bool:
+        """True if several runs were to be scored."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +42,7 @@ class MlflowSink:
 
     experiment: Experiment
 
-    def log(self, found: ScoredRuns) -> tuple[str, ...]:
+    def log(self, found: Scores) -> tuple[str, ...]:
         """Log each scored run as a run of the experiment, and one more for all together.
 
         Scores become metrics. The run's tags, its drive's identity and crosscue's version become
