@@ -123,7 +123,7 @@ class Detections:
 
     @property
     def heights_px(self) -> NDArray[np.float64]:
-        """Height of each object, shape (N,): of its mask if that was measured, else of its box."""
+        """Shape (N,), the height of each object, of its mask if measured, else of its box."""
         if self.spans_px is not None:
             return self.spans_px
         return np.asarray(self.boxes_px[:, 3] - self.boxes_px[:, 1])
