@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,7 @@ from crosscue.replay.errors import UsageError
 
 from .quaternions import about_z, angle_rad, between, inverse, product, rotate
 
-Alignment: TypeAlias = Literal["none", "origin", "yaw", "se3"]
-Pairing: TypeAlias = Literal["interpolated", "nearest"]
+Alignment: TypeAlias = Literal["none", "origin", "yaw"]
 Indices: TypeAlias = NDArray[np.intp]
 
 
@@ -128,38 +127,19 @@ class NeesSummary:
     fraction_inside_95: float
 
 
-class RpeDelta(NamedTuple):
-    """Distance between the poses of a relative error.
-
-    Attributes:
-        size: Number of frames, or metres along the path.
-        unit: Unit of ``size``.
-        all_pairs: True for all pairs of that distance, False for consecutive pairs.
-        tolerance: Allowed deviation of a pair from ``size``, as a fraction of it, for metres with
-            ``all_pairs``.
-    """
-
-    size: float
-    unit: Literal["frames", "metres"]
-    all_pairs: bool = False
-    tolerance: float = 0.1
-
-
 def pair_poses(
     truth: Trajectory,
     estimate: Trajectory,
     max_difference_ns: int,
     cov_xyh: Floats | None = None,
-    how: Pairing = "interpolated",
 ) -> Paired:
-    """Return the estimates at the times of the true poses.
+    """Interpolate the estimates at the times of the true poses.
 
     Args:
         truth: True poses.
         estimate: Estimated poses.
         max_difference_ns: Max time between a true pose and the nearest estimate.
         cov_xyh: Shape (M, 6): covariance of the estimates, to be paired as well.
-        how: Interpolate between the estimates, or use the nearest one.
 
     Raises:
         ValueError: ``cov_xyh`` does not fit the estimate.
@@ -173,21 +153,12 @@ def pair_poses(
     before = np.maximum(after - (estimate.t_ns[after] > truth.t_ns), 0)
     to_before = np.abs(truth.t_ns - estimate.t_ns[before])
     to_after = np.abs(estimate.t_ns[after] - truth.t_ns)
-    near = np.minimum(to_before, to_after) <= max_difference_ns
     early, late = truth.t_ns < estimate.t_ns[0], truth.t_ns > estimate.t_ns[-1]
-    if how == "interpolated":
-        near &= ~early & ~late
-    coverage = Coverage(
-        len(truth),
-        int(near.sum()),
-        int((early & ~near).sum()),
-        int((late & ~near).sum()),
-        int((~near & ~early & ~late).sum()),
-    )
+    near = (np.minimum(to_before, to_after) <= max_difference_ns) & ~early & ~late
+    counts = (int(kind.sum()) for kind in (near, early, late, ~near & ~early & ~late))
+    coverage = Coverage(len(truth), *counts)
     if not near.any():
         raise UsageError(f"no true pose has an estimate within {max_difference_ns} ns: {coverage}")
-    if how == "nearest":
-        before = after = np.where(to_before <= to_after, before, after)
     at = _taken(truth, near)
     found, cov = _between(estimate, before[near], after[near], at.t_ns, cov_xyh)
     return Paired(at, found, cov, coverage)
@@ -200,8 +171,7 @@ def align(truth: Trajectory, estimate: Trajectory, how: Alignment) -> Trajectory
         truth: N poses.
         estimate: N poses at the same times.
         how: ``origin`` aligns the first poses. ``yaw`` rotates about the vertical and translates,
-            by least squares of the positions. ``se3`` also rotates about other axes (Umeyama's
-            solution, by Horn's quaternions, JOSA A 4, 1987).
+            by least squares of the positions.
 
     Raises:
         UsageError: The positions do not determine the rotation.
@@ -213,8 +183,7 @@ def align(truth: Trajectory, estimate: Trajectory, how: Alignment) -> Trajectory
         return _moved(estimate, turn, estimate.xyz_m[0], truth.xyz_m[0])
     center, to = estimate.xyz_m.mean(axis=0), truth.xyz_m.mean(axis=0)
     products = (estimate.xyz_m - center).T @ (truth.xyz_m - to)
-    turn = _yaw_turn(products) if how == "yaw" else _free_turn(products)
-    return _moved(estimate, turn, center, to)
+    return _moved(estimate, _yaw_turn(products), center, to)
 
 
 def ape(truth: Trajectory, estimate: Trajectory) -> PoseErrors:
@@ -224,40 +193,30 @@ def ape(truth: Trajectory, estimate: Trajectory) -> PoseErrors:
     return PoseErrors(truth.t_ns, distance, angle_rad(turn))
 
 
-def rpe(truth: Trajectory, estimate: Trajectory, delta: RpeDelta) -> PoseErrors:
-    """Return the error of the motion between poses at a given distance: evo's RPE.
+def rpe(truth: Trajectory, estimate: Trajectory, size_m: float) -> PoseErrors:
+    """Return the error of the motion between consecutive poses ``size_m`` apart: evo's RPE.
 
     Pairs are chosen along the estimate, as in evo.
 
     Raises:
+        ValueError: The size is not positive.
         UsageError: No two poses are that far apart.
     """
-    first, second = rpe_pairs(estimate.xyz_m, delta)
-    if len(first) == 0:
-        raise UsageError(
-            f"no two of {len(estimate)} poses are {delta.size:g} {delta.unit} apart; use less"
-        )
+    if not (math.isfinite(size_m) and size_m > 0.0):
+        raise ValueError(f"size_m: expected > 0, got {size_m}")
+    stops, gone_m = [0], 0.0
+    for i, step_m in enumerate(np.linalg.norm(np.diff(estimate.xyz_m, axis=0), axis=1), start=1):
+        gone_m += float(step_m)
+        if gone_m >= size_m:
+            stops.append(i)
+            gone_m = 0.0
+    if len(stops) == 1:
+        raise UsageError(f"no two of {len(estimate)} poses are {size_m:g} metres apart; use less")
+    first, second = np.array(stops[:-1], np.intp), np.array(stops[1:], np.intp)
     true_step, true_turn = _steps(truth, first, second)
     step, turn = _steps(estimate, first, second)
     apart = np.linalg.norm(step - true_step, axis=1)
     return PoseErrors(truth.t_ns[second], apart, angle_rad(product(inverse(true_turn), turn)))
-
-
-def rpe_pairs(xyz_m: Floats, delta: RpeDelta) -> tuple[Indices, Indices]:
-    """Return the indices of the earlier and the later pose of each pair.
-
-    Raises:
-        ValueError: The size is not positive, or is not an integer number of frames.
-    """
-    if not (math.isfinite(delta.size) and delta.size > 0.0):
-        raise ValueError(f"size: expected > 0, got {delta.size}")
-    if delta.unit == "metres":
-        return _metre_pairs(xyz_m, delta)
-    frames = int(delta.size)
-    if frames != delta.size:
-        raise ValueError(f"size: expected a whole number of frames, got {delta.size}")
-    first = np.arange(0, max(len(xyz_m) - frames, 0), 1 if delta.all_pairs else frames)
-    return first, first + frames
 
 
 def statistics(errors: Floats) -> ErrorStatistics:
@@ -364,61 +323,8 @@ def _yaw_turn(products: Floats) -> Floats:
     return about_z(math.atan2(across, along))
 
 
-def _free_turn(products: Floats) -> Floats:
-    """Return Horn's quaternion: the eigenvector of the largest eigenvalue."""
-    cross = np.array(
-        [
-            products[1, 2] - products[2, 1],
-            products[2, 0] - products[0, 2],
-            products[0, 1] - products[1, 0],
-        ]
-    )
-    trace = np.trace(products)
-    form = np.empty((4, 4))
-    form[0, 0] = trace
-    form[0, 1:] = form[1:, 0] = cross
-    form[1:, 1:] = products + products.T - trace * np.eye(3)
-    values, vectors = np.linalg.eigh(form)
-    if values[3] - values[2] <= 1e-12 * max(values[3], 1e-300):
-        raise UsageError(
-            "the positions do not determine rotation (straight drive?); align by yaw or origin"
-        )
-    return np.asarray(vectors[:, 3])
-
-
 def _steps(trajectory: Trajectory, first: Indices, second: Indices) -> tuple[Floats, Floats]:
     """Return each later pose in the frame of the earlier one."""
     back = inverse(trajectory.quat_wxyz[first])
     step = rotate(back, trajectory.xyz_m[second] - trajectory.xyz_m[first])
     return step, product(back, trajectory.quat_wxyz[second])
-
-
-def _metre_pairs(xyz_m: Floats, delta: RpeDelta) -> tuple[Indices, Indices]:
-    steps = np.linalg.norm(np.diff(xyz_m, axis=0), axis=1)
-    if not delta.all_pairs:
-        stops, gone = [0], 0.0
-        for i, step in enumerate(steps.tolist(), start=1):
-            gone += step
-            if gone >= delta.size:
-                stops.append(i)
-                gone = 0.0
-        ends = np.array(stops, np.intp)
-        return ends[:-1], ends[1:]
-    travelled = np.concatenate([[0.0], np.cumsum(steps)])
-    first = np.arange(max(len(xyz_m) - 1, 0))
-    return _nearest_pairs(travelled, first, delta.size, delta.size * delta.tolerance)
-
-
-def _nearest_pairs(
-    travelled: Floats, first: Indices, size_m: float, tolerance_m: float
-) -> tuple[Indices, Indices]:
-    """Return, for each pose, the later pose whose distance from it is nearest to ``size_m``."""
-    wanted = travelled[first] + size_m
-    above = np.clip(np.searchsorted(travelled, wanted), first + 1, len(travelled) - 1)
-    below = np.searchsorted(travelled, travelled[above - 1])
-    below = np.maximum(below, first + 1)
-    off_above = np.abs(travelled[above] - travelled[first] - size_m)
-    off_below = np.abs(travelled[below] - travelled[first] - size_m)
-    second = np.where(off_below <= off_above, below, above)
-    keep = np.minimum(off_below, off_above) <= tolerance_m
-    return first[keep], second[keep]

@@ -34,7 +34,6 @@ from .errors import (
     ErrorStatistics,
     NeesSummary,
     Paired,
-    RpeDelta,
     align,
     ape,
     pair_poses,
@@ -352,7 +351,7 @@ def _rpe(paired: Paired, sizes_m: Sequence[float]) -> dict[str, PoseErrorSummary
     for size_m in sizes_m:
         if size_m >= way_m:
             continue
-        errors = rpe(paired.truth, paired.estimate, RpeDelta(size_m, "metres"))
+        errors = rpe(paired.truth, paired.estimate, size_m)
         found[f"{size_m:g} m"] = PoseErrorSummary(
             statistics(errors.translation_m), statistics(np.rad2deg(errors.rotation_rad))
         )
