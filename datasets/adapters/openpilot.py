@@ -209,8 +209,8 @@ class _OtherMessages:
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """One topic for all of them."""
-        return (Topic(OTHER, "openpilot/Event", "capnp", declared=self.kinds.total()),)
+        """None: they can be counted only."""
+        return ()
 
     def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
         """Account for them."""
