@@ -1,10 +1,10 @@
 """Heading from a magnetometer.
 
 A reading is corrected for iron that turns with the car (hard iron: an offset; soft iron: a
-matrix), rotated into the car's axes forward, left, up, and levelled if roll and pitch are known.
-Its horizontal part points to magnetic north. Heading is counter-clockwise from east; magnetic north
-is ``declination_rad`` clockwise of true north. Model: M. Caruso, "Applications of Magnetic Sensors
-for Low Cost Compass Systems", IEEE PLANS 2000.
+matrix) and rotated into the car's axes forward, left, up; the car counts as level. Its horizontal
+part points to magnetic north. Heading is counter-clockwise from east; magnetic north is
+``declination_rad`` clockwise of true north. Model: M. Caruso, "Applications of Magnetic Sensors for
+Low Cost Compass Systems", IEEE PLANS 2000.
 """
 
 from __future__ import annotations
@@ -68,63 +68,37 @@ class CompassSettings:
 def heading(
     field_t: NDArray[np.float64],
     settings: CompassSettings,
-    roll_rad: NDArray[np.float64] | None = None,
-    pitch_rad: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Compute headings of the car, counter-clockwise from east.
 
     Args:
         field_t: Shape (N, 3): readings in the sensor's axes, in the unit of ``hard_iron_t``.
         settings: Mounting and calibration of the compass.
-        roll_rad: Shape (N,): about forward, right side down positive; None for a level car.
-        pitch_rad: Shape (N,): about left, nose down positive; None for a level car.
 
     Returns:
         Shape (N,), in (-pi, pi]; NaN where a reading is not finite or has no horizontal part.
 
     Raises:
-        ValueError: Columns differ in length.
+        ValueError: The readings have another shape.
     """
-    level = level_field(field_t, settings, roll_rad, pitch_rad)
+    level = level_field(field_t, settings)
     forward, left = level[:, 0], level[:, 1]
     north_rad = np.arctan2(left, forward) + settings.mounting_yaw_rad
     found = wrap_all(math.pi / 2 - settings.declination_rad - north_rad)
     return np.where(np.hypot(forward, left) > 0.0, found, np.nan)
 
 
-def level_field(
-    field_t: NDArray[np.float64],
-    settings: CompassSettings,
-    roll_rad: NDArray[np.float64] | None = None,
-    pitch_rad: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
-    """Correct readings and rotate them to level axes forward, left, up, without the mounting yaw.
+def level_field(field_t: NDArray[np.float64], settings: CompassSettings) -> NDArray[np.float64]:
+    """Correct readings and rotate them to the axes forward, left, up, without the mounting yaw.
 
     Arguments and errors are those of ``heading``; the result has shape (N, 3).
     """
     n = len(field_t)
     if field_t.shape != (n, 3):
         raise ValueError(f"field_t: expected ({n}, 3), got {field_t.shape}")
-    for name, angle in (("roll_rad", roll_rad), ("pitch_rad", pitch_rad)):
-        if angle is not None and angle.shape != (n,):
-            raise ValueError(f"{name}: expected ({n},), got {angle.shape}")
     to_car = np.array(settings.mounting_rotation) @ np.array(settings.soft_iron)
     body: NDArray[np.float64] = (field_t - np.array(settings.hard_iron_t)) @ to_car.T
-    if roll_rad is None and pitch_rad is None:
-        return body
-    zero = np.zeros(n)
-    roll = zero if roll_rad is None else roll_rad
-    pitch = zero if pitch_rad is None else pitch_rad
-    forward, left, up = body.T
-    left_of = np.cos(roll) * left - np.sin(roll) * up
-    up_of = np.sin(roll) * left + np.cos(roll) * up
-    return np.column_stack(
-        [
-            np.cos(pitch) * forward + np.sin(pitch) * up_of,
-            left_of,
-            np.cos(pitch) * up_of - np.sin(pitch) * forward,
-        ]
-    )
+    return body
 
 
 def course_at(

@@ -33,9 +33,6 @@ CASES: Final[dict[str, Callable[[], object]]] = {
     r"field_t: expected \(4, 3\), got \(4, 2\)": lambda: heading(
         np.zeros((4, 2)), CompassSettings()
     ),
-    r"roll_rad: expected \(4,\), got \(3,\)": lambda: heading(
-        np.zeros((4, 3)), CompassSettings(), roll_rad=np.zeros(3)
-    ),
     "cancel out": lambda: circular_mean(np.array([0.0, math.pi])),
     "at least one angle": lambda: circular_mean(EMPTY),
     "at least one option": lambda: choose_option(EMPTY, EMPTY, EMPTY),
