@@ -151,6 +151,9 @@ class _Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit status."""
     _prepare_streams()
+    # Before NumPy is imported: starting threads for its linear algebra takes longer than a small
+    # log, and sums of another order differ from machine to machine.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     warnings.formatwarning = lambda message, *_, **__: f"crosscue: {visible(str(message))}\n"
     if "_ARGCOMPLETE" in os.environ:
         from crosscue.eval.completion import complete

@@ -338,7 +338,13 @@ def _hints(function: Callable[..., Any]) -> dict[str, Any]:
     plain = inspect.unwrap(function)
     notes = {name: kind for name, kind in plain.__annotations__.items() if name != "return"}
     holder: Any = types.SimpleNamespace(__annotations__=notes)
-    return typing.get_type_hints(holder, vars(inspect.getmodule(plain)), include_extras=True)
+    names = vars(inspect.getmodule(plain))
+    while True:
+        try:
+            return typing.get_type_hints(holder, names, include_extras=True)
+        except NameError as error:
+            # A type that is only known to type checkers, because its import takes long.
+            names = {**names, error.name: type(error.name, (), {})}
 
 
 def types_of(function: Callable[..., Any]) -> dict[str, Any]:

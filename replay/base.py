@@ -170,6 +170,26 @@ def report_missing(log: Log, ledger: Ledger) -> None:
         log.report_missing(ledger)
 
 
+@runtime_checkable
+class KnowsItsStart(Protocol):
+    """A log that finds its start faster than by reading its first block."""
+
+    def start_ns(self) -> int | None:
+        """Return the log time of the first stored row; None if it has to be read."""
+        ...
+
+
+def start_ns(log: Log) -> int | None:
+    """Return the log time of the first stored row; None without a row."""
+    known = log.start_ns() if isinstance(log, KnowsItsStart) else None
+    return known if known is not None else first_stored_ns(log.read(Ledger(name_of(log))))
+
+
+def first_stored_ns(blocks: Iterator[Block]) -> int | None:
+    """Return the lowest log time of the first block with a row; None without a row."""
+    return next((int(block.log_ns.min()) for block in blocks if len(block)), None)
+
+
 class WrappedLog(Closing):
     """A log that wraps another log; subclasses change how it is read or closed."""
 
@@ -195,6 +215,10 @@ class WrappedLog(Closing):
     def report_missing(self, ledger: Ledger) -> None:
         """Report missing rows of the log; see ``KnowsItsEnd``."""
         report_missing(self._log, ledger)
+
+    def start_ns(self) -> int | None:
+        """Return the log time of the first stored row, if the log knows it."""
+        return self._log.start_ns() if isinstance(self._log, KnowsItsStart) else None
 
     def close(self) -> None:
         """Close the log."""

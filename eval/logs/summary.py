@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
-from crosscue.eval.pipeline.drive_time import plan_for_time, time_segments
+from crosscue.eval.pipeline.drive_time import (
+    may_have_wheels,
+    plan_for_time,
+    time_segments,
+    without_wheels,
+)
 from crosscue.eval.runs.drive import Drive
+from crosscue.replay.base import Log, Selection
 from crosscue.replay.clocks.findings import instant_text
 from crosscue.replay.logs.log_summary import (
     LogSummary,
@@ -21,12 +27,14 @@ from crosscue.replay.logs.log_summary import (
     summarise_log,
 )
 from crosscue.replay.safe_text import table, terminal_width, wrapped
-from crosscue.replay.time.scan import LogWatch, timeline_from
-from crosscue.replay.time.segments import Timeline, gaps_text
-from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
+from crosscue.replay.time.scan import DriveWatch
+from crosscue.replay.time.segments import SplitLimits, Timeline, gaps_text
 from crosscue.results import HIDDEN, Result
 
 from .log import DriveGiven, opened
+
+if TYPE_CHECKING:
+    from crosscue.replay.vehicle.vehicle import Vehicle
 
 LOSSES_SHOWN: Final = 10
 
@@ -101,29 +109,41 @@ def info(
         quick: Print what the log declares, and whether its end is missing, without reading its
             messages.
     """
-    settings = vehicle_given(vehicle)
+    settings = None if vehicle is None else _settings(vehicle)
     with opened(log) as drive:
-        return summary_of(Drive(drive.logs, settings, drive.selection), quick=quick)
+        if quick:
+            return DriveSummary(tuple(map(quick_summary, drive.logs)), None)
+        return summary_of(drive.logs, drive.selection, settings)
 
 
-def summary_of(drive: Drive, *, quick: bool) -> DriveSummary:
-    """Summarise logs, by reading each once or only its declarations.
+def _settings(given: Vehicle | Path | str | None) -> Vehicle:
+    # A vehicle file takes longer to import than a small log to read.
+    from crosscue.replay.vehicle.vehicle import vehicle_given
+
+    return vehicle_given(given)
+
+
+def summary_of(logs: Sequence[Log], selection: Selection, vehicle: Vehicle | None) -> DriveSummary:
+    """Summarise logs, by reading each once.
 
     Args:
-        drive: The drive; its vehicle has the topic of wheel speeds, to find gaps.
-        quick: Do not read messages.
+        logs: Open logs of one drive.
+        selection: The part to read.
+        vehicle: Vehicle file with the topic of wheel speeds, to find gaps; None for the defaults.
     """
-    logs, vehicle, selection = drive.logs, drive.vehicle, drive.selection
-    if quick:
-        return DriveSummary(tuple(map(quick_summary, logs)), None)
-    planned, wheels = plan_for_time(drive)
-    watches = [LogWatch(i, planned, vehicle, wheels[i]) for i in range(len(logs))]
-    found = tuple(
-        summarise_log(log, selection, watch.add) for log, watch in zip(logs, watches, strict=True)
+    if vehicle is None and may_have_wheels(logs):
+        vehicle = _settings(None)
+    limits = SplitLimits() if vehicle is None else vehicle.time.split
+    planned, wheels = (
+        without_wheels(logs) if vehicle is None else plan_for_time(Drive(logs, vehicle, selection))
     )
-    timeline = timeline_from(watches, planned, vehicle)
+    watch = DriveWatch(planned, limits, wheels)
+    found = tuple(
+        summarise_log(log, selection, one.add) for log, one in zip(logs, watch.logs, strict=True)
+    )
     together = common_span(found) if len(found) > 1 else None
-    return DriveSummary(found, together, timeline, vehicle.camera.delay_s)
+    delay_s = 0.0 if vehicle is None else vehicle.camera.delay_s
+    return DriveSummary(found, together, watch.timeline(), delay_s)
 
 
 def lines_of(summary: LogSummary, width: int) -> Iterator[str]:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from crosscue.eval.runs.drive import Drive
-from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.manifest import TimeSegments
-from crosscue.replay.base import Selection
-from crosscue.replay.columns import Topic
+from crosscue.replay.base import Log, Selection
+from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import UsageError, VehicleError
-from crosscue.replay.signals.extractor import SampleExtractor, probe_clocks, wheels_only
-from crosscue.replay.signals.kinds import Signal, SignalPlan
+from crosscue.replay.signals.extractor import probe_clocks, wheels_only
+from crosscue.replay.signals.kinds import Samples, Signal, SignalPlan
 from crosscue.replay.signals.plan import pictures_only, plan, with_pictures
-from crosscue.replay.time.scan import scan
+from crosscue.replay.time.scan import WheelReader, scan
 from crosscue.replay.time.segments import Timeline, gaps_text
-from crosscue.replay.vehicle.vehicle import Vehicle
+from crosscue.replay.vehicle.roles import Role, role_of
+
+if TYPE_CHECKING:
+    from crosscue.eval.runs.folder import RunFolder
+    from crosscue.eval.runs.manifest import TimeSegments
 
 
 def with_segments(
@@ -42,7 +46,8 @@ def with_segments(
         wheels_only(planned, vehicle, i, probe_clocks(log, planned, vehicle, i, selections[i]))
         for i, log in enumerate(logs)
     ]
-    return replace(drive, segments=scan(logs, planned, vehicle, selections, wheels, known))
+    limits = vehicle.time.split
+    return replace(drive, segments=scan(logs, planned, limits, selections, wheels, known))
 
 
 def with_camera_segments(drive: Drive) -> Drive:
@@ -55,10 +60,10 @@ def with_camera_segments(drive: Drive) -> Drive:
     try:
         return with_segments(drive, camera)
     except VehicleError:
-        planned, logs, vehicle = pictures_only(camera), drive.logs, drive.vehicle
-        wheels = _no_wheels(planned, vehicle, len(logs))
+        planned, logs, limits = pictures_only(camera), drive.logs, drive.vehicle.time.split
+        wheels = [_no_wheels] * len(logs)
         return replace(
-            drive, segments=scan(logs, planned, vehicle, selections_of(drive, planned), wheels)
+            drive, segments=scan(logs, planned, limits, selections_of(drive, planned), wheels)
         )
 
 
@@ -86,10 +91,11 @@ def refuse_other_segments(run: RunFolder, timeline: Timeline) -> None:
 def whole_timeline(drive: Drive) -> Timeline:
     """Return the segments as ``with_segments`` does, from the stamps of all topics."""
     planned, wheels = plan_for_time(drive)
-    return scan(drive.logs, planned, drive.vehicle, [drive.selection] * len(drive.logs), wheels)
+    limits = drive.vehicle.time.split
+    return scan(drive.logs, planned, limits, [drive.selection] * len(drive.logs), wheels)
 
 
-def plan_for_time(drive: Drive) -> tuple[SignalPlan, list[SampleExtractor]]:
+def plan_for_time(drive: Drive) -> tuple[SignalPlan, list[WheelReader]]:
     """Return the plan for the wheel speeds, and an extractor for each log.
 
     Without wheel speeds nothing is planned; clock set-backs are still found.
@@ -98,8 +104,7 @@ def plan_for_time(drive: Drive) -> tuple[SignalPlan, list[SampleExtractor]]:
     try:
         planned = plan(drive.topics, vehicle)
     except VehicleError:
-        planned = SignalPlan((), {})
-        return planned, _no_wheels(planned, vehicle, len(logs))
+        return without_wheels(logs)
     wheels = planned.source_of(Signal.WHEEL_SPEEDS)
     planned = SignalPlan(() if wheels is None else (wheels,), {})
     selections = selections_of(drive, planned)
@@ -110,8 +115,20 @@ def plan_for_time(drive: Drive) -> tuple[SignalPlan, list[SampleExtractor]]:
     return planned, [wheels_only(planned, vehicle, i, used) for i, used in enumerate(clocks)]
 
 
-def _no_wheels(planned: SignalPlan, vehicle: Vehicle, logs: int) -> list[SampleExtractor]:
-    return [wheels_only(planned, vehicle, i, {}) for i in range(logs)]
+def may_have_wheels(logs: Sequence[Log]) -> bool:
+    """Return whether a topic has wheel speeds without a vehicle file that names them."""
+    roles = {role_of(topic) for log in logs for topic in log.topics}
+    return not roles.isdisjoint((Role.WHEELS, Role.ODOMETRY))
+
+
+def without_wheels(logs: Sequence[Log]) -> tuple[SignalPlan, list[WheelReader]]:
+    """Return a plan without wheel speeds, as ``plan_for_time`` returns one with them."""
+    return SignalPlan((), {}), [_no_wheels] * len(logs)
+
+
+def _no_wheels(block: Block) -> tuple[Samples, ...]:
+    """Find no wheel speeds in a block."""
+    return ()
 
 
 def selections_of(drive: Drive, planned: SignalPlan) -> list[Selection]:
@@ -126,6 +143,8 @@ def _narrowed(selection: Selection, planned: frozenset[str]) -> Selection:
 
 def time_segments(timeline: Timeline) -> TimeSegments:
     """Return a timeline in the form of the manifest."""
+    from crosscue.eval.runs.manifest import TimeSegments
+
     return TimeSegments(
         segments=timeline.segments,
         clocks=timeline.clocks,

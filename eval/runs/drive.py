@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from crosscue.replay.base import EVERYTHING, Log, Selection
 from crosscue.replay.columns import Topic
@@ -11,7 +12,9 @@ from crosscue.replay.errors import EmptyResultError
 from crosscue.replay.logs.opening import unless_damaged
 from crosscue.replay.signals.plan import chosen_camera
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
-from crosscue.replay.vehicle.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from crosscue.replay.vehicle.vehicle import Vehicle
 
 
 @dataclass(frozen=True, slots=True)

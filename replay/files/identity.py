@@ -24,17 +24,18 @@ import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path, PurePosixPath
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
-from crosscue.replay.base import Log
+from crosscue.replay.base import HasUrl, Log
 from crosscue.replay.errors import LogError
 from crosscue.replay.files.log_identity import Identity
 from crosscue.replay.limits import MIB
 from crosscue.replay.remote.address import LogAddress, is_remote
-from crosscue.replay.remote.logs import RangedLog, RemoteFiles, by_ranges, fetch_log
-from crosscue.replay.remote.ranges import RangedFile
 
 from .tree_text import spelled
+
+if TYPE_CHECKING:
+    from crosscue.replay.remote.ranges import RangedFile
 
 SHARE_BYTES: Final = 4 * MIB
 MIN_BYTES: Final = 64 << 10
@@ -81,10 +82,17 @@ def identity_of_log(log: Log) -> Identity:
     Raises:
         LogError: It no longer exists or cannot be read.
     """
-    return _identity_of_ranged(log.ranged) if isinstance(log, RangedLog) else log_identity(log.path)
+    if isinstance(log, HasUrl):
+        from crosscue.replay.remote.logs import RangedLog
+
+        if isinstance(log, RangedLog):
+            return _identity_of_ranged(log.ranged)
+    return log_identity(log.path)
 
 
 def _identity_of_url(url: LogAddress) -> Identity:
+    from crosscue.replay.remote.logs import by_ranges, fetch_log
+
     ranged = by_ranges(url)
     if ranged is not None:
         with closing(ranged):
@@ -98,6 +106,8 @@ def _identity_of_url(url: LogAddress) -> Identity:
 
 def _identity_of_parts(url: LogAddress) -> Identity | None:
     """Return the identity of a remote log of any format; None if all of it should be fetched."""
+    from crosscue.replay.remote.logs import RemoteFiles
+
     remote = RemoteFiles(url)
     names = sorted(_names_of(url.name, remote.sizes).items(), key=lambda one: os.fsencode(one[0]))
     max_bytes = _hashed_bytes(len(names))

@@ -14,7 +14,6 @@ import json
 import math
 import os
 import re
-import tomllib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -73,6 +72,8 @@ def toml_tree(text: str) -> dict[str, Any]:
     """
     _check_toml(text)
     try:
+        import tomllib  # most logs have no seal, and need none
+
         tree = tomllib.loads(text)
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None

@@ -8,10 +8,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
-from crosscue.replay.base import Log, Selection, name_of
+from crosscue.replay.base import Log, Selection, start_ns
 from crosscue.replay.errors import MissingTopicError, UsageError
-from crosscue.replay.ledger import Ledger
-from crosscue.replay.remote.logs import RangedLog
 from crosscue.verb import Option
 
 
@@ -119,13 +117,7 @@ def first_ns(logs: Sequence[Log]) -> int:
     Raises:
         MissingTopicError: No log contains a row.
     """
-    starts: list[int] = []
-    for log in logs:
-        blocks = log.first_blocks if isinstance(log, RangedLog) else log.read
-        for block in blocks(Ledger(name_of(log))):
-            if len(block):
-                starts.append(int(block.log_ns.min()))
-                break
+    starts = [start for start in map(start_ns, logs) if start is not None]
     if not starts:
         raise MissingTopicError(
             "begin, end: the log holds no row, so it has no start; leave them out"

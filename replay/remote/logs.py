@@ -22,7 +22,15 @@ from importlib import import_module
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, Final, Protocol, TypeVar, cast
 
-from crosscue.replay.base import EVERYTHING, KnowsItsEnd, Log, Selection, WrappedLog
+from crosscue.replay.base import (
+    EVERYTHING,
+    KnowsItsEnd,
+    KnowsItsStart,
+    Log,
+    Selection,
+    WrappedLog,
+    first_stored_ns,
+)
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import (
     CrosscueError,
@@ -302,9 +310,10 @@ class RangedLog(Closing):
         if isinstance(self._log, KnowsItsEnd):
             self._log.report_missing(ledger)
 
-    def first_blocks(self, ledger: Ledger) -> Iterator[Block]:
-        """Read only the first chunk, for callers that need only the beginning."""
-        return self.read(ledger, self._log.beginning)
+    def start_ns(self) -> int | None:
+        """Return the log time of the first stored row, from the index or the first chunk."""
+        known = self._log.start_ns() if isinstance(self._log, KnowsItsStart) else None
+        return known or first_stored_ns(self.read(Ledger(self.url), self._log.beginning))
 
     def close(self) -> None:
         """Close the connection and release the local copy."""

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from crosscue.replay.columns import Block, Floats, Int64s, Table
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.vehicle.vehicle import AngleSignal
 
 from .kinds import Samples, Signal
+
+if TYPE_CHECKING:
+    from crosscue.replay.vehicle.vehicle import AngleSignal
 
 SPEED_UNITS: Final[Mapping[str, float]] = {
     "m/s": 1.0, "mps": 1.0, "km/h": 1 / 3.6, "kph": 1 / 3.6, "kmh": 1 / 3.6, "kmph": 1 / 3.6,

@@ -16,13 +16,13 @@ from crosscue.replay.columns import Block, Images, Int64s, Topic
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.roles import Role, role_of
-from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .converters import FROM_TABLE
 from .kinds import MOBILEYE_SIGNALS, Samples, Signal, SignalPlan, SignalSource
 
 if TYPE_CHECKING:
     from crosscue.replay.decode.packets import PacketDecoder
+    from crosscue.replay.vehicle.vehicle import Vehicle
 
 
 # Duration at a log's start that is examined to choose a clock for each topic.

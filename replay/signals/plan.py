@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import MissingTopicError, VehicleError
 from crosscue.replay.vehicle.roles import Role, role_of
-from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .kinds import MOBILEYE_SIGNALS, Signal, SignalPlan, SignalSource
+
+if TYPE_CHECKING:
+    from crosscue.replay.vehicle.vehicle import Vehicle
 
 
 @dataclass(slots=True)

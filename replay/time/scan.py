@@ -19,9 +19,17 @@ from crosscue.replay.base import Log, Selection
 from crosscue.replay.columns import Block
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.signals.kinds import Samples, Signal, SignalPlan, SignalSource
-from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .segments import BEGINNING, Cause, Epoch, EpochMarks, LogClock, Timeline, TimeSegment
+from .segments import (
+    BEGINNING,
+    Cause,
+    Epoch,
+    EpochMarks,
+    LogClock,
+    SplitLimits,
+    Timeline,
+    TimeSegment,
+)
 from .stamp_watch import StampWatch
 
 # Max difference of the set-backs of two topics or logs that count as one.
@@ -123,7 +131,7 @@ class _WheelRuns:
 def scan(
     logs: Sequence[Log],
     planned: SignalPlan,
-    vehicle: Vehicle,
+    limits: SplitLimits,
     selections: Sequence[Selection],
     wheels: Sequence[WheelReader],
     known: Timeline | None = None,
@@ -133,34 +141,28 @@ def scan(
     Args:
         logs: All logs of the drive, open.
         planned: Plan of the topics that will be used.
-        vehicle: Vehicle with the limits, under ``[time]``.
+        limits: Limits at which the drive is split.
         selections: Selection that will be read of each log.
         wheels: For each log, the reader of wheel speeds from its blocks.
         known: Earlier timeline of these logs. Its shifts are kept, so that the tables of both can
             be joined.
     """
-    watches = [LogWatch(number, planned, vehicle, wheels[number]) for number in range(len(logs))]
-    for watch, log, selection in zip(watches, logs, selections, strict=True):
+    watch = DriveWatch(planned, limits, wheels)
+    for one, log, selection in zip(watch.logs, logs, selections, strict=True):
         if selection.topics is None or selection.topics:
             for block in log.read(Ledger(""), selection):
-                watch.add(block)
-    return timeline_from(watches, planned, vehicle, known)
+                one.add(block)
+    return watch.timeline(known)
 
 
 class LogWatch:
-    """Incremental scan of one log's stamps and wheel speeds, from its blocks in stored order.
+    """Incremental scan of one log's stamps and wheel speeds, from its blocks in stored order."""
 
-    It serves callers that read the log anyway; ``scan`` reads the log for this purpose alone.
-    """
-
-    def __init__(
-        self, number: int, planned: SignalPlan, vehicle: Vehicle, read: WheelReader
-    ) -> None:
-        """Prepare the scan of the log with this number in the plan."""
-        wheels = planned.source_of(Signal.WHEEL_SPEEDS)
+    def __init__(self, wheels: str | None, max_silence_ns: int, read: WheelReader) -> None:
+        """Prepare the scan of a log with this topic of wheel speeds, if any."""
         self.topics: Final[dict[str, StampWatch]] = {}
-        self._wheels: Final = wheels if wheels is not None and wheels.log == number else None
-        self._limit_ns: Final = round(vehicle.time.max_silence_s * 1e9)
+        self._wheels: Final = wheels
+        self._limit_ns: Final = max_silence_ns
         self._read: Final = read
         self._following: _WheelRuns | None = None
 
@@ -170,7 +172,7 @@ class LogWatch:
             return
         watch = self.topics.setdefault(block.topic, StampWatch())
         watch.add(block.log_ns)
-        if self._wheels is None or block.topic != self._wheels.topic.name:
+        if block.topic != self._wheels:
             return
         if self._following is None:
             self._following = _WheelRuns(self._read, self._limit_ns, watch)
@@ -186,19 +188,31 @@ class LogWatch:
         return self._following.runs
 
 
-def timeline_from(
-    watches: Sequence[LogWatch],
-    planned: SignalPlan,
-    vehicle: Vehicle,
-    known: Timeline | None = None,
-) -> Timeline:
-    """Return the time segments of completely scanned logs, in the plan's order."""
-    limit_ns = round(vehicle.time.max_silence_s * 1e9)
-    wheels = planned.source_of(Signal.WHEEL_SPEEDS)
-    runs = [run for watch in watches for run in watch.finish()]
-    aligned = [_Aligned(watch.topics) for watch in watches]
-    log_clocks = _clocks(aligned, round(vehicle.time.unknown_gap_s * 1e9), known)
-    return Timeline(_segments(aligned, log_clocks, runs, wheels, limit_ns), log_clocks)
+class DriveWatch:
+    """Incremental scan of a drive's logs.
+
+    It serves callers that read the logs anyway; ``scan`` reads them for this purpose alone.
+    """
+
+    def __init__(
+        self, planned: SignalPlan, limits: SplitLimits, wheels: Sequence[WheelReader]
+    ) -> None:
+        """Prepare the scan, with the reader of wheel speeds of each log."""
+        self._wheels: Final = planned.source_of(Signal.WHEEL_SPEEDS)
+        self._limit_ns: Final = round(limits.max_silence_s * 1e9)
+        self._gap_ns: Final = round(limits.unknown_gap_s * 1e9)
+        at = None if self._wheels is None else (self._wheels.log, self._wheels.topic.name)
+        self.logs: Final = tuple(
+            LogWatch(at[1] if at is not None and at[0] == number else None, self._limit_ns, read)
+            for number, read in enumerate(wheels)
+        )
+
+    def timeline(self, known: Timeline | None = None) -> Timeline:
+        """Return the time segments of completely scanned logs, in the plan's order."""
+        runs = [run for one in self.logs for run in one.finish()]
+        aligned = [_Aligned(one.topics) for one in self.logs]
+        clocks = _clocks(aligned, self._gap_ns, known)
+        return Timeline(_segments(aligned, clocks, runs, self._wheels, self._limit_ns), clocks)
 
 
 class _Aligned:

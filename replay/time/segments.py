@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,13 @@ from crosscue.replay.ledger import Ledger, ReversedTimes
 
 STRAY_STAMP: Final = "stray time stamp"
 BEGINNING: Final = int(np.iinfo(np.int64).min)
+
+
+class SplitLimits(NamedTuple):
+    """Limits at which a drive is split, see the vehicle file's ``[time]``."""
+
+    max_silence_s: float = 1.0
+    unknown_gap_s: float = 1.0
 
 
 class Cause(StrEnum):

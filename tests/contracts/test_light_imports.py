@@ -35,6 +35,8 @@ for line in sys.argv[1:]:
     status = run(line.split())
     assert status == 0, (line, status)
 """
+# What takes longer to import than a small log to read.
+SLOW: Final = (*COMPILER, "pydantic", "pyarrow", "tomllib", "email", "fsspec")
 COMMAND: Final = "from crosscue.eval.cli import main; main(sys.argv[1:])"
 CARD: Final = """\
 version = 1
@@ -95,6 +97,13 @@ def test_import_of_blocked_module_fails() -> None:
 
 def test_info_does_not_import_compiler(drive: Path) -> None:
     assert "/can" in run_without(COMPILER, COMMAND, "info", str(drive))
+
+
+@pytest.mark.parametrize("options", [(), ("--quick",)])
+def test_info_of_log_without_odometry_imports_neither_vehicle_file_nor_tables(
+    options: tuple[str, ...], drive: Path
+) -> None:
+    assert "/can" in run_without(SLOW, COMMAND, "info", str(drive), *options)
 
 
 def test_replay_with_onnx_detector_and_score_need_no_heavy_library(drive: Path) -> None:

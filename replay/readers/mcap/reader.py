@@ -33,7 +33,7 @@ from .bytes import ByteFile, RangedByteFile
 from .channels import TopicBook
 from .recording_pass import CUT, INCOMPLETE, read_segments
 from .segments import RecordingSegment, find_segments, has_whole_summary
-from .window import find_window
+from .window import LATEST, find_window
 
 HEADER_GUESS: Final = 64
 # Number of bytes at the end of a remote file that are fetched at once.
@@ -92,6 +92,17 @@ class McapLog(Closing):
             elif not segment.has_end:
                 detail = f"no data end record and footer up to byte {segment.end}"
                 ledger.drop("", CUT, None, detail)
+
+    def start_ns(self) -> int | None:
+        """Return the start of the first chunk, if a verified summary says nothing is earlier."""
+        summary = self._segments[0].summary
+        if summary is None or not summary.is_verified or not len(summary.chunks):
+            return None
+        start = int(summary.chunks.start[0])
+        counted = summary.statistics
+        # Some writers do not set the times of a chunk.
+        is_first = counted is not None and 0 < start == counted.start <= LATEST
+        return start if is_first and len(self._segments) == 1 else None
 
     @property
     def beginning(self) -> Selection:

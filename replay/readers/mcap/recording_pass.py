@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
 from typing import Final
@@ -138,8 +137,8 @@ class SegmentPass:
         self._damages: list[DamagedPart] = []
         self._rows_doubted = 0
         self._is_short: bool | None = None
-        self._section: Future[int | None] | None = None
-        self._attachments: list[tuple[int, int, Future[int | None]]] = []
+        self._section: Callable[[], int | None] | None = None
+        self._attachments: list[tuple[int, int, Callable[[], int | None]]] = []
         self._waiting: list[tuple[ChunkRecords, Rows]] = []
         self._declarations = segment.declarations(book)
         self._builder = BlockBuilder(ledger, selection, limits, self._declarations)
@@ -158,7 +157,7 @@ class SegmentPass:
             yield from self._windowed(window)
         else:
             if segment.data_crc and not self._may_skip:
-                self._section = self._loader.section_crc(segment)
+                self._section = self._loader.crc(segment.base, segment.end)
             yield from self._walked(iter(self._walk()))
         if segment.after:
             self._ledger.drop("", INCOMPLETE, None, self._where + segment.after)
@@ -444,8 +443,8 @@ class SegmentPass:
     def _section_is_right(self) -> bool:
         """Wait for the checksum of the data section, and return whether it matches."""
         if self._section is None:
-            self._section = self._loader.section_crc(self._segment)
-        return self._section.result() == self._segment.data_crc
+            self._section = self._loader.crc(self._segment.base, self._segment.end)
+        return self._section() == self._segment.data_crc
 
     def _note(self, item: Item | None) -> None:
         """Account for an item without readable messages."""
@@ -487,7 +486,7 @@ class SegmentPass:
 
     def _finish_checks(self) -> None:
         for at, reported, found in self._attachments:
-            if found.result() == reported:
+            if found() == reported:
                 self._checks.attachments_right += 1
             else:
                 self._checks.bad_attachments.add(f"at byte {at}")

@@ -80,7 +80,7 @@ class Summary:
     @property
     def mentioned(self) -> frozenset[int]:
         """Numbers of the channels in its counts or indexes."""
-        found = frozenset(np.unique(self.chunks.channel).tolist())
+        found = frozenset(np.flatnonzero(np.bincount(self.chunks.channel)).tolist())
         return found if self.statistics is None else found | self.statistics.by_channel.keys()
 
     @property

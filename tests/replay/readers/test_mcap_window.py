@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import crosscue
 from crosscue.replay.base import Selection
 from crosscue.replay.readers.mcap import recording_pass as mcap_pass
 from support.mcap_files import (
@@ -110,6 +111,36 @@ def test_chunks_outside_time_range_are_not_read(tmp_path: Path) -> None:
     assert reading.ledger.integrity == (
         "CRC-32 verified: the summary; of 9 chunks 2 were read and verified; the rest was not"
     )
+
+
+def test_seconds_after_start_need_no_chunk_but_those_of_the_part(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    write_with_destroyed_chunks(path, lambda k: k in (3, 4), [chunk(k) for k in range(1, 9)])
+
+    with crosscue.open(path) as log:
+        part = log.part(300e-9, 405e-9).selection
+        reading = read_back(path, part)
+
+    assert part == Selection(None, 400, 505)
+    assert reading.ledger.is_whole
+
+
+@pytest.mark.parametrize("case", ["no checksum", "times not set", "message before"])
+def test_start_that_the_summary_does_not_state_is_that_of_the_first_row(
+    case: str, tmp_path: Path
+) -> None:
+    chunks: list[bytes | ChunkOf] = [chunk(k, times=(0, 0)) for k in (1, 2)]
+    first = [message(0, 50, b"")] if case == "message before" else []
+    if case != "times not set":
+        chunks = [chunk(1), chunk(2)]
+    path = tmp_path / "x.mcap"
+    coded = McapFile([*DEFINITIONS, *first, *chunks], summary_crc=case != "no checksum").coded()
+    path.write_bytes(coded)
+
+    with crosscue.open(path) as log:
+        part = log.part(0.0).selection
+
+    assert part.start_ns == (50 if first else 100)
 
 
 def test_wrong_time_in_index_without_checksum_is_detected(tmp_path: Path) -> None:

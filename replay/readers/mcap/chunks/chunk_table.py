@@ -224,7 +224,7 @@ def _names(
 ) -> NDArray[np.bytes_]:
     """Return the compression names; the dtype ignores the zero padding of shorter names."""
     padded = np.zeros((len(at), _LONGEST_NAME), dtype=np.uint8)
-    for width in np.unique(size).tolist():
+    for width in sorted(set(size.tolist())):
         rows = size == width
         padded[rows, :width] = _gathered(view, at[rows], width)
     return padded.view(f"S{_LONGEST_NAME}")[:, 0]

@@ -9,18 +9,19 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from threading import Event
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from crosscue.replay.columns import Bytes
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.bytes import ByteFile
 from crosscue.replay.readers.mcap.chunks.inflate import inflate_chunk, inflate_prefix
 from crosscue.replay.readers.mcap.records import BrokenRecordError
-from crosscue.replay.readers.mcap.segments import RecordingSegment
 from crosscue.replay.readers.mcap.walk import Item, UnreadChunk
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future, ThreadPoolExecutor
 
 # Number of threads. One hides most of the work; more would only compete for the interpreter.
 WORKERS: Final = 1
@@ -31,6 +32,8 @@ AHEAD_BYTES: Final = 32 << 20
 # Maximum total size of a group of chunks.
 GROUP_BYTES: Final = 4 << 20
 GROUP_CHUNKS: Final = 64
+# Size up to which a checksum is computed at once.
+SMALL_BYTES: Final = 1 << 20
 # Compression ratio above which decompression takes longer than the handover to a thread.
 WORTHWHILE: Final = 1.5
 
@@ -119,7 +122,7 @@ class Loader:
     def __init__(self, file: ByteFile, limits: Limits) -> None:
         self._file = file
         self._limits = limits
-        self._pool = ThreadPoolExecutor(WORKERS, thread_name_prefix="mcap")
+        self._threads: ThreadPoolExecutor | None = None
         self._stop = Event()
 
     def __enter__(self) -> Self:
@@ -127,7 +130,16 @@ class Loader:
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        if self._threads is not None:
+            self._threads.shutdown(wait=True, cancel_futures=True)
+
+    @property
+    def _pool(self) -> ThreadPoolExecutor:
+        if self._threads is None:
+            from concurrent.futures import ThreadPoolExecutor  # a short log needs no threads
+
+            self._threads = ThreadPoolExecutor(WORKERS, thread_name_prefix="mcap")
+        return self._threads
 
     def ahead(
         self, items: Iterator[Item], wanted: Callable[[UnreadChunk], bool]
@@ -154,7 +166,8 @@ class Loader:
                 first, done = queue.popleft()
                 under_way -= done.size
                 yield from first
-        self._start(group)
+        if queue:
+            self._start(group)  # else nothing is done while another thread loads it
         for first, _ in queue:
             yield from first
         yield from entries
@@ -164,13 +177,12 @@ class Loader:
         if group.size > WORTHWHILE * stored:
             group.future = self._pool.submit(self.load_group, group)
 
-    def section_crc(self, segment: RecordingSegment) -> Future[int | None]:
-        """Compute the checksum of a segment's data section from its bytes."""
-        return self.crc(segment.base, segment.end)
-
-    def crc(self, begin: int, end: int) -> Future[int | None]:
-        """Compute the checksum of the bytes from ``begin`` to ``end``."""
-        return self._pool.submit(self._file.crc, begin, end, self._stop)
+    def crc(self, begin: int, end: int) -> Callable[[], int | None]:
+        """Compute the checksum of the bytes from ``begin`` to ``end``, and return its getter."""
+        if end - begin <= SMALL_BYTES:
+            found = self._file.crc(begin, end, self._stop)
+            return lambda: found
+        return self._pool.submit(self._file.crc, begin, end, self._stop).result
 
     def load_group(self, group: ChunkGroup) -> list[ChunkRecords | BrokenRecordError]:
         """Load each chunk of a group; return its records or its error."""
