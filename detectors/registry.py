@@ -14,22 +14,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from importlib.metadata import entry_points
 from inspect import getattr_static, isfunction
 from operator import attrgetter
 from pathlib import Path
 from typing import Final, cast
 
 from crosscue.replay.errors import UsageError, VehicleError
-from crosscue.replay.plugins import GROUPS
+from crosscue.replay.plugins import offered
 
 from .base import Detector, DetectorChoice
 from .box_detector import FunctionDetector
 from .catalog import places as catalog
-from .catalog.card import read_card, read_weights
-from .catalog.entries import weights_folder
-
-GROUP: Final = GROUPS["detector"]
 
 # ``module:factory`` of each detector, by name.
 BUILTIN: Final[Mapping[str, str]] = {
@@ -125,8 +120,8 @@ def is_plugin(choice: DetectorChoice) -> bool:
 
 def known(sections: Mapping[str, DetectorChoice]) -> list[str]:
     """List all names that can be used."""
-    offered = (point.name for point in entry_points(group=GROUP))
-    return sorted({*sections, *BUILTIN, *catalog.names(), *offered})
+    plugins = (point.name for point in offered("detector"))
+    return sorted({*sections, *BUILTIN, *catalog.names(), *plugins})
 
 
 def make(choice: DetectorChoice, table: Mapping[str, str] = BUILTIN) -> Detector:
@@ -178,6 +173,10 @@ def check(choice: DetectorChoice, table: Mapping[str, str] = BUILTIN) -> None:
     choice = _with_card(choice, table)
     _factory_of(choice, table)
     if isinstance(card := choice.settings.get("card"), str):
+        # These import the decoders of all networks.
+        from .catalog.card import read_card, read_weights
+        from .catalog.entries import weights_folder
+
         path = Path(card)
         found = read_card(path)
         read_weights(found, weights_folder(found, path))
@@ -216,5 +215,4 @@ def _factory_of(
 
 
 def _offered(name: str) -> str | None:
-    found = entry_points(group=GROUP, name=name)
-    return next((point.value for point in found), None)
+    return next((point.value for point in offered("detector") if point.name == name), None)

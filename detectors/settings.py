@@ -19,9 +19,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 class Settings(BaseModel):
     """Base class of every detector's settings."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 S = TypeVar("S", bound=Settings)

@@ -154,6 +154,8 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
     # Before NumPy is imported: starting threads for its linear algebra takes longer than a small
     # log, and sums of another order differ from machine to machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Plug-ins of pydantic are not ours, and looking for them reads all installed packages.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     warnings.formatwarning = lambda message, *_, **__: f"crosscue: {visible(str(message))}\n"
     if "_ARGCOMPLETE" in os.environ:
         from crosscue.eval.completion import complete

@@ -138,7 +138,7 @@ def known_formats() -> dict[str, Format]:
 
 @lru_cache(maxsize=4)
 def _formats_on(path: tuple[str, ...]) -> dict[str, Format]:
-    """Find the formats once for each ``sys.path``, because scanning the packages takes 30 ms."""
+    """Load the formats once for each ``sys.path``; a plug-in that fails warns once."""
     found = FORMATS | dict(loaded("reader", Format, FORMATS))
     return found | {name: one.format for name, one in data_sets(found).items()}
 

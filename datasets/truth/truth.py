@@ -42,7 +42,7 @@ CARRIED: Final[dict[str, str]] = {
 class TruthSection(BaseModel):
     """Section of a truth file, which refuses unknown keys."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Origin(TruthSection):
@@ -299,7 +299,9 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def truth_schema() -> dict[str, Any]:
     """Return the JSON Schema of the file, for other tools."""
-    return Truth.model_json_schema()
+    from crosscue.replay.meanings import SchemaWithMeanings
+
+    return Truth.model_json_schema(schema_generator=SchemaWithMeanings)
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -27,6 +27,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from sphinx.util.docutils import SphinxDirective
 
+from crosscue.replay.meanings import meanings
 from crosscue.results import Result
 
 if TYPE_CHECKING:
@@ -224,13 +225,13 @@ def _fields(model: type[BaseModel]) -> Iterator[tuple[str, str, str, str]]:
             name,
             _type_name(field.annotation),
             default,
-            _meaning(field),
+            _meaning(field, meanings(model).get(name, "")),
         )
 
 
-def _meaning(field: FieldInfo) -> str:
+def _meaning(field: FieldInfo, text: str) -> str:
     """What the field is; of a section, its summary."""
-    described = " ".join((field.description or "").split())
+    described = " ".join(text.split())
     inner = _models_in(field.annotation)
     return described or (_summary(inner[0]) if inner else "")
 

@@ -266,13 +266,14 @@ def check_inputs(settings: ReplaySettings) -> None:
     Without a vehicle file, detectors are checked later: the file next to a log may define them.
     """
     from crosscue.eval.fit.first_pose import check_start
-    from crosscue.localization.landmarks.database import LandmarkDatabase
 
     vehicle = vehicle_given(settings.vehicle)
     if settings.vehicle is not None:
         choices_for(vehicle, settings.detector_names)
     check_start(vehicle, None if settings.start is None else str(settings.start))
     if settings.landmarks is not None:
+        from crosscue.localization.landmarks.database import LandmarkDatabase
+
         LandmarkDatabase(Path(settings.landmarks)).close()
 
 

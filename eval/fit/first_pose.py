@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, get_args
+from typing import TYPE_CHECKING, Final, get_args
 
 import numpy as np
 
@@ -23,7 +23,9 @@ from crosscue.replay.vehicle.pose import GnssUse, Start
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .log_signals import read_signals, signal_plan, turn_samples, wheel_speeds
-from .reference import GeodeticOrigin, ReferencePositions, of_gnss, of_truth
+
+if TYPE_CHECKING:
+    from .reference import GeodeticOrigin, ReferencePositions
 
 # Time read from the start of a drive, seconds; receivers and buses start at different times.
 READ_S: Final = START_S + 10.0
@@ -66,6 +68,8 @@ def with_start(
 def check_start(vehicle: Vehicle, start: str | None) -> None:
     """Refuse a first pose that is neither three numbers nor a truth file, before a log is read."""
     if start is not None and _numbers(start) is None:
+        from .reference import of_truth
+
         of_truth(Path(start), vehicle, spacing_ns=0)
 
 
@@ -161,6 +165,8 @@ def _aligned(
     part = replace(selection, end_ns=end_ns)
     found = read_signals(logs, planned, vehicle, part, wanted, warns=False)
     samples = found.get(Signal.POSITION)
+    from .reference import of_gnss, of_truth
+
     if truth is not None:
         reference = of_truth(truth, vehicle, spacing_ns=0)
     elif samples is not None and gnss is not None:

@@ -396,4 +396,6 @@ def parse_manifest(content: bytes) -> Manifest:
 
 def manifest_json_schema() -> dict[str, Any]:
     """Return the JSON Schema of ``manifest.json``."""
-    return _ANY.json_schema(mode="serialization")
+    from crosscue.replay.meanings import SchemaWithMeanings
+
+    return _ANY.json_schema(mode="serialization", schema_generator=SchemaWithMeanings)

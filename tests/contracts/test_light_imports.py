@@ -106,6 +106,16 @@ def test_info_of_log_without_odometry_imports_neither_vehicle_file_nor_tables(
     assert "/can" in run_without(SLOW, COMMAND, "info", str(drive), *options)
 
 
+def test_replay_without_detectors_imports_neither_networks_nor_scores(drive: Path) -> None:
+    unused = ("crosscue.detectors.decoders", "crosscue.eval.scoring", "crosscue.datasets.truth")
+    code = f"""{CHAIN}
+found = [name for name in sys.modules if name.startswith({unused})]
+assert not found, found
+"""
+    line = "replay drive.mcap -o bare --vehicle car.toml --detectors none -q"
+    run_without(HEAVY, code, line, folder=drive.parent)
+
+
 def test_replay_with_onnx_detector_and_score_need_no_heavy_library(drive: Path) -> None:
     run = drive.parent / "run"
 
