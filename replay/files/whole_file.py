@@ -12,7 +12,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from crosscue.replay.errors import OutputError
 
@@ -21,6 +21,9 @@ from .tree_text import valid_text
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+# Size up to which a table is written without compression.
+SMALL_TABLE_BYTES: Final = 64 << 10
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
@@ -78,7 +81,9 @@ def write_table(path: Path, table: pa.Table) -> None:
 
     def write(partial: Path) -> None:
         with pa.OSFile(os.fsencode(partial), "wb") as file:
-            pq.write_table(table, file, compression="zstd", write_page_checksum=True)
+            # Preparing to inflate each column takes longer than reading a few rows.
+            compression = "zstd" if table.nbytes > SMALL_TABLE_BYTES else "none"
+            pq.write_table(table, file, compression=compression, write_page_checksum=True)
 
     write_whole(path, write)
 

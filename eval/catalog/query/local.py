@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -78,14 +78,9 @@ class LocalRuns:
             OSError: The folder cannot be listed, or a file is not a regular one.
         """
         folder = self.path(run)
-        names = sorted(os.listdir(folder))  # noqa: PTH208 (there may be 100,000)
-        tables = [name for name in names if name.endswith(".parquet") or name in BESIDE]
-        if SCORE in names and (folder / SCORE).is_dir():
-            scored = sorted(os.listdir(door.inside(folder, SCORE)))  # noqa: PTH208
-            tables += [f"{SCORE}/{name}" for name in scored if name.endswith(".parquet")]
-        # Arrow opens tables by their names, so they are examined here.
-        for name in tables:
-            os.close(door.opened(folder / name))
+        tables = _tables(folder, BESIDE)
+        if (folder / SCORE).is_dir():
+            tables += [f"{SCORE}/{name}" for name in _tables(door.inside(folder, SCORE))]
         return tables
 
     def read(self, run: str, file: str) -> bytes:
@@ -111,6 +106,22 @@ class LocalRuns:
         import pyarrow.fs
 
         return pyarrow.fs.LocalFileSystem()
+
+
+def _tables(folder: Path, also: Sequence[str] = ()) -> list[str]:
+    """Return the names of a folder's tables; Arrow opens them by name, so they are examined here.
+
+    Raises:
+        OSError: The folder cannot be listed, or a table is not a regular file.
+    """
+    names = []
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name.endswith(".parquet") or entry.name in also:
+                if not entry.is_file(follow_symlinks=False):
+                    os.close(door.opened(Path(entry.path)))
+                names.append(entry.name)
+    return sorted(names)
 
 
 def _below(folder: str, prefix: str, depth: int) -> Iterator[FoundRun]:

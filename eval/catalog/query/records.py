@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
-from typing import Any, Final, Literal, TypeAlias, TypeVar
+from typing import Any, Final, Literal, TypeAlias
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from crosscue.eval.runs.account import Account
 from crosscue.eval.runs.folder import FAILURE, MANIFEST, TAGS, TIMINGS
@@ -21,7 +19,7 @@ from crosscue.eval.runs.manifest import (
     TimeSegments,
     Timings,
 )
-from crosscue.eval.runs.settings_hash import settings_sha256
+from crosscue.eval.runs.settings_hash import settings_sha256, settings_text
 from crosscue.eval.runs.tags import parse_tags
 from crosscue.replay.errors import one_line
 from crosscue.replay.files.identity import identity_of_all
@@ -29,7 +27,6 @@ from crosscue.replay.files.identity import identity_of_all
 from .local import BESIDE, FoundRun
 
 Row: TypeAlias = dict[str, Any]
-M = TypeVar("M", bound=BaseModel)
 JUDGED: Final = "score/approaches.parquet"
 _EPOCH: Final = datetime(1970, 1, 1)
 # Stages of folders that are not runs of a single drive.
@@ -41,13 +38,9 @@ class _Head(BaseModel):
     stage: str = ""
 
 
-class _Counts(BaseModel):
-    frames: int
-
-
 class _Detect(BaseModel):
     detectors: tuple[dict[str, Any], ...]
-    counts: _Counts
+    counts: dict[str, Any]
 
 
 class _Manifest(BaseModel):
@@ -56,6 +49,7 @@ class _Manifest(BaseModel):
     Validating the settings takes ten times as long, and there may be 100,000 runs.
     """
 
+    format_version: Literal[7]
     stage: Literal["detect", "estimate"]
     versions: dict[str, str]
     logs: tuple[LogRow, ...]
@@ -67,6 +61,8 @@ class _Manifest(BaseModel):
     pose: PoseSummary | None = None
     scene: SceneSummary | None = None
     detect: _Detect | None = None
+    detectors: tuple[dict[str, Any], ...] = ()
+    counts: dict[str, Any] = Field(default_factory=dict)
 
 
 @dataclass(slots=True)
@@ -102,16 +98,13 @@ def run_rows(
     if found.file == FAILURE:
         row = _failed_row(found, name, head, tags)
         return None if row is None else RunRows(row)
-    kind = _read(_Head, head)
-    if kind.format_version != FORMAT_VERSION:
-        raise ValueError(
-            f"{MANIFEST}: format {kind.format_version!r}, this crosscue reads {FORMAT_VERSION}; "
-            "replay again"
-        )
-    if kind.stage in NOT_A_RUN:
-        return None
-    manifest = _read(_Manifest, head)
-    detect = _read(_Detect, head) if manifest.stage == "detect" else manifest.detect
+    try:
+        manifest = _Manifest.model_validate_json(head)
+    except ValidationError as error:
+        return _not_a_run(head, error)
+    detect = manifest.detect
+    if manifest.stage == "detect":
+        detect = _Detect.model_construct(detectors=manifest.detectors, counts=manifest.counts)
     results = _results(read(JUDGED)) if JUDGED in files else []
     run = found.run
     failure = _failure(read(FAILURE)) if FAILURE in files else {}
@@ -124,14 +117,38 @@ def run_rows(
     )
 
 
+def _not_a_run(head: bytes, error: ValidationError) -> None:
+    """Accept the manifest of a folder that is not a run.
+
+    Raises:
+        ValueError: The manifest is damaged or of another version.
+    """
+    try:
+        kind = _Head.model_validate_json(head)
+    except ValidationError as of_head:
+        error, kind = of_head, _Head(format_version=FORMAT_VERSION)
+    if kind.format_version != FORMAT_VERSION:
+        raise ValueError(
+            f"{MANIFEST}: format {kind.format_version!r}, this crosscue reads {FORMAT_VERSION}; "
+            "replay again"
+        )
+    if kind.stage in NOT_A_RUN:
+        return
+    first = error.errors(include_url=False)[0]
+    place = ".".join(str(part) for part in first["loc"])
+    where = f"{place}: " if place else ""
+    raise ValueError(f"{MANIFEST}: unreadable ({where}{first['msg'].lower()}); replay again")
+
+
 def _results(content: bytes) -> list[Row]:
     """Return the results of the approaches in the truth, from a score's ``approaches.parquet``."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        columns = pq.read_table(pa.BufferReader(content), page_checksum_verification=True)
-        return list(columns.to_pylist())
+        # Without threads, which take longer to start than a run's few rows to read.
+        file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
+        return list(file.read(use_threads=False).to_pylist())
     except (OSError, pa.ArrowException) as error:
         raise ValueError(f"{JUDGED}: damaged ({one_line(error)}); score the run again") from None
 
@@ -164,7 +181,7 @@ def _run_row(
             {"name": one["name"], "identity": one["identity"]}
             for one in (() if detect is None else detect.detectors)
         ],
-        "settings": sys.intern(json.dumps(manifest.settings, sort_keys=True)),
+        "settings": settings_text(manifest.settings),
         "settings_sha256": settings_sha256(
             manifest.settings,
             None if detect is None else list(detect.detectors),
@@ -176,7 +193,7 @@ def _run_row(
         "end_ns": segments[-1].end_ns if segments else None,
         "made_at": _made_at(found),
         "travelled_m": None if manifest.pose is None else manifest.pose.travelled_m,
-        "frames": None if detect is None else detect.counts.frames,
+        "frames": None if detect is None else detect.counts["frames"],
         "approaches": 0 if manifest.scene is None else len(manifest.scene.approaches),
         "is_scored": "score/by_drive.parquet" in files,
         "rows_in": sum(one.entered for one in lines),
@@ -228,18 +245,6 @@ def _failed_row(found: FoundRun, name: str, content: bytes, tags: Mapping[str, s
         "is_scored": False,
         "tables": [],
     }
-
-
-def _read(model: type[M], content: bytes) -> M:
-    try:
-        return model.model_validate_json(content)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
-        where = f"{place}: " if place else ""
-        raise ValueError(
-            f"{MANIFEST}: unreadable ({where}{first['msg'].lower()}); replay again"
-        ) from None
 
 
 def _approaches(
