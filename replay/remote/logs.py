@@ -299,11 +299,10 @@ class RangedLog(Closing):
         if why or self._whole is not None:
             yield from self._fetched(why).read(ledger, selection)
             return
-        before = self.ranged.transferred
         yield from self._log.read(ledger, selection)
         self.ranged.verify()
-        took = self.ranged.transferred - before
-        ledger.notice(f"{took} of {self.ranged.size} bytes were fetched")
+        # With those for the index, and those of earlier passes, which are not fetched again.
+        ledger.notice(f"{self.ranged.transferred} of {self.ranged.size} bytes were fetched")
 
     def report_missing(self, ledger: Ledger) -> None:
         """Report missing rows; see ``KnowsItsEnd``."""
@@ -313,7 +312,9 @@ class RangedLog(Closing):
     def start_ns(self) -> int | None:
         """Return the log time of the first stored row, from the index or the first chunk."""
         known = self._log.start_ns() if isinstance(self._log, KnowsItsStart) else None
-        return known or first_stored_ns(self.read(Ledger(self.url), self._log.beginning))
+        if known is not None:
+            return known
+        return first_stored_ns(self.read(Ledger(self.url), self._log.beginning))
 
     def close(self) -> None:
         """Close the connection and release the local copy."""

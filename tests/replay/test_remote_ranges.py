@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
+import crosscue
 from crosscue.replay.base import Selection
 from crosscue.replay.columns import Block
 from crosscue.replay.errors import LogError
@@ -85,6 +87,35 @@ def test_window_of_remote_mcap_transfers_only_its_chunks(tmp_path: Path, web: Se
     assert web.sent - opened < 1.5 * fraction * path.stat().st_size
     assert any("bytes were fetched" in notice for notice in there.notices)
     assert not (tmp_path / "store").exists()
+
+
+def test_seconds_of_remote_topic_transfer_its_chunks_only_and_each_byte_is_counted(
+    tmp_path: Path, web: Served
+) -> None:
+    path = mcap_log(tmp_path / "log.mcap")
+    web.files["log.mcap"] = path.read_bytes()
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    first_ns = min(chunk.message_start_time for chunk in summary.chunk_indexes)
+    window = Selection(None, first_ns + 20_000 * MS, first_ns + 24_000 * MS)
+    needed = sum(
+        chunk.chunk_length + chunk.message_index_length
+        for chunk in summary.chunk_indexes
+        if chunk.message_end_time >= first_ns + 20_000 * MS
+        and chunk.message_start_time < first_ns + 24_000 * MS
+    )
+    ledger = Ledger("there")
+
+    with crosscue.open(f"{web.base}/log.mcap") as log:
+        opened = web.sent
+        assert log.part(20.0, 24.0).selection == window
+        rows = sum(map(len, log.logs[0].read(ledger, window)))
+
+    assert rows
+    assert needed <= web.sent - opened <= 1.15 * needed
+    size = path.stat().st_size
+    assert f"{web.sent} of {size} bytes were fetched" in ledger.notices
 
 
 @pytest.mark.slow

@@ -98,10 +98,10 @@ class McapLog(Closing):
         summary = self._segments[0].summary
         if summary is None or not summary.is_verified or not len(summary.chunks):
             return None
-        start = int(summary.chunks.start[0])
+        start, end = int(summary.chunks.start[0]), int(summary.chunks.end[0])
         counted = summary.statistics
         # Some writers do not set the times of a chunk.
-        is_first = counted is not None and 0 < start == counted.start <= LATEST
+        is_first = counted is not None and start == counted.start and 0 < end <= LATEST
         return start if is_first and len(self._segments) == 1 else None
 
     @property
