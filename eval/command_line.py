@@ -344,7 +344,8 @@ def _hints(function: Callable[..., Any]) -> dict[str, Any]:
             return typing.get_type_hints(holder, names, include_extras=True)
         except NameError as error:
             # A type that is only known to type checkers, because its import takes long.
-            names = {**names, error.name: type(error.name, (), {})}
+            name = str(error.name)
+            names = {**names, name: type(name, (), {})}
 
 
 def types_of(function: Callable[..., Any]) -> dict[str, Any]:

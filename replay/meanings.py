@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import inspect
-from functools import cache
 from itertools import pairwise
 from textwrap import dedent
 
@@ -17,7 +16,6 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core.core_schema import ModelSchema
 
 
-@cache
 def meanings(model: type[BaseModel]) -> dict[str, str]:
     """Return the text below each field of a record, by the field's name."""
     found: dict[str, str] = {}

@@ -7,13 +7,13 @@ import json
 import marshal
 from collections.abc import Callable, Mapping
 from functools import wraps
-from typing import ParamSpec
+from typing import Final, ParamSpec
 
 from crosscue.replay.files.tree_text import json_tree
 
 P = ParamSpec("P")
 # Number of results that are kept of each function.
-KEPT = 256
+KEPT: Final = 256
 
 
 def _kept(make: Callable[P, str]) -> Callable[P, str]:
@@ -25,7 +25,7 @@ def _kept(make: Callable[P, str]) -> Callable[P, str]:
 
     @wraps(make)
     def cached(*values: P.args, **named: P.kwargs) -> str:
-        key = marshal.dumps((values, named), 2)
+        key = marshal.dumps([*values, *named.items()], 2)
         if key not in found:
             if len(found) >= KEPT:
                 found.clear()

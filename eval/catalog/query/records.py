@@ -101,7 +101,8 @@ def run_rows(
     try:
         manifest = _Manifest.model_validate_json(head)
     except ValidationError as error:
-        return _not_a_run(head, error)
+        _check_other(head, error)
+        return None
     detect = manifest.detect
     if manifest.stage == "detect":
         detect = _Detect.model_construct(detectors=manifest.detectors, counts=manifest.counts)
@@ -117,8 +118,8 @@ def run_rows(
     )
 
 
-def _not_a_run(head: bytes, error: ValidationError) -> None:
-    """Accept the manifest of a folder that is not a run.
+def _check_other(head: bytes, error: ValidationError) -> None:
+    """Accept the manifest of a folder that is not a run, such as merged tables.
 
     Raises:
         ValueError: The manifest is damaged or of another version.

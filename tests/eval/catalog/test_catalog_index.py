@@ -1,8 +1,10 @@
 """The index of a catalog: it saves reading and does not change the content."""
 
 import errno
+import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NoReturn
 
 import pytest
@@ -149,10 +151,13 @@ def test_each_manifest_is_parsed_once_and_shared_settings_are_written_once(
 
     monkeypatch.setattr(BaseModel, "model_validate_json", classmethod(counted))
     texts: list[object] = []
-    dumps = settings_hash.json.dumps
-    monkeypatch.setattr(
-        settings_hash.json, "dumps", lambda one, **how: texts.append(one) or dumps(one, **how)
-    )
+    dumps = json.dumps
+
+    def written(one: object, **how: bool) -> str:
+        texts.append(one)
+        return dumps(one, sort_keys=how["sort_keys"])
+
+    monkeypatch.setattr(settings_hash, "json", SimpleNamespace(dumps=written))
 
     found = crosscue.catalog(fleet).query("select run from runs")
 
