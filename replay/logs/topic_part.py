@@ -72,22 +72,25 @@ def topic_columns(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:
         blocks: At least one block of ``Table``, ``CanFrames`` or ``Images``, all with the same
             columns. Payloads of CAN frames and pictures are omitted.
     """
-    columns: dict[str, NDArray[np.generic]] = {
-        "log_t_ns": np.concatenate([b.log_ns for b in blocks])
-    }
+    columns: dict[str, NDArray[np.generic]] = {"log_t_ns": _joined([b.log_ns for b in blocks])}
     for name in ("publish_ns", "header_ns"):
         parts = [part for block in blocks if (part := getattr(block, name)) is not None]
         if len(parts) == len(blocks):
-            columns[name] = np.concatenate(parts)
+            columns[name] = _joined(parts)
     rows = [_named(block.rows) for block in blocks]
     for name in rows[0]:
-        joined = np.concatenate([one[name] for one in rows])
+        joined = _joined([one[name] for one in rows])
         if joined.ndim == 1:
             columns[f"{name}_" if name == "log_t_ns" else name] = joined
             continue
         flat = joined.reshape(len(joined), -1)
         columns |= {f"{name}.{i}": flat[:, i] for i in range(flat.shape[1])}
     return columns
+
+
+def _joined(parts: Sequence[NDArray[np.generic]]) -> NDArray[np.generic]:
+    """Return the parts as one array; a single part is not copied."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _named(rows: object) -> dict[str, NDArray[np.generic]]:
