@@ -30,6 +30,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+import crosscue
 from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
@@ -151,6 +152,13 @@ def ours(path: Path, is_decoded: bool) -> int:
     return count
 
 
+def batches(path: Path, is_decoded: bool) -> int:
+    """Read by the call that users write, with every column decoded."""
+    assert is_decoded
+    with crosscue.open(path) as log:
+        return sum(rows.num_rows for _, rows in log.batches())
+
+
 def theirs(path: Path, is_decoded: bool) -> int:
     count = 0
     with AnyReader([path]) as reader:
@@ -170,6 +178,7 @@ def timed(work: Callable[[Path, bool], int], path: Path, is_decoded: bool, want:
 def compare(name: str, path: Path, rounds: int, want: int) -> None:
     """Print one table line per case: median CPU seconds, messages a second, median ratios."""
     cases: dict[str, tuple[Callable[[Path, bool], int], bool]] = {
+        "ours, log.batches()": (batches, True),
         "ours, blocks": (ours, False),
         "ours, columns": (ours, True),
         "rosbags, raw": (theirs, False),

@@ -383,7 +383,9 @@ class LogTopic:
                 raise UsageError(f"{self.name}: {self.type_name} has no pictures; use table()")
             for row in range(len(block)):
                 picture = encoded(block.rows, row)
-                content = bytes(picture.content)
+                # Pixels of a video are its own already, and large.
+                is_raw = picture.layout is not None
+                content = picture.content if is_raw else bytes(picture.content)
                 t_ns = int(block.log_ns[row])
                 yield CameraFrame(t_ns, self.name, content, picture.coding, picture.layout)
 
@@ -429,14 +431,14 @@ class CameraFrame:
     Attributes:
         t_ns: Log time.
         camera: Topic.
-        encoded: Bytes of the picture, as stored.
+        encoded: Bytes of the picture, as stored; a view if ``coding`` is ``raw``.
         coding: Encoding of the bytes: ``jpeg``, ``png``, ``raw``, ...
         layout: Width, height, bytes per row and pixel format of a raw picture; else None.
     """
 
     t_ns: int
     camera: str
-    encoded: bytes
+    encoded: bytes | memoryview
     coding: str
     layout: tuple[int, int, int, str] | None = None
 

@@ -14,6 +14,7 @@ import numpy as np
 from crosscue.replay.columns import Block, Images, Messages
 from crosscue.replay.errors import one_line
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.readers.can_rows import keep_memory
 
 if TYPE_CHECKING:
     from av import VideoFrame
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 # FFmpeg's decoders by coding of ``Images``.
 CODECS: Final = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
 MAX_PIXELS: Final = 64_000_000
-# Number of pictures in a block; at 1280 by 720 these are 22 MB.
-AT_ONCE: Final = 8
 NOT_DECODED: Final = "video packet not decoded"
 NO_PICTURE: Final = "video packet without picture"
 
@@ -42,6 +41,7 @@ class PacketDecoder:
             topic: Topic of the packets.
             ledger: Records packets that yield no picture.
         """
+        keep_memory()
         self._topic = topic
         self._ledger = ledger
         self._context: Any = None
@@ -64,7 +64,7 @@ class PacketDecoder:
             except av.FFmpegError as error:
                 why = one_line(error, 100)
                 self._ledger.spoil(self._topic, NOT_DECODED, 1, why, t_ns)
-            yield from self._full()
+            yield from self._blocks()
 
     def flush(self) -> Iterator[Block]:
         """Yield the last pictures, and report packets that yielded none."""
@@ -76,35 +76,29 @@ class PacketDecoder:
             self._waiting += self._context.decode(None)
         except av.FFmpegError as error:
             self._ledger.notice(f"{self._topic}: the video's end does not decode: {error}")
-        while self._waiting:
-            yield self._block()
+        yield from self._blocks()
         lacking = self._taken - self._shown
         if lacking > 0:
             # A stream that does not begin at a key frame loses the packets before the first one.
             self._ledger.skip(self._topic, NO_PICTURE, lacking)
         self._context = None
 
-    def _full(self) -> Iterator[Block]:
-        while len(self._waiting) >= AT_ONCE:
-            yield self._block()
-
-    def _block(self) -> Block:
-        frames, self._waiting = self._waiting[:AT_ONCE], self._waiting[AT_ONCE:]
-        self._shown += len(frames)
-        pixels = [frame.to_ndarray(format="bgr24") for frame in frames]
-        stop = np.cumsum([picture.size for picture in pixels], dtype=np.int64)
-        start = np.concatenate([[0], stop[:-1]]).astype(np.int64)
-        buffer = np.concatenate([np.asarray(picture, np.uint8).ravel() for picture in pixels])
-        sizes = np.array([picture.shape[:2] for picture in pixels], np.int32)
-        images = Images(
-            Messages(buffer, start, stop),
-            ("raw",) * len(frames),
-            sizes[:, 1],
-            sizes[:, 0],
-            3 * sizes[:, 1],
-            ("bgr8",) * len(frames),
-        )
-        return Block(self._topic, np.array([frame.pts for frame in frames], np.int64), images)
+    def _blocks(self) -> Iterator[Block]:
+        """Yield each picture as a block, so that its pixels are not copied."""
+        frames, self._waiting = self._waiting, []
+        for frame in frames:
+            self._shown += 1
+            pixels = np.asarray(frame.to_ndarray(format="bgr24"), np.uint8)
+            height, width = pixels.shape[:2]
+            images = Images(
+                Messages(pixels.ravel(), np.zeros(1, np.int64), np.array([pixels.size], np.int64)),
+                ("raw",),
+                np.array([width], np.int32),
+                np.array([height], np.int32),
+                np.array([3 * width], np.int32),
+                ("bgr8",),
+            )
+            yield Block(self._topic, np.array([frame.pts], np.int64), images)
 
 
 def _context(coding: str) -> Any:

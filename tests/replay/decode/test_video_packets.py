@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import crosscue
 from crosscue.replay.columns import Block, Images, Topic
 from crosscue.replay.decode.packets import NO_PICTURE, NOT_DECODED
 from crosscue.replay.ledger import Ledger
@@ -70,3 +71,16 @@ def test_stream_that_begins_within_a_group_loses_only_that_group(tmp_path: Path)
     assert set(skipped) <= {NO_PICTURE, NOT_DECODED}
     assert sorted(found)[-1] == 23 * STEP_NS
     assert all(found[12 * STEP_NS + k * STEP_NS] == 12 + k for k in range(12))
+
+
+def test_pixels_of_a_video_are_handed_over_without_a_copy(tmp_path: Path) -> None:
+    with crosscue.open(video(tmp_path / "v.mp4")) as log:
+        shown = [frame for topic in log.topics.values() for frame in topic.frames()]
+
+    assert [number_of(frame.rgb) for frame in shown] == list(range(24))
+    for frame in shown:
+        stored = np.frombuffer(frame.encoded, np.uint8)
+        assert np.shares_memory(stored, frame.rgb)
+        # One picture in each buffer, so that a picture that is kept does not keep others.
+        assert isinstance(frame.encoded, memoryview)
+        assert frame.encoded.nbytes == memoryview(frame.encoded.obj).nbytes
