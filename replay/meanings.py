@@ -41,7 +41,10 @@ class SchemaWithMeanings(GenerateJsonSchema):
         """Return the schema of a record."""
         found = super().model_schema(schema)
         model = schema["cls"]
-        for name, text in meanings(model).items():
-            key = model.model_fields[name].serialization_alias or name
-            found["properties"][key].setdefault("description", text)
+        shown, texts = found.get("properties", {}), meanings(model)
+        for name, field in model.model_fields.items():
+            # A field that is not written, and a record with a serializer of its own, are not shown.
+            key = field.serialization_alias or name
+            if name in texts and key in shown:
+                shown[key].setdefault("description", texts[name])
         return found
