@@ -5,7 +5,7 @@ error is a false cue over successive frames, a wrong belief (absent above 0.9, p
 an approach, or a range outside its 95 % interval over successive frames. Each counts once, however
 many of the moments show it. The same is counted for as many frames drawn at random.
 
-Intervals are over drives: 95 % of 1,000 bootstrap samples of them. Missed cues are not errors here:
+Intervals are over drives: 95 % of 300 bootstrap samples of them. Missed cues are not errors here:
 nearly every frame misses some distant object.
 
     python benchmarks/unlabelled.py OUT --layouts-from 4000 --blocks 4

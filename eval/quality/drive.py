@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.eval.vehicle.check import SignalRow, judge_signals, read_samples
-from crosscue.eval.vehicle.mounting import MountingWatch, watch_camera
+from crosscue.eval.vehicle.mounting import CarMotion, MountingWatch, watch_camera
 from crosscue.eval.vehicle.picture_pass import PicturePass
 from crosscue.localization.camera_delay import CameraDelay
 from crosscue.replay.base import Log, Selection
@@ -149,10 +149,8 @@ def examine_drive(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -
         known = known.model_copy(
             update={"focal_px": focal_px, "center_px": center_px, "size_px": size_px}
         )
-    speed, yaw_rate = drive.series(Signal.WHEEL_SPEEDS), drive.series(Signal.YAW_RATE)
-    watched = watch_camera(
-        logs[number], number, topic.name, vehicle, known, speed, yaw_rate, selection
-    )
+    motion = CarMotion(drive.series(Signal.WHEEL_SPEEDS), drive.series(Signal.YAW_RATE))
+    watched = watch_camera(logs[number], number, topic.name, vehicle, known, motion, selection)
     return replace(
         drive,
         camera=topic.name,

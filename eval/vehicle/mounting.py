@@ -114,7 +114,7 @@ def estimate_mounting(
     if intrinsics is not None:
         focal_px, center_px, _, size_px = intrinsics
         known = Camera(focal_px=focal_px, center_px=center_px, size_px=size_px)
-    found = watch_camera(log, 0, camera, Vehicle(version=1), known, speed, yaw_rate)
+    found = watch_camera(log, 0, camera, Vehicle(version=1), known, CarMotion(speed, yaw_rate))
     size_px = found.seen.size_px
     if size_px is not None and (why := known.mismatch(size_px)) is not None:
         return Estimate(why_not=(f"pitch and yaw {NOT_CAN}{why}",))
@@ -132,14 +132,25 @@ def estimate_mounting(
     return _with_angles(estimate, found.seen, found.mounting)
 
 
+class CarMotion(NamedTuple):
+    """Signals of the vehicle's motion, where they are known.
+
+    Attributes:
+        speed: Speed, m/s.
+        yaw_rate: Yaw rate, rad/s.
+    """
+
+    speed: Series | None
+    yaw_rate: Series | None
+
+
 def watch_camera(
     log: Log,
     number: int,
     camera: str,
     vehicle: Vehicle,
     known: Camera,
-    speed: Series | None,
-    yaw_rate: Series | None,
+    motion: CarMotion,
     selection: Selection = EVERYTHING,
 ) -> CameraWatch:
     """Look at the pictures, again where the focal length or height turns out to be another.
@@ -150,19 +161,18 @@ def watch_camera(
         camera: Topic of the camera.
         vehicle: The vehicle file.
         known: What is known of the camera; without ``focal_px``, it is estimated in turns.
-        speed: Speed of the vehicle, m/s, if known.
-        yaw_rate: Yaw rate of the vehicle, rad/s, if known.
+        motion: Signals of the vehicle's motion.
         selection: Part of the log to read; its topics are ignored.
     """
     has_focal, focal = known.focal_px is not None, None
     for last in range(PASSES):
         seen = watch_pictures(log, number, camera, vehicle, known, selection)
-        delays = delays_of(seen, speed, yaw_rate)
+        delays = delays_of(seen, motion)
         off = 0.0
         if not has_focal and (focal := _focal(seen, delays)) is not None:
             off = abs(focal.value * seen.scale / _focal_px(seen) - 1.0)
             known = known.model_copy(update={"focal_px": focal.value})
-        watch = watch_mounting(seen, speed) if has_focal or focal is not None else None
+        watch = watch_mounting(seen, motion.speed) if has_focal or focal is not None else None
         if watch is not None and (height := watch.whole.get("height")) is not None:
             off = max(off, abs(height.mean / known.z_m - 1.0))
             known = known.model_copy(update={"z_m": height.mean})
@@ -194,10 +204,9 @@ def _with_angles(found: Estimate, seen: PicturePass, watch: MountingWatch) -> Es
     )
 
 
-def delays_of(
-    seen: PicturePass, speed: Series | None, yaw_rate: Series | None
-) -> tuple[CameraDelay, ...]:
+def delays_of(seen: PicturePass, motion: CarMotion) -> tuple[CameraDelay, ...]:
     """Return the delay of the pictures by each signal that is known."""
+    speed, yaw_rate = motion
     found = []
     if yaw_rate is not None:
         found.append(delay_by_yaw_rate(seen.motion, yaw_rate.t_ns, yaw_rate.values))

@@ -194,7 +194,7 @@ def test_unterminated_quotes_are_refused_quickly(text: str) -> None:
 def test_product_parses_json_toml_and_yaml_only_in_tree_text() -> None:
     """All readers of such files must enforce the depth limit."""
     paths = [path for name in PACKAGES for path in (ROOT / name).rglob("*.py")]
-    assert len(paths) > 700
+    assert len(paths) > 600
     for path in paths:
         if path.name == "tree_text.py":
             continue

@@ -122,7 +122,7 @@ def test_fitted_card_reaches_required_precision_of_cues(drive: Path) -> None:
     # Of single frames; by default, lights are decided by their tracks.
     frames = drive / "frames.toml"
     frames.write_text('version = 1\n[cues]\nkind = "frames"\n')
-    run = crosscue.detect_drive(
+    run = crosscue.replay_drive(
         drive / "log", drive / "run_fitted", vehicle=frames, detectors=[f"{drive}/net_fitted.toml"]
     )
     after = crosscue.score_detector(run, drive / "labels", has_figures=False)

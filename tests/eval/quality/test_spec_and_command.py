@@ -113,7 +113,8 @@ def test_info_open_vehicle_init_and_truth_descend_to_the_only_log(
     assert cli.run(["info", folder, "--quick"]) == 0
     assert cli.run(["vehicle", "init", folder]) == 0
     assert cli.run(["truth", folder, "-o", str(tmp_path / "truth")]) == 0
-    assert str(kitti) in capsys.readouterr().out
+    # A long path is broken at the width of the terminal.
+    assert str(kitti) in capsys.readouterr().out.replace("\n", "")
 
 
 def test_several_logs_below_a_folder_are_named(kitti: Path, tmp_path: Path) -> None:
