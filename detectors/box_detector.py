@@ -9,6 +9,8 @@ from typing import Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 
+from crosscue.replay.errors import VehicleError
+
 from .base import Detections, Frame, View
 from .settings import Settings, identity_of, settings_of
 
@@ -19,7 +21,7 @@ ScoredBox: TypeAlias = tuple[str, float, Sequence[float]]
 class BoxDetector(Settings):
     """Base class of a detector of boxes. Its fields are its settings, typed and with defaults.
 
-    A subclass sets ``name`` and ``labels`` and implements ``boxes_in``. This is a whole detector::
+    A subclass sets ``labels`` and implements ``boxes_in``. This is a whole detector::
 
         import cv2
         import crosscue
@@ -42,7 +44,7 @@ class BoxDetector(Settings):
     score, label.
 
     Attributes:
-        name: Name in error messages.
+        name: Name in error messages; default: that of the class.
         labels: All class names that it can report.
         view: Resolution and channels of the frames that it needs.
         version: Increment it when the same pixels and settings yield different boxes than before,
@@ -53,6 +55,13 @@ class BoxDetector(Settings):
     labels: ClassVar[tuple[str, ...]]
     view: ClassVar[View] = View()
     version: ClassVar[int] = 1
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Name a class that has no name after itself."""
+        super().__pydantic_init_subclass__(**kwargs)
+        if "name" not in vars(cls):
+            cls.name = cls.__name__
 
     @abstractmethod
     def boxes_in(self, frame: Frame) -> Iterable[ScoredBox]:
@@ -71,8 +80,12 @@ class BoxDetector(Settings):
         """Build the detector with these settings.
 
         Raises:
-            VehicleError: A setting is unknown or its value is invalid.
+            VehicleError: A setting is unknown or its value is invalid, or there are no labels.
         """
+        if not getattr(cls, "labels", ()):
+            raise VehicleError(
+                f'detector {cls.name}: no labels; set labels = ("stop sign",) or what it reports'
+            )
         return settings_of(cls, given, f"detector {cls.name}")
 
     @property

@@ -108,3 +108,28 @@ def test_wrong_box_of_a_run_is_refused_with_frame_and_reason(
     assert str(refused.value).startswith("detector yields: ")
     assert " ns: " in str(refused.value)
     assert fault in str(refused.value)
+
+
+class Unnamed(BoxDetector):
+    """Detector as a beginner writes it, without a name."""
+
+    labels = ("stop sign",)
+
+    def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
+        """Return nothing."""
+        yield from ()
+
+
+class Unlabelled(BoxDetector):
+    """Detector without labels."""
+
+    def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
+        """Return nothing."""
+        yield from ()
+
+
+def test_class_without_a_name_is_named_after_itself_and_one_without_labels_is_refused() -> None:
+    check_detector(Unnamed.build)
+    assert Unnamed.name == "Unnamed"
+    with pytest.raises(VehicleError, match="detector Unlabelled: no labels; set labels ="):
+        chosen([Unlabelled], {})
