@@ -280,8 +280,10 @@ def replay(
     found = find_drives(*logs, each=each, shard=shard)
     if found.is_many:
         if settings.start is not None:
+            first = found.drives[0].logs[0]
             raise UsageError(
-                "start: expected one drive, found many, each of which has its own start"
+                f"start: applies to one drive, and {', '.join(logs)} is a folder or list of "
+                f"{len(found.drives)}; name the drive itself, such as {first}"
             )
         return replay_many(found, output, settings)
     if settings.workers is not None or settings.ray is not None or settings.retry_failed:

@@ -124,3 +124,16 @@ def test_real_demo_on_recorded_drive_meets_precision_and_recall(
     assert cues["stop_sign"]["precision_of"] == 0
     assert made.recording.stat().st_size > 1_000_000
     assert "PandaSet" in repr(made)
+
+
+def test_start_of_a_folder_with_one_drive_names_the_drive(
+    stand_in_drive: StandIn, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sequences = stand_in_drive.folder / "sequences"
+    assert run(["truth", str(sequences / "pandaset_002"), "-o", "truth"]) == 0
+
+    assert run(["replay", str(sequences), "--start", "truth", "-o", "run"]) == 2
+
+    printed = capsys.readouterr().err
+    assert "is a folder or list of 1; name the drive itself, such as" in printed
+    assert str(sequences / "pandaset_002") in printed
