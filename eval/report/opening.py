@@ -13,6 +13,7 @@ import numpy as np
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.moments import frame_times, seconds_into, span_ns
 from crosscue.eval.scoring.columns import NONE, CueRows, RangeRows, RunTables
+from crosscue.eval.scoring.pose.score import PoseScore
 from crosscue.eval.scoring.runs import RunScored, read_run_tables
 from crosscue.eval.scoring.scene.approaches import ApproachResult, Curve
 from crosscue.eval.scoring.scene.cues import CueFrames
@@ -213,10 +214,19 @@ def judged_sentences(scored: RunScored) -> tuple[str, ...]:
     if judged is not None and judged.extra_detected:
         told.append(f"{judged.extra_detected} times an intersection was believed where none is.")
     if scored.pose is not None:
-        pose = scored.pose
-        rms_m = pose.ape["none"].translation_m.rmse
-        told.append(f"The pose is {rms_m:.2f} m from the truth (rms) over {pose.distance_m:.0f} m.")
+        told.append(_pose_sentence(scored.pose))
     return tuple(told)
+
+
+def _pose_sentence(pose: PoseScore) -> str:
+    """Return the position error; of a track in its own frame, what is left once it is turned."""
+    over = f"from the truth (rms) over {pose.distance_m:.0f} m"
+    if pose.why_no_nees:
+        rms_m = pose.ape["yaw"].translation_m.rmse
+        return (
+            f"The start heading is unknown; shifted and turned, the pose is {rms_m:.2f} m {over}."
+        )
+    return f"The pose is {pose.ape['none'].translation_m.rmse:.2f} m {over}."
 
 
 def _verdict(result: ApproachResult, cues: Sequence[CueFrames], is_named: bool) -> str:

@@ -11,6 +11,7 @@ from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, write_t
 from crosscue.eval.drives.score import score_run
 from crosscue.eval.pipeline.whole_run import replay_drive
 from crosscue.eval.recording import save_rrd as save_recording
+from crosscue.eval.report.opening import judged_sentences
 from crosscue.eval.report.summary import pose_summary, scores_text
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
@@ -171,6 +172,8 @@ def test_nees_is_not_computed_without_common_frame(tmp_path: Path) -> None:
     assert "NEES of" not in text
     # Errors that need no common frame are still measured.
     assert result.ape["yaw"].translation_m.max < 1e-2
+    (told,) = judged_sentences(score_run(run.path, path, has_figures=False).one)
+    assert told.startswith("The start heading is unknown; shifted and turned, the pose is 0.00 m")
 
 
 def test_score_reports_compared_body_and_assumed_mounting(tmp_path: Path) -> None:
