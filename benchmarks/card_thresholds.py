@@ -1,11 +1,12 @@
 """Choose thresholds of stop signs and lights for cards of the catalog, on labelled pictures.
 
-The pictures and their Pascal VOC labels are those of Road Sign Detection (877 pictures, public
-domain, https://www.kaggle.com/datasets/andrewmvd/road-sign-detection), in the folders ``images``
-and ``annotations``. A picture is right or wrong as a whole: its best detection of a class against
+The pictures and their Pascal VOC labels are those of Road Sign Detection (877 pictures,
+https://www.kaggle.com/datasets/andrewmvd/road-sign-detection), in the folders ``images`` and
+``annotations``. A picture is right or wrong as a whole: its best detection of a class against
 whether the class is labelled in it, as a cue of one frame counts.
 
-The rule was stated before the second half was looked at. Pictures with an even number choose the
+This rule is the second one: results of both halves had been seen when it was made, so the odd half
+is not wholly unseen. Pictures with an even number choose the
 lowest of ten thresholds at which, with 95 % confidence (Clopper and Pearson, one-sided, corrected
 for ten candidates), at most 3 % of pictures without an object show one. Those with an odd number
 decide whether the card gets it: if they show the same (one-sided, not corrected), and if at least
