@@ -7,7 +7,6 @@ log is read.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -16,6 +15,7 @@ import pytest
 
 from crosscue.eval import cli
 from crosscue.localization.landmarks.database import LandmarkWriter
+from support.coco import stop_signs
 from support.failures import table_of_failures
 from support.gap_drive import BEGIN, BUS, Clock, replayed, write_drive
 from support.mcap_files import McapFile
@@ -247,7 +247,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         (photos / place).mkdir(parents=True)
         for number in range(2):
             (photos / place / f"{number}.png").write_bytes(picture(number, width=64, height=48))
-    (photos / "coco.json").write_text(_coco())
+    (photos / "coco.json").write_text(stop_signs([("0.png", 0), ("1.png", 1)], (64, 48)))
     (photos / "labels.csv").write_text("picture,label,x0,y0,x1,y1\nimages/0.png,stop,1,1,9,9\n")
     (photos / "places.csv").write_text("image,x_m,y_m,sd_m\n0.png,0,0,1\n")
     (photos / "pairs_m.csv").write_text(
@@ -275,19 +275,6 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "there": photos,
         "failures": table_of_failures(run.path, photos / "failures.parquet", BEGIN),
     }
-
-
-def _coco() -> str:
-    box = {"bbox": [10, 10, 40, 30], "segmentation": [[10, 10, 50, 10, 50, 40, 10, 40]]}
-    return json.dumps(
-        {
-            "categories": [{"id": 1, "name": "stop sign"}],
-            "images": [
-                {"id": k, "file_name": f"{k}.png", "width": 64, "height": 48} for k in range(2)
-            ],
-            "annotations": [{"id": k, "image_id": k, "category_id": 1, **box} for k in range(2)],
-        }
-    )
 
 
 @pytest.mark.parametrize("damage", DAMAGE)

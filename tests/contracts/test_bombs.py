@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import struct
@@ -21,6 +20,7 @@ from crosscue.eval import cli
 from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.replay.columns import Floats
 from crosscue.replay.limits import MIB
+from support.coco import stop_signs
 from support.every_format import EVERY_FORMAT
 from support.failures import table_of_failures
 from support.gap_drive import BEGIN, SIZE, Clock, replayed, write_drive
@@ -95,7 +95,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     gnss_car = folder / "gnss.toml"
     gnss_car.write_text('version = 1\n[topics]\ngnss = "/imu"\n')
     objects = drive / "objects.json"
-    objects.write_text(_coco([("0.png", BEGIN)], SIZE))
+    objects.write_text(stop_signs([("0.png", BEGIN)], SIZE))
     return {
         "drive": drive,
         "log": log,
@@ -267,7 +267,7 @@ def test_oversized_picture_file_is_refused_with_status_4(
     (folder / "places.csv").write_text(f"image,x_m,y_m,sd_m\na.{coded},0,0,1\n")
     (folder / "pairs.csv").write_text(f"query,known,same\na.{coded},b.png,1\n")
     (folder / "labels.csv").write_text(f"picture,label,x0,y0,x1,y1\na.{coded},stop sign,1,1,9,9\n")
-    (folder / "coco.json").write_text(_coco([(f"a.{coded}", 0), ("b.png", 1)], (24, 16)))
+    (folder / "coco.json").write_text(stop_signs([(f"a.{coded}", 0), ("b.png", 1)], (24, 16)))
     (folder / "net.onnx").write_bytes(bright_box_model())
     if command == "check":
         assert cli.run(["model", "init", str(folder / "net.onnx"), "-q"]) == 0
@@ -330,34 +330,11 @@ def test_array_header_exceeding_file_is_reported(
     assert ("copy it again" in printed.err) if status == 4 else ("losses" in printed.out)
 
 
-def _coco(images: list[tuple[str, int]], size: tuple[int, int]) -> str:
-    """Return COCO annotations of pictures at given times, with a stop sign in each."""
-    return json.dumps(
-        {
-            "categories": [{"id": 1, "name": "stop sign"}],
-            "images": [
-                {"id": k, "file_name": name, "width": size[0], "height": size[1], "t_ns": t_ns}
-                for k, (name, t_ns) in enumerate(images)
-            ],
-            "annotations": [
-                {
-                    "id": k,
-                    "image_id": k,
-                    "category_id": 1,
-                    "bbox": [1, 1, 9, 9],
-                    "segmentation": [[1, 1, 10, 1, 10, 10, 1, 10]],
-                }
-                for k in range(len(images))
-            ],
-        }
-    )
-
-
 def _annotate(drive: Path, start_ns: int) -> None:
     """Write the truth of four pictures, a tenth of a second apart."""
     t_ns = start_ns + np.arange(4) * 100_000_000
     times = t_ns.tolist()
-    (drive / "objects.json").write_text(_coco([(f"{t}.png", t) for t in times], (24, 16)))
+    (drive / "objects.json").write_text(stop_signs([(f"{t}.png", t) for t in times], (24, 16)))
     save(
         Truth(version=1, source="x", start_ns=times[0], end_ns=times[-1] + 1, pose="pose.tum"),
         drive,

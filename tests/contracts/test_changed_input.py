@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from crosscue.eval import cli
 from crosscue.replay.errors import OutputError
 from crosscue.replay.files.made_of import made_of
 from crosscue.replay.files.tree_text import strict_json
+from support.coco import stop_signs
 from support.pictures import picture
 from support.scenes import shorten
 from support.trees import tree
@@ -48,15 +48,8 @@ def folder(tmp_path: Path) -> Path:
         (folder / place).mkdir(parents=True)
         for number in range(2):
             (folder / place / f"{number}.png").write_bytes(picture(number, width=128, height=80))
-    box = {"bbox": [10, 10, 40, 40], "segmentation": [[10, 10, 50, 10, 50, 50, 10, 50]]}
-    coco = {
-        "categories": [{"id": 1, "name": "stop sign"}],
-        "images": [
-            {"id": k, "file_name": f"{k}.png", "width": 128, "height": 80} for k in range(2)
-        ],
-        "annotations": [{"id": k, "image_id": k, "category_id": 1, **box} for k in range(2)],
-    }
-    (folder / "coco.json").write_text(json.dumps(coco))
+    labels = stop_signs([("0.png", 0), ("1.png", 1)], (128, 80))
+    (folder / "coco.json").write_text(labels)
     return folder
 
 

@@ -14,6 +14,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from support.accounted import read
 from support.every_format import EVERY_FORMAT
+from support.refusals import refusal
 
 # Formats with an index at the end of the file, without which no row can be read.
 INDEX_AT_THE_END = {"mf4", "video"}
@@ -157,17 +158,15 @@ def test_rows_without_time_stamp_are_dropped(
     ],
 )
 def test_log_truncated_before_first_topic_is_unreadable_not_wrong_usage(
-    drive: DriveFiles, flags: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    drive: DriveFiles, flags: str, tmp_path: Path
 ) -> None:
     log = tmp_path / "cut.mcap"
     log.write_bytes(drive.log.read_bytes()[:500])
     command, _, rest = flags.partition(" -")
     argv = f"-{rest}".format(out=tmp_path / "out", car=drive.vehicle).split()
 
-    assert cli.run([*command.split(), str(log), *argv]) == 4
-    err = capsys.readouterr().err
+    err = refusal(4, *command.split(), log, *argv)
     assert err.startswith(f"crosscue: {log}: ")
-    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

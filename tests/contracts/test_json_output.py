@@ -12,6 +12,7 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive as simulated
 from crosscue.eval import cli
+from support.coco import stop_signs
 from support.gap_drive import BEGIN, ROW, SIZE, Clock, write_drive
 from support.kitti_drive import raw_drive
 from support.landmark_files import database_of, encoded, seen_from, wall
@@ -182,16 +183,8 @@ def _write_road(folder: Path) -> None:
         for k in range(2):
             content = picture(k, width=SIZE[0], height=SIZE[1])
             (folder / place / f"{k}.png").write_bytes(content)
-    size = {"width": SIZE[0], "height": SIZE[1]}
-    box = {"bbox": [10, 10, 40, 30], "segmentation": [[10, 10, 50, 10, 50, 40, 10, 40]]}
-    coco = {
-        "categories": [{"id": 1, "name": "stop sign"}],
-        "images": [
-            {"id": k, "file_name": f"{k}.png", "t_ns": BEGIN + k * ROW, **size} for k in range(2)
-        ],
-        "annotations": [{"id": k, "image_id": k, "category_id": 1, **box} for k in range(2)],
-    }
-    (folder / "coco.json").write_text(json.dumps(coco))
+    labels = stop_signs(((f"{k}.png", BEGIN + k * ROW) for k in range(2)), SIZE)
+    (folder / "coco.json").write_text(labels)
 
 
 @pytest.mark.parametrize("clock", [Clock(pause_s=(0.3, 13.5)), Clock(pause_s=(2.0, 20.0))])

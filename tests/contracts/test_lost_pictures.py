@@ -24,6 +24,7 @@ from crosscue.replay.logs.opening import open_log
 from crosscue.replay.losses import losses_heard
 from crosscue.replay.vehicle.drafting.camera import Intrinsics
 from crosscue.replay.vehicle.drafting.series import Series
+from support.coco import stop_signs
 from support.failures import table_of_failures
 from support.gap_drive import (
     BEGIN,
@@ -142,7 +143,8 @@ def names(
     log = write_drive(drive, Clock(), seconds=4, pictures=pictures)
     (drive / "vehicle.toml").write_bytes((drive / "car.toml").read_bytes())
     run = replayed(drive, log, "../run")
-    (drive / "objects.json").write_text(_coco())
+    labels = [(f"{t}.png", t) for t in (BEGIN + number * ROW for number in range(40))]
+    (drive / "objects.json").write_text(stop_signs(labels, SIZE))
     labelled = folder / "labelled"
     shutil.copytree(drive, labelled, ignore=shutil.ignore_patterns("*.mcap"))
     tree = json.loads((labelled / "truth.json").read_text())
@@ -165,23 +167,6 @@ def names(
         "failures": table_of_failures(run.path, folder / "failures.parquet", *times),
         "reason": reason,
     }
-
-
-def _coco() -> str:
-    times = [BEGIN + number * ROW for number in range(40)]
-    width, height = SIZE
-    return json.dumps(
-        {
-            "categories": [{"id": 1, "name": "stop sign"}],
-            "images": [
-                {"id": t, "file_name": f"{t}.png", "width": width, "height": height, "t_ns": t}
-                for t in times
-            ],
-            "annotations": [
-                {"id": t, "image_id": t, "category_id": 1, "bbox": [9, 9, 30, 30]} for t in times
-            ],
-        }
-    )
 
 
 @pytest.mark.parametrize(

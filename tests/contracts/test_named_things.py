@@ -6,7 +6,6 @@ Options that name a file are in ``test_auxiliary_files.py``.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 
 from crosscue.eval import cli
+from support.coco import stop_signs
 from support.empty_inputs import empty_inputs
 from support.gap_drive import BEGIN, BUS, Clock, write_drive
 from support.landmark_files import database_of
@@ -146,13 +146,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     (folder / "net.onnx").write_bytes(bright_box_model())
     score = ["score", str(found["run"]), "--truth", f"{drive}/truth.json", "--without-figures"]
     assert cli.run(score) == 0
-    annotation = {"id": 1, "image_id": 1, "category_id": 1, "bbox": [5, 5, 20, 20]}
-    labels = {
-        "categories": [{"id": 1, "name": "stop sign"}],
-        "images": [{"id": 1, "file_name": "a.png", "width": 160, "height": 90, "t_ns": BEGIN}],
-        "annotations": [annotation],
-    }
-    (folder / "labels.json").write_text(json.dumps(labels))
+    (folder / "labels.json").write_text(stop_signs([("a.png", BEGIN)], (160, 90)))
     return {
         **found,
         "truth": drive / "truth.json",

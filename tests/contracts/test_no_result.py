@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.eval import cli
 from support.empty_inputs import COMMANDS, empty_inputs
+from support.refusals import refusal
 
 
 @pytest.fixture(scope="module")
@@ -19,17 +19,11 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_empty_result_is_reported_in_one_line_without_files(
-    command: str, names: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, names: dict[str, Path], tmp_path: Path
 ) -> None:
     shutil.rmtree(names["run"] / "score", ignore_errors=True)
     argv = COMMANDS[command].format(**names, out=tmp_path / "out").split()
 
-    status = cli.run([*command.split(), *argv])
-
-    captured = capsys.readouterr()
-    assert status == 1, captured.err
-    assert captured.out == ""
-    assert captured.err.startswith("crosscue: ")
-    assert captured.err.count("\n") == 1
+    refusal(1, *command.split(), *argv)
     assert not list(tmp_path.iterdir())
     assert not (names["run"] / "score").exists()

@@ -26,6 +26,7 @@ from crosscue.detectors.training.samples import Sampler, SampleSettings
 from crosscue.eval.cli import run
 from crosscue.replay.errors import CrosscueError, SchemaError
 from support.mask_rcnn import CPU, plan_of, write_bars
+from support.refusals import refusal
 
 WINDOW = SampleSettings(96, 64)
 CARS = ("car",)
@@ -255,8 +256,7 @@ def test_train_commands_produce_a_checkpoint_from_simulated_pictures(
     assert [row["step"] for row in json.loads(out.with_suffix(".curve.json").read_text())] == [1, 2]
     assert cv2.imread(str(out.with_suffix(".curve.png"))) is not None
     assert not out.with_suffix(".state.safetensors").exists()
-    assert run(learn) == 1
-    assert "--overwrite starts over" in capsys.readouterr().err
+    assert "--overwrite starts over" in refusal(1, *learn)
 
 
 @pytest.mark.parametrize(
@@ -276,7 +276,7 @@ def test_train_commands_produce_a_checkpoint_from_simulated_pictures(
     ],
 )
 def test_invalid_flags_are_reported_before_training(
-    tmp_path: Path, flags: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, flags: list[str], message: str
 ) -> None:
     path = write_bars(tmp_path / "set", 11)
     base = (
@@ -284,8 +284,7 @@ def test_invalid_flags_are_reported_before_training(
         f"{tmp_path / 'out.safetensors'}"
     ).split()
 
-    assert run([*base, *flags]) == 2
-    assert message in capsys.readouterr().err
+    assert message in refusal(2, *base, *flags)
 
 
 def test_box_beyond_the_picture_is_clipped_and_counted(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 import crosscue
 from crosscue.eval import cli
+from support.refusals import refusal
 
 WRONG: Final[list[tuple[Callable[[], object], str, str, str]]] = [
     (
@@ -117,13 +118,9 @@ LINES: Final[dict[str, str]] = {
 
 @pytest.mark.parametrize("line", LINES)
 def test_wrong_value_is_refused_in_one_line_before_anything_is_read(
-    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
 
-    assert cli.run(line.split()) == 2
-
-    error = capsys.readouterr().err
-    assert LINES[line] in error
-    assert error.count("\n") == 1
+    assert LINES[line] in refusal(2, *line.split())
     assert not list(tmp_path.iterdir())

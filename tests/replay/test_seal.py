@@ -24,6 +24,7 @@ from support.accounted import read
 from support.can_files import candump, random_frames
 from support.every_format import EVERY_FORMAT
 from support.pictures import picture_folder
+from support.refusals import refusal
 from support.rosbag_files import rows_of, write_bag, write_folder
 
 
@@ -137,8 +138,7 @@ def test_seal_of_changed_log_is_replaced_only_with_overwrite(
 
     _flip(long_log, 7)
     capsys.readouterr()
-    assert run(["seal", str(long_log)]) == 1
-    assert "--overwrite only if the log is correct" in capsys.readouterr().err
+    assert "--overwrite only if the log is correct" in refusal(1, "seal", long_log)
     assert seal_path(long_log).read_bytes() == before
 
     assert run(["seal", "--overwrite", str(long_log)]) == 0
@@ -194,17 +194,13 @@ def _damaged_seals() -> Iterator[tuple[str, bytes]]:
 
 
 @pytest.mark.parametrize(("why", "content"), list(_damaged_seals()))
-def test_damaged_seal_is_refused_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], why: str, content: bytes
-) -> None:
+def test_damaged_seal_is_refused_in_one_line(tmp_path: Path, why: str, content: bytes) -> None:
     log = EVERY_FORMAT["candump"](tmp_path)
     seal_path(log).write_bytes(content)
 
     for argv in (["info", str(log)], ["check", f"{log}.seal"]):
-        assert run(argv) == 4
-        reported = capsys.readouterr().err
+        reported = refusal(4, *argv)
         assert why in reported
-        assert reported.count("\n") == 1
         assert "delete it and seal the log again" in reported
     assert run(["seal", str(log)]) == 1
 
@@ -227,24 +223,18 @@ def test_seal_of_invalid_log_is_refused(
     assert why in capsys.readouterr().err
 
 
-def test_check_of_log_without_seal_fails(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["check", f"{EVERY_FORMAT['asc'](tmp_path)}.seal"]) == 1
-    assert "not sealed" in capsys.readouterr().err
+def test_check_of_log_without_seal_fails(tmp_path: Path) -> None:
+    assert "not sealed" in refusal(1, "check", f"{EVERY_FORMAT['asc'](tmp_path)}.seal")
 
 
-def test_convert_does_not_overwrite_a_sealed_log(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_convert_does_not_overwrite_a_sealed_log(tmp_path: Path) -> None:
     log = EVERY_FORMAT["candump"](tmp_path)
     out = tmp_path / "out.mcap"
     assert run(["convert", str(log), "-o", str(out)]) == 0
     assert run(["seal", str(out)]) == 0
     before = out.read_bytes()
 
-    assert run(["convert", str(log), "-o", str(out), "--overwrite"]) == 1
-    assert "out.mcap.seal" in capsys.readouterr().err
+    assert "out.mcap.seal" in refusal(1, "convert", log, "-o", out, "--overwrite")
     assert out.read_bytes() == before
 
 

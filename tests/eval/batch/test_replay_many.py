@@ -11,6 +11,7 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.cli import run
+from support.refusals import refusal
 
 pytestmark = pytest.mark.slow
 
@@ -55,11 +56,7 @@ def test_merged_shards_equal_one_batch(
     assert shards == batch
 
 
-def test_workers_for_a_single_drive_are_refused(
-    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_workers_for_a_single_drive_are_refused(drives: Path, tmp_path: Path) -> None:
     log = str(drives / "monday" / "drive.mcap")
 
-    assert run(["replay", log, "-o", str(tmp_path / "run"), "--workers", "2"]) == 2
-
-    assert "add --each" in capsys.readouterr().err
+    assert "add --each" in refusal(2, "replay", log, "-o", tmp_path / "run", "--workers", "2")

@@ -13,6 +13,7 @@ from crosscue.eval import cli
 from crosscue.eval.check import KINDS
 from crosscue.eval.fit.truth_check import TruthFit
 from support import scene_run
+from support.refusals import refusal
 from support.scoring import good_truth, truth, truth_folder
 
 CAR = "version = 1\n"
@@ -132,17 +133,12 @@ def test_run_with_changed_table_or_log_fails(drive: Path, tmp_path: Path) -> Non
     ],
 )
 def test_setting_that_applies_to_no_file_is_refused(
-    line: str,
-    message: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    line: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("car.toml").write_text(CAR)
 
-    assert cli.run(["check", *line.split()]) == 2
-    assert message in capsys.readouterr().err
+    assert message in refusal(2, "check", *line.split())
 
 
 @pytest.mark.parametrize("former", cli.MOVED)

@@ -16,6 +16,7 @@ import pytest
 from crosscue.eval import cli
 from crosscue.replay.errors import CrosscueError, LogError, UsageError
 from crosscue.results import Result
+from support.refusals import refusal
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -63,18 +64,11 @@ def _register_command(monkeypatch: pytest.MonkeyPatch, error: BaseException | No
     ],
 )
 def test_errors_are_one_line_with_documented_exit_status(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    error: BaseException,
-    status: int,
+    monkeypatch: pytest.MonkeyPatch, error: BaseException, status: int
 ) -> None:
     _register_command(monkeypatch, error)
 
-    assert cli.run(["fake"]) == status
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("crosscue: ")
-    assert captured.err.count("\n") == 1
+    refusal(status, "fake")
 
 
 def test_control_characters_in_an_error_are_escaped(

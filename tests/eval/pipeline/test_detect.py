@@ -15,6 +15,7 @@ from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR
 from support.data import shared
 from support.pictures import picture_folder
+from support.refusals import refusal
 
 BRIGHT = "support.detecting:build"
 CITY = (
@@ -158,19 +159,13 @@ OTHER_SIZES = {
 
 
 @pytest.mark.parametrize("camera", OTHER_SIZES)
-def test_intrinsics_for_another_image_size_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], camera: str
-) -> None:
+def test_intrinsics_for_another_image_size_are_refused(tmp_path: Path, camera: str) -> None:
     log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
     vehicle.write_text(f"version = 1\n[camera]\n{camera}\n")
 
     for command in ("detect", "replay"):
         argv = [command, str(log), "--vehicle", str(vehicle), "-o", str(out), "--no-cache"]
-        assert run([*argv, "--detectors", BRIGHT]) == 2
-
-        message = capsys.readouterr().err
-        assert OTHER_SIZES[camera] in message
-        assert message.count("\n") == 1
+        assert OTHER_SIZES[camera] in refusal(2, *argv, "--detectors", BRIGHT)
         assert not out.exists()
 
 
@@ -200,16 +195,12 @@ def test_later_picture_not_matching_intrinsics_is_dropped(tmp_path: Path) -> Non
     ],
 )
 def test_invalid_detector_is_reported_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], detector: str, message: str
+    tmp_path: Path, detector: str, message: str
 ) -> None:
     log = _folder(tmp_path)
     args = ["-o", str(tmp_path / "run"), "--detectors", detector, "--no-cache"]
 
-    assert run(["detect", str(log), *args]) == 2
-
-    reported = capsys.readouterr().err
-    assert message in reported
-    assert reported.count("\n") == 1
+    assert message in refusal(2, "detect", log, *args)
 
 
 @pytest.mark.parametrize("name", sorted(ROAD_CARDS))

@@ -16,6 +16,7 @@ from crosscue.eval.cli import run
 from crosscue.eval.pipeline.detect import Detecting
 from crosscue.eval.runs.manifest import FORMAT_VERSION
 from crosscue.replay.files.log_identity import of_row
+from support.refusals import refusal
 from support.trees import tree
 
 pytestmark = pytest.mark.slow
@@ -86,15 +87,12 @@ def test_run_of_older_format_is_refused(
         ["merge", "old", "-o", "all"],
     ):
         argv = [str(tmp_path / word) if word in ("old", "all") else word for word in argv]
-        assert run(argv) == 4
-        assert REFUSAL in capsys.readouterr().err
+        assert REFUSAL in refusal(4, *argv)
     assert _replay(drives / "D-0", manifest.parent, "--resume") == 4
     assert REFUSAL in capsys.readouterr().err
 
 
-def test_moved_logs_are_accepted_and_changed_logs_refused(
-    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_moved_logs_are_accepted_and_changed_logs_refused(drives: Path, tmp_path: Path) -> None:
     place = tmp_path / "one"
     shutil.copytree(drives / "D-0", place / "drive")
     assert _replay(place / "drive", place / "run") == 0
@@ -110,11 +108,9 @@ def test_moved_logs_are_accepted_and_changed_logs_refused(
     moved = tmp_path / "elsewhere" / "deep" / "drive.mcap"
     moved.parent.mkdir(parents=True)
     log.rename(moved)
-    assert run(estimate) == 4
-    assert "is gone; name its folder with --logs DIR" in capsys.readouterr().err
+    assert "is gone; name its folder with --logs DIR" in refusal(4, *estimate)
     shutil.copy(drives / "D-1" / "drive.mcap", log)
-    assert run(estimate) == 4
-    assert "has changed since" in capsys.readouterr().err
+    assert "has changed since" in refusal(4, *estimate)
     assert run([*estimate, "--logs", str(drives / "D-1")]) == 4
     assert run([*estimate, "--logs", str(tmp_path / "elsewhere")]) == 0
 

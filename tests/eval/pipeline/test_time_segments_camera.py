@@ -14,6 +14,7 @@ from crosscue.eval import cli
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import RunFolder
 from support.gap_drive import ROW, SECOND, Clock, distance_m, replay, write_drive
+from support.refusals import refusal
 
 LABELLED: Final = ("frames", "detections", "road", "cues", "range", "belief", "pose", "skipped")
 NEVER_S: Final = 1e6
@@ -120,18 +121,13 @@ def test_short_gap_keeps_approach_and_range(tmp_path: Path, pause_s: float) -> N
 
 
 @pytest.mark.parametrize("line", ["max_silence_s = 9.0", "restart_after_s = 2.0"])
-def test_estimate_refuses_settings_that_split_frames_differently(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str
-) -> None:
+def test_estimate_refuses_settings_that_split_frames_differently(tmp_path: Path, line: str) -> None:
     run = replay(tmp_path, write_drive(tmp_path, Clock(pause_s=(5.0, 8.0)))).run
     before = run.file("manifest.json").read_bytes()
     other = tmp_path / "other.toml"
     other.write_text((tmp_path / "car.toml").read_text() + f"[time]\n{line}\n")
 
-    assert cli.run(["estimate", str(run.path), "--vehicle", str(other)]) == 2
-
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
+    message = refusal(2, "estimate", run.path, "--vehicle", other)
     assert f"time.{line.split()[0]}" in message
     assert "run crosscue replay again" in message
     assert run.file("manifest.json").read_bytes() == before

@@ -10,10 +10,10 @@ import pytest
 from rerun.chunk import RrdReader
 
 import crosscue
-from crosscue.eval import cli
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.moments import run_between
 from crosscue.replay.errors import UsageError
+from support.refusals import refusal
 from support.scene_run import scene_run
 from support.scoring import at
 
@@ -75,12 +75,9 @@ def test_approach_is_recorded_from_its_first_step_to_its_last(tmp_path: Path) ->
     ],
 )
 def test_invalid_part_options_are_refused_in_one_line(
-    run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: str, named: str
+    run: RunFolder, tmp_path: Path, flags: str, named: str
 ) -> None:
     output = tmp_path / "x.rrd"
 
-    assert cli.run(["view", str(run.path), "-o", str(output), *flags.split()]) == 2
-    printed = capsys.readouterr()
-    assert named in printed.err
-    assert printed.err.count("\n") == 1
+    assert named in refusal(2, "view", run.path, "-o", output, *flags.split())
     assert not output.exists()

@@ -9,6 +9,7 @@ import pytest
 
 from crosscue.eval import cli
 from crosscue.eval.runs.tags import write_tags
+from support.refusals import refusal
 from support.scoring import run_folder, truth_folder
 
 needs_mlflow = pytest.mark.skipif(
@@ -63,18 +64,9 @@ def test_scores_tags_and_report_are_stored_in_mlflow(
     ],
 )
 def test_unusable_mlflow_store_is_refused_before_scoring(
-    tmp_path: Path,
-    uri: str,
-    status: int,
-    message: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, uri: str, status: int, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("MLFLOW_ALLOW_FILE_STORE", raising=False)
     monkeypatch.chdir(tmp_path)
 
-    assert cli.run(["score", "no_such_run", "--mlflow", uri]) == status
-
-    printed = capsys.readouterr().err
-    assert message in printed
-    assert printed.count("\n") == 1
+    assert message in refusal(status, "score", "no_such_run", "--mlflow", uri)

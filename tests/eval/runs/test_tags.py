@@ -10,6 +10,7 @@ from crosscue.eval import cli
 from crosscue.eval.batch.merge import gathered
 from crosscue.replay.errors import UnreadableRunError, UsageError
 from support.catalog_runs import add_run, runs_below
+from support.refusals import refusal
 from support.trees import tree
 
 
@@ -56,13 +57,11 @@ def test_copies_of_a_run_with_different_tags_are_not_merged(runs: Path) -> None:
     ],
 )
 def test_invalid_tags_are_refused_without_changes(
-    runs: Path, argv: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    runs: Path, argv: list[str], message: str
 ) -> None:
     before = tree(runs)
 
-    assert cli.run(["tag", str(runs / "a"), *argv]) == 2
-
-    assert message in capsys.readouterr().err
+    assert message in refusal(2, "tag", runs / "a", *argv)
     assert tree(runs) == before
 
 

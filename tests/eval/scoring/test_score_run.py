@@ -16,6 +16,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import LogRow
 from crosscue.eval.scoring.gates import Gate, check_gates
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
+from support.refusals import refusal
 from support.scoring import (
     BELIEF,
     CUES,
@@ -42,11 +43,7 @@ def _one(tmp_path: Path, name: str = "one") -> Path:
 def _fails(capsys: pytest.CaptureFixture[str], status: int, *argv: object) -> str:
     """Return the one line that a command prints when it fails with an exit status."""
     capsys.readouterr()
-    assert cli.run([str(one) for one in argv]) == status
-    line = capsys.readouterr().err
-    assert line.startswith("crosscue: ")
-    assert line.count("\n") == 1
-    return line
+    return refusal(status, *argv)
 
 
 def test_score_finds_truth_next_to_log_and_writes_files(

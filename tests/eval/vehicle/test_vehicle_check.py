@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.eval.cli import run
 from crosscue.eval.vehicle.check import Checked, _normalized, check_drive_signals
 from crosscue.eval.vehicle.drive_check import check_vehicle
 from crosscue.replay.base import EVERYTHING
@@ -17,6 +16,7 @@ from crosscue.replay.vehicle.pose import Odometry
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block
 from support.pandaset_drive import pandaset_drive
+from support.refusals import refusal
 
 FIX = Topic("fix", "sensor_msgs/msg/NavSatFix", "columns")
 
@@ -94,17 +94,9 @@ def test_intrinsics_of_other_pictures_are_contradictions(
     ],
 )
 def test_invalid_check_options_are_refused_in_one_line(
-    tmp_path: Path,
-    arguments: list[str],
-    status: int,
-    message: str,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, arguments: list[str], status: int, message: str
 ) -> None:
     drive = pandaset_drive(tmp_path / "002")
     vehicle = write_vehicle(tmp_path / "car.toml", "focal_px = 1500.0")
 
-    assert run(["check", str(drive), str(vehicle), *arguments]) == status
-
-    printed = capsys.readouterr().err
-    assert message in printed
-    assert printed.count("\n") == 1
+    assert message in refusal(status, "check", drive, vehicle, *arguments)
