@@ -37,6 +37,7 @@ from crosscue.eval.fit.compass import fit_compass as fit_compass
 from crosscue.eval.fit.detector.fit import fit_detector as fit_detector
 from crosscue.eval.fit.gnss_truth import truth_from_gnss as truth_from_gnss
 from crosscue.eval.fit.landmarks.fit import fit_landmarks as fit_landmarks
+from crosscue.eval.fit.map_truth import truth_from_map as truth_from_map
 from crosscue.eval.fit.messages import fit_messages as fit_messages
 from crosscue.eval.fit.odometry import fit_odometry as fit_odometry
 from crosscue.eval.fit.ranges.fit import fit_ranges as fit_ranges

@@ -75,6 +75,7 @@ COMMANDS: Final = {
     "landmarks match": "eval.landmarks:match_landmarks",
     "truth": "datasets.truth.truth:write_truth",
     "truth from-gnss": "eval.fit.gnss_truth:truth_from_gnss",
+    "truth from-map": "eval.fit.map_truth:truth_from_map",
     "truth import": "eval.failures.imported_truth:import_truth",
     "run schema": "eval.schemas:run",
     "truth schema": "eval.schemas:truth",

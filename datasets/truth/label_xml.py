@@ -44,11 +44,16 @@ def read_cvat(path: Path) -> Annotations:
             declaration.
     """
     reader = _CvatReader(str(path))
-    _parse(path, reader, MAX_BYTES)
+    parse_xml(path, reader, MAX_BYTES)
     return reader.annotations()
 
 
-def _parse(path: Path, reader: _XmlReader, max_bytes: int) -> None:
+def parse_xml(path: Path, reader: XmlReader, max_bytes: int) -> None:
+    """Parse a file.
+
+    Raises:
+        AnnotationError: It is missing, too large, or not XML, or its reader refuses it.
+    """
     parser = expat.ParserCreate()
     parser.StartDoctypeDeclHandler = reader.refuse_doctype
     parser.StartElementHandler = reader.start
@@ -65,7 +70,7 @@ def _parse(path: Path, reader: _XmlReader, max_bytes: int) -> None:
 
 
 @dataclass(slots=True)
-class _XmlReader:
+class XmlReader:
     """Parser of a file; the path of the current element, and its text."""
 
     where: str
@@ -75,12 +80,14 @@ class _XmlReader:
     _words: list[str] = field(default_factory=list)
 
     def refuse_doctype(self, *_: object) -> None:
+        """Refuse the file."""
         raise AnnotationError(
             f"{self.where}: has a document type declaration, which may define entities; remove it "
             f"({self.kind} has none)"
         )
 
     def start(self, tag: str, found: Mapping[str, str]) -> None:
+        """Begin an element."""
         if len(self._path) >= self.max_depth:
             raise AnnotationError(
                 f"{self.where}: nested over {self.max_depth} levels deep; expected {self.kind}"
@@ -89,10 +96,12 @@ class _XmlReader:
         self._words = []
 
     def end(self, tag: str) -> None:
+        """End an element."""
         self._path.pop()
         self._words = []
 
     def text(self, words: str) -> None:
+        """Take text of the current element."""
         self._words.append(words)
 
     @property
@@ -101,7 +110,7 @@ class _XmlReader:
 
 
 @dataclass(slots=True)
-class _CvatReader(_XmlReader):
+class _CvatReader(XmlReader):
     """Parser of CVAT's file, with the contents read so far."""
 
     kind = "CVAT's XML 1.1"
@@ -119,7 +128,7 @@ class _CvatReader(_XmlReader):
             raise AnnotationError(
                 f"{self.where}: <{tag}>: expected <annotations> of CVAT's XML 1.1"
             )
-        _XmlReader.start(self, tag, found)
+        XmlReader.start(self, tag, found)
         if tag == "image":
             self._things = []
             self._pictures.append(self._picture(found))
@@ -144,7 +153,7 @@ class _CvatReader(_XmlReader):
             )
         elif tag == "track":
             self._track = None
-        _XmlReader.end(self, tag)
+        XmlReader.end(self, tag)
 
     def _picture(self, found: Mapping[str, str]) -> Picture:
         name = self._text(found, "name")
@@ -325,7 +334,7 @@ def read_voc(path: Path) -> tuple[str, tuple[int, int] | None, list[VocBox]]:
             declaration.
     """
     reader = _VocReader(str(path))
-    _parse(path, reader, MAX_VOC_BYTES)
+    parse_xml(path, reader, MAX_VOC_BYTES)
     if not reader.is_voc:
         raise AnnotationError(f"{path}: no <annotation>; expected a Pascal VOC file")
     name = reader.values.get("annotation/filename", "") or path.name
@@ -333,7 +342,7 @@ def read_voc(path: Path) -> tuple[str, tuple[int, int] | None, list[VocBox]]:
 
 
 @dataclass(slots=True)
-class _VocReader(_XmlReader):
+class _VocReader(XmlReader):
     """Parser of a Pascal VOC file; values by their path below the root."""
 
     kind = "a Pascal VOC file"
@@ -344,7 +353,7 @@ class _VocReader(_XmlReader):
     _object: dict[str, str] = field(default_factory=dict)
 
     def start(self, tag: str, found: Mapping[str, str]) -> None:
-        _XmlReader.start(self, tag, found)
+        XmlReader.start(self, tag, found)
         self.is_voc = self.is_voc or self._path == ["annotation"]
         if self._path == ["annotation", "object"]:
             self._object = {}
@@ -357,7 +366,7 @@ class _VocReader(_XmlReader):
             self.boxes.append(self._box())
         else:
             self.values.setdefault(place, text)
-        _XmlReader.end(self, tag)
+        XmlReader.end(self, tag)
 
     def size(self) -> tuple[int, int] | None:
         """Width and height, if the file specifies them."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from crosscue.datasets.geodesy import geodetic_to_enu
 from crosscue.datasets.truth.truth import Mounting, Origin, Truth, WrittenTruth, save
-from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.datasets.truth.tum import Trajectory, planar, write_tum
 from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.localization.compass import course_at
 from crosscue.replay.base import Log, Selection, name_of
@@ -59,12 +59,35 @@ def write_gnss_truth(
 ) -> Path:
     """Write ``truth.json`` and the antenna's track.
 
+    Raises:
+        EmptyResultError: No GNSS position exists, or none has a heading.
+        OutputError: A file cannot be written.
+    """
+    truth, track = gnss_truth(logs, vehicle, selection)
+    return save_with_track(truth, track, folder)
+
+
+def save_with_track(truth: Truth, track: Trajectory, folder: Path) -> Path:
+    """Write a truth and the antenna's track.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    write_tum(folder / POSE_FILE, track, "GNSS: the antenna in a local frame, x east, y north")
+    return save(truth, folder)
+
+
+def gnss_truth(
+    logs: Sequence[Log], vehicle: Vehicle, selection: Selection
+) -> tuple[Truth, Trajectory]:
+    """Return the truth of a drive's GNSS, and the antenna's track.
+
     Rows without a heading (the vehicle has not moved yet, or stood too long) are left out, because
     a pose without a heading cannot be scored.
 
     Raises:
         EmptyResultError: No GNSS position exists, or none has a heading.
-        OutputError: A file cannot be written.
     """
     planned = signal_plan(logs, vehicle)
     source = planned.source_of(Signal.POSITION)
@@ -89,12 +112,9 @@ def write_gnss_truth(
     t_ns = fixes.t_ns[known] - round(gnss.delay_s * 1e9)
     stated = np.where(np.isfinite(sd), sd, gnss.position_sd_m)[known]
     track = planar(t_ns, xyz[known, 0], xyz[known, 1], heading[known])
-    folder.mkdir(parents=True, exist_ok=True)
-    note = f"GNSS ({source.topic.name}): the antenna in a local frame, x east, y north"
-    write_tum(folder / POSE_FILE, track, note)
     mounting, mounting_source = _antenna(gnss)
     name = name_of(logs[source.log]).rstrip("/").rpartition("/")[2]
-    return save(
+    return (
         Truth(
             version=1,
             log=name,
@@ -110,7 +130,7 @@ def write_gnss_truth(
             source=f"GNSS of the log ({source.topic.name}), as received; {int((~known).sum())} of "
             f"{len(known)} positions left out because they lack a heading",
         ),
-        folder,
+        track,
     )
 
 

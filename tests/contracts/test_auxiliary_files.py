@@ -22,6 +22,7 @@ from support.mcap_files import McapFile
 from support.onnx_models import bright_box_model
 from support.opened_files import opened_files
 from support.pictures import picture
+from support.street_map import write_crossing
 from support.trees import tree
 
 INPUT: Final = 4
@@ -38,6 +39,8 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("check", "FILE"): ("{gone}", INPUT),
     ("fit compass", "LOG"): ("{gone} --vehicle {car}", INPUT),
     ("truth from-gnss", "LOG"): ("{gone} -o {out}", INPUT),
+    ("truth from-map", "LOG"): ("{gone} {streets} -o {out}", INPUT),
+    ("truth from-map", "FILE"): ("{log} {gone} -o {out}", INPUT),
     ("fit odometry", "LOG"): ("{gone} --vehicle {car}", INPUT),
     ("fit landmarks", "LOG"): ("{gone} --poses {truth} --database {db} --vehicle {car}", INPUT),
     ("landmarks add", "LOG"): ("{out}.db {gone} --poses {truth} --vehicle {car}", INPUT),
@@ -111,6 +114,7 @@ CASES: Final[dict[tuple[str, str], tuple[str, int]]] = {
     ("vehicle init", "--dbc"): ("{log} -o {out}.toml --dbc {gone}.dbc", INPUT),
     ("fit compass", "--vehicle"): ("{log} --vehicle {gone}", SETTINGS),
     ("truth from-gnss", "--vehicle"): ("{log} -o {out} --vehicle {gone}", SETTINGS),
+    ("truth from-map", "--vehicle"): ("{log} {streets} -o {out} --vehicle {gone}", SETTINGS),
     ("fit odometry", "--vehicle"): ("{log} --vehicle {gone}", SETTINGS),
     ("fit odometry", "--truth"): ("{log} --vehicle {car} --truth {gone}", INPUT),
     ("fit signs", "--test"): ("{labels} --label stop --test {gone}.csv", INPUT),
@@ -273,6 +277,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "onnx": photos / "net.onnx",
         "card": photos / "net.toml",
         "there": photos,
+        "streets": write_crossing(photos / "streets.osm"),
         "failures": table_of_failures(run.path, photos / "failures.parquet", BEGIN),
     }
 

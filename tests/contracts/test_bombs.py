@@ -29,6 +29,7 @@ from support.onnx_models import bright_box_model, open_model
 from support.pictures import OVERSIZED as CODED
 from support.pictures import SIDE_PX, picture
 from support.rosbag_files import START_NS, Row, write_bag, write_folder
+from support.street_map import write_crossing
 
 DECLARED = 3 * MIB
 LIMIT_MIB = 2
@@ -50,6 +51,7 @@ OPENS_LOGS: dict[str, tuple[str, int]] = {
     "check": ("{log} {car} {truth} -o {out}.html", 3),
     "fit compass": ("{compass} --vehicle {its_car}", 4),
     "truth from-gnss": ("{compass} -o {out} --vehicle {gnss_car}", 4),
+    "truth from-map": ("{compass} {streets} -o {out} --vehicle {gnss_car}", 4),
     "fit odometry": ("{compass} --vehicle {its_car} --truth {its_truth}", 4),
     "fit signs": ("{drive} --label stop_sign", 1),
     "fit landmarks": ("{log} --database {db} --poses {truth} --vehicle {car}", 1),
@@ -107,6 +109,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "compass": compass.log,
         "its_car": compass.vehicle,
         "gnss_car": gnss_car,
+        "streets": write_crossing(folder / "streets.osm"),
         "its_truth": compass.truth,
         "failures": table_of_failures(run.path, folder / "failures.parquet", BEGIN + 10**9),
     }

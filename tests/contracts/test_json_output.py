@@ -19,6 +19,7 @@ from support.landmark_files import database_of, encoded, seen_from, wall
 from support.onnx_models import bright_box_model
 from support.pictures import picture
 from support.scenes import shorten
+from support.street_map import write_crossing
 
 # The order matters: commands read results of earlier ones. LOG is a drive with a gap.
 LINES: Final[dict[str, tuple[str, int]]] = {
@@ -64,6 +65,7 @@ MADE: Final[dict[str, tuple[str, int]]] = {
     "landmarks match": ("new.db photos/seen1.png", 0),
     "model init": ("net.onnx", 0),
     "truth from-gnss": ("KITTI -o from_gnss", 0),
+    "truth from-map": ("KITTI streets.osm -o from_map", 0),
     "truth": ("KITTI -o its_truth", 0),
     "truth import": ("road/coco.json --log LOG -o imported.json", 0),
     "simulate": ("A -o simulated --width 64 --fps 10", 0),
@@ -132,6 +134,7 @@ def test_json_of_creating_commands_is_one_strict_document(
     compass = simulated(tmp_path / "compass", DriveSettings(seed=3, blocks=2, block_m=60.0))
     _write_photos(tmp_path / "photos")
     _write_road(tmp_path / "road")
+    write_crossing(tmp_path / "streets.osm")
     (tmp_path / "net.onnx").write_bytes(bright_box_model())
     places = {
         "LOG": str(log),

@@ -40,6 +40,7 @@ BASE: Final[dict[str, str]] = {
     "landmarks add": "{out}.db {log} --poses {truth}",
     "landmarks match": "{db} {empty}/a.png",
     "truth from-gnss": "{log} -o {out}",
+    "truth from-map": "{log} {empty}/streets.osm -o {out}",
     "truth import": "{empty}/coco.json --log {log} -o {out}.json",
     "train road": "--layouts L0 -o {out}.safetensors",
     "study intersections": "-o {out} --layouts A --runs 1 --width 160 --no-attribution",

@@ -22,6 +22,7 @@ from crosscue.replay.remote import logs as remote
 from crosscue.replay.remote import ranges as remote_ranges
 from support.gap_drive import Clock, write_drive
 from support.range_server import Served, serving
+from support.street_map import write_crossing
 
 SECRET: Final = "hunter2"
 PARTS: Final = "?X-Amz-Signature=hunter2query&hunter2=1#hunter2fragment"
@@ -35,6 +36,7 @@ FINE: Final[dict[str, tuple[str, int]]] = {
     "fit compass": ("COMPASS --vehicle ITS_CAR", 0),
     "fit odometry": ("COMPASS --vehicle ITS_CAR --truth ITS_TRUTH --keep", 0),
     "truth from-gnss": ("COMPASS -o truth", 1),
+    "truth from-map": ("COMPASS streets.osm -o truth", 1),
 }
 # Commands whose LOG is text, but must be on this machine.
 LOCAL: Final = frozenset({"seal"})
@@ -68,6 +70,7 @@ def web(
     with serving() as served:
         for name, path in drives.items():
             served.files[f"{name}{path.suffix}"] = path.read_bytes()
+        write_crossing(tmp_path / "streets.osm")
         served.password = SECRET
         yield served
 

@@ -10,6 +10,7 @@ from support.failures import table_of_failures
 from support.gap_drive import BEGIN, SECOND, Clock, replayed, write_drive
 from support.pictures import picture, picture_folder
 from support.rosbag_files import Row, write_folder
+from support.street_map import write_crossing
 
 # Commands without a result for such input, and their arguments.
 COMMANDS: dict[str, str] = {
@@ -17,6 +18,7 @@ COMMANDS: dict[str, str] = {
     "truth import": "{empty}/coco.json --log {log} -o {out}.json --vehicle {car}",
     "fit compass": "{log} --vehicle {car}",
     "truth from-gnss": "{log} -o {out} --vehicle {car}",
+    "truth from-map": "{log} {empty}/streets.osm -o {out} --vehicle {car}",
     "fit odometry": "{log} --vehicle {car}",
     "fit signs": "{empty}/labels.csv --label stop",
     "fit temporal": "{run} --truth {empty}/truth.json -o {out}.toml",
@@ -48,6 +50,7 @@ def empty_inputs(folder: Path) -> dict[str, Path]:
     coco: dict[str, list[object]] = {"categories": [], "images": [], "annotations": []}
     (empty / "coco.json").write_text(json.dumps(coco))
     (empty / "a.png").write_bytes(picture(1))
+    write_crossing(empty / "streets.osm")
     (empty / "labels.csv").write_text("picture,label,x0,y0,x1,y1\na.png,,,,,\n")
     (empty / "pairs.csv").write_text("query,known,same\n")
     (empty / "places.csv").write_text("image,x_m,y_m,sd_m\na.png,0,0,1\n")

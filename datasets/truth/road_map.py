@@ -1,0 +1,333 @@
+"""Roads of a map, their junctions, and what a vehicle that follows them comes to next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+
+from crosscue.replay.columns import Floats, Int64s
+
+Control = Literal["stop_sign", "traffic_light"]
+Side = Literal["left", "right", "straight", "back"]
+
+# Junctions of a map that are closer along a road belong to one intersection: dual carriageways
+# and staggered arms have several.
+SAME_M: Final = 25.0
+# A leg's direction is that of its first part; a shorter dead end is no leg.
+LEG_M: Final = 20.0
+MIN_LEG_M: Final = 8.0
+# Turn from which on a leg leads left or right, and from which on it leads back.
+SIDE_RAD: Final = np.radians(40.0)
+BACK_RAD: Final = np.radians(155.0)
+# Distance from which on a vehicle approaches an intersection.
+REACH_M: Final = 100.0
+# A control stands at most so far ahead of its intersection.
+CONTROL_M: Final = 30.0
+# Farthest position from a road's centre line, and the scales with which a road is chosen.
+OFF_M: Final = 20.0
+_SCALE_M: Final = 5.0
+_SCALE_RAD: Final = np.radians(20.0)
+_CHANGE: Final = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Road:
+    """A drivable way between points.
+
+    Attributes:
+        nodes: Keys of its points, in its direction.
+        width_m: Width between its kerbs.
+        is_one_way: True if it may only be driven in its direction.
+        is_inside: True if it lies inside an intersection, as a roundabout does.
+    """
+
+    nodes: tuple[str, ...]
+    width_m: float
+    is_one_way: bool = False
+    is_inside: bool = False
+
+
+class Leg(NamedTuple):
+    """A road that leads away from an intersection."""
+
+    heading_rad: float
+    width_m: float
+    is_in: bool
+    is_out: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Ahead:
+    """The next intersection of a vehicle on a road.
+
+    Attributes:
+        junction: Number of the intersection.
+        start_m: Distance to the near kerb of its crossroad.
+        end_m: Distance to the far kerb.
+        heading_rad: Direction of travel at its first point.
+        control: Control that the map states for this approach; None if it states none.
+    """
+
+    junction: int
+    start_m: float
+    end_m: float
+    heading_rad: float
+    control: Control | None
+
+
+class _Edge(NamedTuple):
+    """Part of a road between two points."""
+
+    to: str
+    width_m: float
+    is_out: bool
+    is_in: bool
+    is_inside: bool
+
+
+@dataclass(slots=True)
+class RoadMap:
+    """Roads as a graph in a local frame, x east and y north.
+
+    Args:
+        points_m: Position of each point by its key, shape (2,).
+        roads: The roads.
+        controls: Control at a point, with the heading that it is for; None for every heading.
+    """
+
+    points_m: Mapping[str, Floats]
+    roads: Sequence[Road]
+    controls: Mapping[str, tuple[Control, float | None]]
+    _edges: dict[str, list[_Edge]] = field(init=False, default_factory=dict)
+    _junction: dict[str, int] = field(init=False, default_factory=dict)
+    _legs: dict[int, tuple[Leg, ...]] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Connect the roads, and find the junctions."""
+        for road in self.roads:
+            for a, b in zip(road.nodes, road.nodes[1:], strict=False):
+                if a == b:
+                    continue
+                two_way = not road.is_one_way
+                one = _Edge(b, road.width_m, True, two_way, road.is_inside)
+                self._edges.setdefault(a, []).append(one)
+                back = one._replace(to=a, is_out=two_way, is_in=True)
+                self._edges.setdefault(b, []).append(back)
+        self._find_junctions()
+
+    def _find_junctions(self) -> None:
+        forks = {at for at, edges in self._edges.items() if len({e.to for e in edges}) > 2}
+        parent = {at: at for at in forks}
+
+        def root(at: str) -> str:
+            while parent[at] != at:
+                parent[at] = parent[parent[at]]
+                at = parent[at]
+            return at
+
+        for road in self.roads:
+            if road.is_inside:
+                for at in road.nodes:
+                    parent[root(parent.setdefault(at, at))] = root(road.nodes[0])
+        for fork in sorted(forks):
+            for edge in self._edges[fork]:
+                chain, length_m = self._chain(fork, edge, SAME_M)
+                if length_m < SAME_M and chain[-1] in parent:
+                    for at in chain:
+                        parent[root(parent.setdefault(at, at))] = root(fork)
+        numbers = {one: n for n, one in enumerate(sorted({root(at) for at in parent}))}
+        self._junction = {at: numbers[root(at)] for at in parent}
+        members: dict[int, list[str]] = {}
+        for at, number in self._junction.items():
+            members.setdefault(number, []).append(at)
+        self._legs = {number: tuple(self._legs_of(one)) for number, one in members.items()}
+
+    def _chain(self, at: str, edge: _Edge, most_m: float) -> tuple[list[str], float]:
+        """Follow a road from a point to the next fork or end, or over the given length."""
+        chain, length_m = [at], 0.0
+        while True:
+            before, here = chain[-1], edge.to
+            length_m += self._distance_m(before, here)
+            chain.append(here)
+            onward = [e for e in self._edges[here] if e.to != before]
+            if length_m >= most_m or len(onward) != 1 or here in chain[:-1]:
+                return chain, length_m
+            edge = onward[0]
+
+    def _legs_of(self, members: Sequence[str]) -> Iterator[Leg]:
+        inside = set(members)
+        for at in sorted(members):
+            for edge in self._edges[at]:
+                if edge.to in inside:
+                    continue
+                chain, length_m = self._chain(at, edge, LEG_M)
+                if length_m >= MIN_LEG_M:
+                    heading = self._heading_rad(at, chain[-1])
+                    yield Leg(heading, edge.width_m, edge.is_in, edge.is_out)
+
+    def _distance_m(self, a: str, b: str) -> float:
+        return float(np.hypot(*(self.points_m[b] - self.points_m[a])))
+
+    def _heading_rad(self, a: str, b: str) -> float:
+        x, y = self.points_m[b] - self.points_m[a]
+        return float(np.arctan2(y, x))
+
+    def legs(self, ahead: Ahead) -> dict[Side, list[Leg]]:
+        """Return the legs of the next intersection by their side, as seen by the vehicle."""
+        found: dict[Side, list[Leg]] = {"left": [], "right": [], "straight": [], "back": []}
+        for leg in self._legs[ahead.junction]:
+            found[_side(leg.heading_rad - ahead.heading_rad)].append(leg)
+        return found
+
+    def along(self, xy_m: Floats, heading_rad: Floats) -> list[Ahead | None]:
+        """Return the next intersection at each position of a track.
+
+        Args:
+            xy_m: Positions, shape (N, 2).
+            heading_rad: Headings, shape (N,), from x, counter-clockwise.
+
+        Returns:
+            One for each position; None inside an intersection, off the roads, or where there is
+            none within reach.
+        """
+        near = self._near(xy_m)
+        if not near:
+            return [None] * len(xy_m)
+        starts = np.array([self.points_m[a] for a, _ in near])
+        ways = np.array([self.points_m[e.to] for _, e in near]) - starts
+        length = np.hypot(*ways.T)
+        headings = np.arctan2(ways[:, 1], ways[:, 0])
+        found: list[Ahead | None] = []
+        last: set[str] = set()
+        for at, heading in zip(xy_m, heading_rad.tolist(), strict=True):
+            part = np.clip(((at - starts) * ways).sum(axis=1) / length**2, 0.0, 1.0)
+            off = np.hypot(*(starts + part[:, None] * ways - at).T)
+            turn = np.abs(_wrapped(headings - heading))
+            cost = (off / _SCALE_M) ** 2 + (turn / _SCALE_RAD) ** 2
+            cost += [0.0 if a in last or e.to in last else _CHANGE for a, e in near]
+            best = int(cost.argmin())
+            if off[best] > OFF_M or turn[best] > SIDE_RAD:
+                found.append(None)
+                continue
+            begin, edge = near[best]
+            last = {begin, edge.to}
+            found.append(self._ahead(begin, edge, float((1.0 - part[best]) * length[best])))
+        return found
+
+    def _near(self, xy_m: Floats) -> list[tuple[str, _Edge]]:
+        """Return the drivable edges near a track."""
+        low, high = xy_m.min(axis=0) - OFF_M, xy_m.max(axis=0) + OFF_M
+        found = []
+        for at, edges in self._edges.items():
+            for edge in edges:
+                pair = np.array([self.points_m[at], self.points_m[edge.to]])
+                beside = (pair.max(axis=0) < low).any() or (pair.min(axis=0) > high).any()
+                if edge.is_out and not beside and pair[0].tolist() != pair[1].tolist():
+                    found.append((at, edge))
+        return found
+
+    def _ahead(self, begin: str, edge: _Edge, left_m: float) -> Ahead | None:
+        """Follow the road to the next intersection that has a side road."""
+        before, at, gone_m = begin, edge.to, left_m
+        control: tuple[Control, float] | None = None
+        seen = {begin}
+        while gone_m < REACH_M and at not in seen:
+            seen.add(at)
+            heading = self._heading_rad(before, at)
+            stated = self.controls.get(at)
+            if stated and (stated[1] is None or abs(_wrapped(stated[1] - heading)) < SIDE_RAD):
+                control = stated[0], gone_m
+            number = self._junction.get(at)
+            if number is not None:
+                if self._junction.get(before) == number:
+                    return None
+                found = self._measured(number, before, at, gone_m)
+                if found is not None:
+                    stands = control is not None and gone_m - control[1] < CONTROL_M
+                    said = control[0] if control and stands else None
+                    return Ahead(*found, heading, said or self._control_in(number, heading))
+            onward = [e for e in self._edges[at] if e.is_out and e.to != before]
+            if not onward:
+                return None
+            turns = [abs(_wrapped(self._heading_rad(at, e.to) - heading)) for e in onward]
+            before, edge = at, onward[int(np.argmin(turns))]
+            at = edge.to
+            gone_m += self._distance_m(before, at)
+        return None
+
+    def _measured(
+        self, number: int, before: str, at: str, gone_m: float
+    ) -> tuple[int, float, float] | None:
+        """Return number, start and end of an intersection; None if it has no side road."""
+        heading = self._heading_rad(before, at)
+        halves = [
+            0.5 * leg.width_m / abs(np.sin(leg.heading_rad - heading))
+            for leg in self._legs[number]
+            if _side(leg.heading_rad - heading) in ("left", "right")
+        ]
+        if not halves:
+            return None
+        across_m, seen = 0.0, {before}
+        while at not in seen:
+            seen.add(at)
+            within = [e for e in self._edges[at] if self._junction.get(e.to) == number]
+            turns = [abs(_wrapped(self._heading_rad(at, e.to) - heading)) for e in within]
+            if not turns or min(turns) > SIDE_RAD:
+                break
+            onward = within[int(np.argmin(turns))].to
+            across_m += self._distance_m(at, onward)
+            at = onward
+        return number, gone_m - max(halves), gone_m + across_m + max(halves)
+
+    def _control_in(self, number: int, heading_rad: float) -> Control | None:
+        """Return the control that stands at a point of the intersection itself."""
+        for at, (control, toward) in self.controls.items():
+            if self._junction.get(at) == number and (
+                toward is None or abs(_wrapped(toward - heading_rad)) < SIDE_RAD
+            ):
+                return control
+        return None
+
+
+def _side(turn_rad: float) -> Side:
+    turn = _wrapped(turn_rad)
+    if abs(turn) >= BACK_RAD:
+        return "back"
+    if abs(turn) < SIDE_RAD:
+        return "straight"
+    return "left" if turn > 0.0 else "right"
+
+
+def _wrapped(angle_rad: Floats | float) -> Floats:
+    return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def approaches_along(
+    t_ns: Int64s, found: Sequence[Ahead | None]
+) -> list[tuple[int, int, int | None]]:
+    """Group rows by the intersection ahead.
+
+    Returns:
+        First row, row after the last, and time of entering, for each approach; the time is None
+        if the track ends before.
+    """
+    groups: list[tuple[int, int, int | None]] = []
+    row = 0
+    while row < len(found):
+        one = found[row]
+        if one is None:
+            row += 1
+            continue
+        stop = row
+        while stop < len(found):
+            here = found[stop]
+            if here is None or here.junction != one.junction or here.start_m <= 0.0:
+                break
+            stop += 1
+        if stop - row > 1:
+            groups.append((row, stop, int(t_ns[stop]) if stop < len(found) else None))
+        row = max(stop, row + 1)
+    return groups

@@ -1,0 +1,148 @@
+"""Intersections of a map along a track: distances, legs and controls, turned and mirrored."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.truth.openstreetmap import read_openstreetmap
+from crosscue.datasets.truth.road_map import Ahead, RoadMap, approaches_along
+from crosscue.replay.errors import AnnotationError
+from support.street_map import ORIGIN, write_map
+
+# A street to the east with a crossing at 60 m; a T junction follows, with its arm on the left.
+POINTS = {
+    "a": (-80.0, 0.0), "b": (60.0, 0.0), "c": (160.0, 0.0), "d": (60.0, 70.0),
+    "e": (60.0, -70.0), "f": (240.0, 0.0), "g": (160.0, 70.0),
+}  # fmt: skip
+STREETS = [("abc", "lanes=2"), ("cf", "lanes=2"), ("ebd", "lanes=4"), ("cg", "")]
+
+
+def _map(path: Path, roads: list[tuple[str, str]], tags: dict[str, str] | None = None) -> RoadMap:
+    return read_openstreetmap(write_map(path, POINTS, roads, tags)).around((*ORIGIN, 0.0))
+
+
+def _ahead(roads: RoadMap, x_m: float, y_m: float = -2.0, heading_rad: float = 0.0) -> Ahead | None:
+    return roads.along(np.array([[x_m, y_m]]), np.array([heading_rad]))[0]
+
+
+def _sides(roads: RoadMap, ahead: Ahead) -> set[str]:
+    return {side for side, legs in roads.legs(ahead).items() if legs}
+
+
+def test_distances_are_those_to_the_kerbs_of_the_crossroad(tmp_path: Path) -> None:
+    roads = _map(tmp_path / "a.osm", STREETS)
+
+    ahead = _ahead(roads, 10.0)
+
+    assert ahead is not None
+    assert ahead.start_m == pytest.approx(50.0 - 6.5, abs=0.2)
+    assert ahead.end_m == pytest.approx(50.0 + 6.5, abs=0.2)
+    assert _sides(roads, ahead) == {"left", "right", "straight", "back"}
+
+
+def test_next_intersection_of_a_drive_begins_after_the_last(tmp_path: Path) -> None:
+    roads = _map(tmp_path / "a.osm", STREETS)
+    x_m = np.arange(-60.0, 155.0, 1.0)
+
+    found = roads.along(np.column_stack([x_m, np.full(len(x_m), -2.0)]), np.zeros(len(x_m)))
+    (first, stop, enter), (second, last, none) = approaches_along(np.arange(len(x_m)), found)
+
+    assert [x_m[first], x_m[stop]] == pytest.approx([-39.0, 54.0])
+    assert enter == stop
+    assert [second, x_m[last - 1]] == pytest.approx([121.0, 154.0], abs=1.0)
+    assert none is None
+    after = found[second]
+    assert after is not None
+    assert _sides(roads, after) == {"left", "straight", "back"}
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 37.0, 90.0, 215.0])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_turned_or_mirrored_map_gives_the_same_distances_and_turned_legs(
+    tmp_path: Path, turn_deg: float, mirrored: bool
+) -> None:
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    sign = -1.0 if mirrored else 1.0
+    turned = {k: (c * x - s * sign * y, s * x + c * sign * y) for k, (x, y) in POINTS.items()}
+    path = write_map(tmp_path / "a.osm", turned, STREETS)
+    roads = read_openstreetmap(path).around((*ORIGIN, 0.0))
+
+    ahead = _ahead(roads, c * 130.0, s * 130.0, np.radians(turn_deg))
+
+    assert ahead is not None
+    assert ahead.start_m == pytest.approx(30.0 - 3.25, abs=0.2)
+    assert _sides(roads, ahead) == {"right" if mirrored else "left", "straight", "back"}
+
+
+def test_control_counts_for_its_direction(tmp_path: Path) -> None:
+    points = POINTS | {"s": (48.0, 0.0)}
+    roads = [("asbc", ""), ("ebd", "")]
+    said = {
+        "forward": "highway=stop direction=forward",
+        "backward": "highway=stop direction=backward",
+        "here": "highway=traffic_signals",
+    }
+    found = {}
+    for name, tags in said.items():
+        at = {"b" if name == "here" else "s": tags}
+        path = write_map(tmp_path / f"{name}.osm", points, roads, at)
+        ahead = _ahead(read_openstreetmap(path).around((*ORIGIN, 0.0)), 0.0)
+        assert ahead is not None
+        found[name] = ahead.control
+
+    assert found == {"forward": "stop_sign", "backward": None, "here": "traffic_light"}
+
+
+def test_a_ramp_or_a_driveway_is_no_intersection(tmp_path: Path) -> None:
+    points = POINTS | {"r": (200.0, -30.0), "p": (80.0, -40.0)}
+    motorway = [("abcf", "highway=motorway"), ("cr", "highway=motorway_link oneway=yes")]
+    path = write_map(tmp_path / "a.osm", points, [*motorway, ("bp", "highway=service")])
+    roads = read_openstreetmap(path).around((*ORIGIN, 0.0))
+
+    assert _ahead(roads, 30.0) is None
+    assert _ahead(roads, 120.0) is None
+
+
+def test_dual_carriageway_is_one_intersection(tmp_path: Path) -> None:
+    points = POINTS | {"h": (75.0, 0.0), "i": (75.0, 70.0), "j": (75.0, -70.0)}
+    roads = [("abhc", ""), ("dbe", "oneway=yes lanes=2"), ("jhi", "oneway=yes lanes=2")]
+    path = write_map(tmp_path / "a.osm", points, roads)
+    road_map = read_openstreetmap(path).around((*ORIGIN, 0.0))
+
+    ahead = _ahead(road_map, 0.0)
+
+    assert ahead is not None
+    assert [ahead.start_m, ahead.end_m] == pytest.approx([60.0 - 3.25, 75.0 + 3.25], abs=0.2)
+    assert _ahead(road_map, 66.0) is None
+
+
+def test_off_the_roads_there_is_nothing_ahead(tmp_path: Path) -> None:
+    roads = _map(tmp_path / "a.osm", STREETS)
+
+    assert _ahead(roads, 0.0, y_m=-35.0) is None
+    assert _ahead(roads, 0.0, heading_rad=np.pi / 2.0) is None
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("<html></html>", "expected <osm>"),
+        ("<!DOCTYPE a [<!ENTITY b 'c'>]><osm></osm>", "document type declaration"),
+        ("<osm><node id='1' lat='x' lon='2'/></osm>", "node 1: expected lat and lon"),
+        ("<osm><node id='1' lat='91' lon='2'/></osm>", "expected degrees"),
+        ("<osm><node id='1' lat='1' lon='2'/></osm>", "no road for cars"),
+        ("<osm><way", "not XML"),
+    ],
+)
+def test_unusable_map_is_refused_in_one_line(tmp_path: Path, content: str, said: str) -> None:
+    path = tmp_path / "a.osm"
+    path.write_text(content)
+
+    with pytest.raises(AnnotationError, match=said) as caught:
+        read_openstreetmap(path)
+
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
