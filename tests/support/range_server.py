@@ -98,8 +98,9 @@ def serving() -> Iterator[Served]:
                 self.wfile.write(body[: len(body) // 2])
                 self.close_connection = True
                 return
-            self.wfile.write(body)
+            # Before the last byte, after which a client that asks for the count may have gone on.
             served.sent += len(body)
+            self.wfile.write(body)
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     server.daemon_threads = True
