@@ -17,7 +17,6 @@ from crosscue.eval.batch.jobs import (
     run_many,
 )
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
-from crosscue.eval.batch.ray_jobs import engine_of
 from crosscue.eval.logs.log import UnopenedLog
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.run import Run
@@ -215,6 +214,8 @@ def replay_many(
     settings: BatchSettings,
 ) -> ReplayedDrives:
     """Replay many drives, as ``replay_drives``."""
+    from crosscue.eval.batch.ray_jobs import engine_of  # one drive needs no processes
+
     nameless = [one for one in settings.detector_names or () if not isinstance(one, str)]
     if nameless:
         raise UsageError(f"detectors: {nameless[0]!r}: many drives need names, as module:Class")

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Final
 from crosscue.replay.errors import CanDatabaseError, LogTooLargeError, SchemaError, one_line
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
-from .dbc_text import read_dbc
 from .extract import MessageExtractor
 from .layout import CanMessage, CanSignal, layout_problem, overlapping_signals
 from .layout_cache import LayoutEntry, layout_cache_folder
@@ -237,6 +236,8 @@ def _read_layout(source: DatabaseText, form: str) -> tuple[list[CanMessage], lis
 
 def _defined(source: DatabaseText, form: str) -> list[CanMessage]:
     """Return the messages of a file, with the keys of ``lines_of_messages`` as ``source``."""
+    from .dbc_text import read_dbc  # a layout in the cache does not need its patterns
+
     quick = read_dbc(source.text) if form == "dbc" else None
     if quick is not None:
         return quick

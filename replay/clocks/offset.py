@@ -116,7 +116,7 @@ class OffsetWatch:
         if len(delay) < 2 * _ROWS_BESIDE:
             return []
         after, before = forward_min(delay, width), _backward_min(delay, width)
-        usual_wait_ns = int(np.median(delay - after))
+        usual_wait_ns = int(_median(delay - after))
         over_ns = max(JUMP_FLOOR_NS, _JUMP_OVER_WAIT * usual_wait_ns)
         by = after - before
         sharp = forward_min(delay, _SHARP_ROWS) - _backward_min(delay, _SHARP_ROWS)
@@ -235,12 +235,20 @@ def theil_sen(x: Floats, y: Floats) -> tuple[float, float, float]:
     """
     i, j = np.triu_indices(len(x), k=1)
     run = x[j] - x[i]
-    slope = float(np.median((y[j] - y[i])[run != 0] / run[run != 0]))
+    slope = _median((y[j] - y[i])[run != 0] / run[run != 0])
     residual = y - slope * x
-    at_zero = float(np.median(residual))
-    scatter = 1.4826 * float(np.median(np.abs(residual - at_zero)))
+    at_zero = _median(residual)
+    scatter = 1.4826 * _median(np.abs(residual - at_zero))
     spread = float(np.sqrt(np.sum((x - x.mean()) ** 2)))
     return slope, scatter / spread, at_zero
+
+
+def _median(values: NDArray[np.generic]) -> float:
+    """Return the median of finite numbers, NaN without any; NumPy's imports masked arrays."""
+    if not len(values):
+        return float("nan")
+    middle = [(len(values) - 1) // 2, len(values) // 2]
+    return float(np.partition(values, middle)[middle].mean())
 
 
 def _bend(x: Floats, y: Floats) -> float:

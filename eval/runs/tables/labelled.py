@@ -9,7 +9,7 @@ import numpy as np
 
 from crosscue.replay.time.segments import LogClock, Timeline
 
-from .parquet import TableFolder, TableSink
+from .parquet import TableFolder, TableSink, arrow_column
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -27,8 +27,8 @@ def with_labels(table: pa.Table, timeline: Timeline, clock: LogClock) -> pa.Tabl
     import pyarrow as pa
 
     times = table["t_ns"].to_numpy()
-    numbers = pa.array(timeline.numbers(times), pa.int32())
-    original = pa.array(clock.log_times(times), pa.int64())
+    numbers = arrow_column(timeline.numbers(times), pa.int32())
+    original = arrow_column(clock.log_times(times), pa.int64())
     return table.append_column("segment", numbers).append_column("log_t_ns", original)
 
 

@@ -7,7 +7,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.replay.errors import UnreadableRunError
 from crosscue.replay.files import door
@@ -31,6 +34,44 @@ def schema_of(columns: Mapping[str, str]) -> pa.Schema:
     import pyarrow as pa
 
     return pa.schema([pa.field(name, kind) for name, kind in columns.items()])
+
+
+def arrow_column(values: Any, kind: pa.DataType) -> pa.Array:
+    """Return values, None where one is missing, as a column of Arrow.
+
+    Numbers and texts are not left to ``pa.array``: it imports pandas where that is installed, which
+    takes as long as a short replay.
+    """
+    import pyarrow as pa
+
+    if isinstance(values, pa.Array | pa.ChunkedArray):
+        return values
+    size, present, is_text = len(values), None, kind == pa.string()
+    if not (is_text or pa.types.is_dictionary(kind) or pa.types.is_primitive(kind)):
+        return pa.array(values, kind)
+    if not isinstance(values, np.ndarray) and None in values:
+        present = _bits(np.array([one is not None for one in values], np.bool_))
+        values = [("" if is_text else False) if one is None else one for one in values]
+    if pa.types.is_dictionary(kind):
+        names = {name: number for number, name in enumerate(dict.fromkeys(values))}
+        codes = np.array([names[one] for one in values], kind.index_type.to_pandas_dtype())
+        texts = arrow_column([*names], kind.value_type)
+        return pa.DictionaryArray.from_buffers(kind, size, [present, pa.py_buffer(codes)], texts)
+    if is_text:
+        parts = [str(one).encode() for one in values]
+        ends = np.cumsum([0, *map(len, parts)]).astype(np.int32)
+        buffers = [present, pa.py_buffer(ends), pa.py_buffer(b"".join(parts))]
+        return pa.Array.from_buffers(kind, size, buffers)
+    numbers = np.asarray(values) if size else np.empty(0, np.bool_)
+    numbers = numbers.astype(kind.to_pandas_dtype(), "C", "same_kind", copy=False)
+    content = _bits(numbers) if kind == pa.bool_() else pa.py_buffer(numbers)
+    return pa.Array.from_buffers(kind, size, [present, content])
+
+
+def _bits(flags: NDArray[np.bool_]) -> pa.Buffer:
+    import pyarrow as pa
+
+    return pa.py_buffer(np.packbits(flags, bitorder="little"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +196,8 @@ class TableSink:
         """
         import pyarrow as pa
 
-        table = pa.table(dict(columns), schema=self._schema)
+        arrays = [arrow_column(columns[field.name], field.type) for field in self._schema]
+        table = pa.table(arrays, schema=self._schema)
         self._held.append(table)
         self._rows += table.num_rows
         if self._rows < GROUP_ROWS:

@@ -20,7 +20,6 @@ from crosscue.replay.readers.mcap.chunks.rows import (
     NEVER_IN_A_CHUNK,
     Rows,
     contradicts,
-    join_chunks,
     rows_by_index,
     rows_by_scan,
 )
@@ -139,7 +138,7 @@ class SegmentPass:
         self._is_short: bool | None = None
         self._section: Callable[[], int | None] | None = None
         self._attachments: list[tuple[int, int, Callable[[], int | None]]] = []
-        self._waiting: list[tuple[ChunkRecords, Rows]] = []
+        self._waiting: list[tuple[UnreadChunk, ChunkRecords]] = []
         self._declarations = segment.declarations(book)
         self._builder = BlockBuilder(ledger, selection, limits, self._declarations)
         self._search = McapResync(file, segment.end, segment.has_end, (), self._plausible())
@@ -231,7 +230,9 @@ class SegmentPass:
     def _is_wanted(self, chunk: UnreadChunk) -> bool:
         """Return whether the chunk must be read, as chunks with inconsistent indexes must."""
         index, head = chunk.index, chunk.head
-        if not self._may_skip or index is None or head is None or not chunk.messages:
+        if not self._may_skip or any(self._builder.wants(m) for m in chunk.messages):
+            return True
+        if index is None or head is None or not chunk.messages:
             return True
         if chunk.fault or chunk.differs or chunk.index_fault or chunk.is_cut:
             return True
@@ -241,9 +242,7 @@ class SegmentPass:
             return True
         if not filled or min(int(m.entries["log"].min()) for m in filled) != head.start:
             return True
-        if max(int(m.entries["log"].max()) for m in filled) != head.end:
-            return True
-        return any(self._builder.wants(m) for m in filled)
+        return max(int(m.entries["log"].max()) for m in filled) != head.end
 
     def _chunk(self, chunk: UnreadChunk, load: Load | None) -> Iterator[Block]:
         self._checks.chunks += 1
@@ -256,19 +255,13 @@ class SegmentPass:
             return
         try:
             stretch = self._stretch(chunk, load)
-            records = stretch.records
-            rows = self._cut_rows(chunk, records) if chunk.is_cut else self._rows(chunk, records)
         except BrokenRecordError as error:
             yield from self._waiting_blocks()
             self._drop_chunk(chunk, str(error))
             return
-        if rows.groups and not rows.definitions and load is not None:
-            self._waiting.append((stretch, rows))
-            if load.is_last:
-                yield from self._waiting_blocks()
-            return
-        yield from self._waiting_blocks()
-        yield from self._builder.build(rows, self._checks, chunk.at)
+        self._waiting.append((chunk, stretch))
+        if load is None or load.is_last:
+            yield from self._waiting_blocks()
 
     def _stretch(self, chunk: UnreadChunk, load: Load | None) -> ChunkRecords:
         if load is not None:
@@ -278,13 +271,37 @@ class SegmentPass:
         return ChunkRecords(records, 0, len(records))
 
     def _waiting_blocks(self) -> Iterator[Block]:
-        """Yield the collected messages of the chunks of one group."""
-        if not self._waiting:
+        """Yield the messages of the loaded chunks of one group."""
+        waiting, self._waiting = self._waiting, []
+        rows = self._joined_rows(waiting)
+        if rows is not None:
+            yield from self._builder.build(rows, self._checks, 0)
             return
-        whole = self._waiting[0][0].whole
-        rows = join_chunks(whole, [(rows, stretch.begin) for stretch, rows in self._waiting])
-        self._waiting.clear()
-        yield from self._builder.build(rows, self._checks, 0)
+        for chunk, stretch in waiting:
+            read = self._cut_rows if chunk.is_cut else self._rows
+            try:
+                rows = read(chunk, stretch.records)
+            except BrokenRecordError as error:
+                self._drop_chunk(chunk, str(error))
+                continue
+            yield from self._builder.build(rows, self._checks, chunk.at)
+
+    def _joined_rows(self, waiting: Sequence[tuple[UnreadChunk, ChunkRecords]]) -> Rows | None:
+        """Parse the messages of several chunks at once; None if any of them needs its own care."""
+        entries = sum(len(index.entries) for chunk, _ in waiting for index in chunk.messages)
+        has_crc = all(chunk.head is not None and chunk.head.crc for chunk, _ in waiting)
+        if len(waiting) < 2 or not has_crc or entries > self._limits.records_per_chunk:
+            return None
+        first, last = waiting[0][1], waiting[-1][1]
+        rows = rows_by_index(
+            first.whole[first.begin : last.end],
+            [(at.begin - first.begin, at.end - first.begin, of.messages) for of, at in waiting],
+        )
+        if rows is None or rows.definitions:
+            return None
+        for (chunk, _), times in zip(waiting, rows.times, strict=True):
+            self._count_verification(chunk, rows, times)
+        return rows
 
     def _rows(self, chunk: UnreadChunk, buffer: Bytes) -> Rows:
         """Parse the messages of a chunk with all possible checks.
@@ -295,18 +312,20 @@ class SegmentPass:
         max_records = self._limits.records_per_chunk
         if sum(len(index.entries) for index in chunk.messages) > max_records:
             raise BrokenRecordError(f"its index names more than {max_records} messages")
-        rows = rows_by_index(buffer, chunk.messages) if chunk.messages else None
+        one = [(0, len(buffer), chunk.messages)]
+        rows = rows_by_index(buffer, one) if chunk.messages else None
         if rows is None:
             if chunk.messages or chunk.index_fault:
                 self._checks.bad_indexes.add(f"that of the chunk at byte {chunk.at}")
             rows = rows_by_scan(buffer, NEVER_IN_A_CHUNK, max_records)
             if rows.end != len(buffer):
                 raise BrokenRecordError(f"its records end at byte {rows.end} of {len(buffer)}")
-        self._count_verification(chunk, rows)
+        times = (np.minimum.reduce(rows.log), np.maximum.reduce(rows.log)) if len(rows) else (0, 0)
+        self._count_verification(chunk, rows, times)
         return rows
 
-    def _count_verification(self, chunk: UnreadChunk, rows: Rows) -> None:
-        """Count the kind of verification of a chunk's bytes.
+    def _count_verification(self, chunk: UnreadChunk, rows: Rows, times: tuple[int, int]) -> None:
+        """Count the kind of verification of a chunk's bytes, with its first and last log time.
 
         Raises:
             BrokenRecordError: The chunk has no verification, and is inconsistent.
@@ -317,7 +336,7 @@ class SegmentPass:
         if not doubt and (head.start or head.end):
             if not len(rows):
                 doubt = "it declares a time range but has no message"
-            elif np.minimum.reduce(rows.log) < head.start or np.maximum.reduce(rows.log) > head.end:
+            elif times[0] < head.start or times[1] > head.end:
                 doubt = "its messages are outside its declared time range"
         if head.crc or (self._segment.data_crc and self._section_is_right()):
             self._checks.chunks_right += 1

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.reader import McapLog
 from support.mcap_files import (
@@ -123,3 +124,39 @@ def test_chunk_without_checksum_among_others_is_reported(tmp_path: Path) -> None
 
     assert reading.count() == 2
     assert any("1 of 2 chunks have no checksum" in notice for notice in reading.ledger.notices)
+
+
+@pytest.mark.parametrize("last", [message(2, 3, b"end"), record(0x80, b"private")])
+def test_record_that_extends_into_the_next_chunk_drops_its_own_chunk_only(
+    tmp_path: Path, last: bytes
+) -> None:
+    # Chunks are parsed together; the next one begins with a record that no index names.
+    between = record(0x80, b"private of the next chunk")
+    longer = (int.from_bytes(last[1:9], "little") + len(between)).to_bytes(8, "little")
+    chunks = [
+        ChunkOf([message(1, 1, b"first")]),
+        ChunkOf([message(1, 2, b"second"), last[:1] + longer + last[9:]]),
+        ChunkOf([between, message(1, 4, b"fourth"), message(2, 5, b"fifth")]),
+    ]
+    reading = read_back(stored(tmp_path / "x.mcap", McapFile([*DEFINITIONS, *chunks])))
+
+    assert reading.messages == {
+        "/a": [message_read(1, b"first"), message_read(4, b"fourth")],
+        "/b": [message_read(5, b"fifth")],
+    }
+    assert not reading.ledger.is_whole
+    assert reading.ledger.topic("/a").dropped == {"damaged chunk": 1}
+
+
+def test_consecutive_chunks_are_parsed_together(tmp_path: Path) -> None:
+    chunks = [
+        ChunkOf([message(2, 10 * k, b"b%d" % k), message(1, 10 * k + 1, b"a%d" % k)])
+        for k in range(5)
+    ]
+    path = stored(tmp_path / "x.mcap", McapFile([*DEFINITIONS, *chunks]))
+
+    with McapLog(path, Limits()) as log:
+        blocks = list(log.read(Ledger(str(path))))
+
+    assert [(block.topic, len(block)) for block in blocks] == [("/b", 5), ("/a", 5)]
+    assert read_back(path).messages["/a"][3] == message_read(31, b"a3")

@@ -73,6 +73,7 @@ class Rows:
         end: End of the last complete record.
         groups: Channel numbers with the ranges of their messages, if the messages are sorted by
             channel and then in stored order. If empty, all messages are in stored order.
+        times: First and last log time of each chunk, if found by index.
     """
 
     buffer: NDArray[np.uint8]
@@ -86,6 +87,7 @@ class Rows:
     ignored: int
     end: int
     groups: tuple[tuple[int, slice], ...] = ()
+    times: tuple[tuple[int, int], ...] = ()
 
     def __len__(self) -> int:
         return len(self.offset)
@@ -120,20 +122,37 @@ NEVER_IN_A_CHUNK: Final = opcodes(
 )
 
 
-def rows_by_index(buffer: NDArray[np.uint8], indexes: Sequence[MessageIndex]) -> Rows | None:
-    """Find the messages of a chunk by its message indexes; None if these are incorrect."""
-    filled = [index for index in indexes if len(index.entries)]
-    if not filled:
+def rows_by_index(
+    buffer: NDArray[np.uint8], chunks: Sequence[tuple[int, int, Sequence[MessageIndex]]]
+) -> Rows | None:
+    """Find the messages of consecutive chunks by their indexes; None if one is incorrect.
+
+    Args:
+        buffer: Shape (B,): records of all chunks.
+        chunks: Start and end of each chunk's records in ``buffer``, and its indexes.
+    """
+    pieces: dict[int, list[tuple[int, MessageIndex]]] = {}
+    for number, (_, _, indexes) in enumerate(chunks):
+        for index in indexes:
+            if len(index.entries):
+                pieces.setdefault(index.channel_id, []).append((number, index))
+    every = [piece for of_channel in pieces.values() for piece in of_channel]
+    owners = [number for number, _ in every]
+    if len({*owners}) < len(chunks):
         return None
-    entries = np.concatenate([index.entries.view("<u8") for index in filled]).reshape(-1, 2)
+    counts = [len(index.entries) for _, index in every]
+    entries = np.concatenate([index.entries.view("<u8") for _, index in every]).reshape(-1, 2)
     log, offset = entries[:, 0].copy(), entries[:, 1].astype(np.int64)
-    if np.minimum.reduce(offset) < 0:
+    last = len(buffer) - MESSAGE_HEAD.itemsize
+    if np.minimum.reduce(offset) < 0 or np.maximum.reduce(offset) > last:
         return None
-    if np.maximum.reduce(offset) > len(buffer) - MESSAGE_HEAD.itemsize:
-        return None
+    bounds = np.array([chunk[:2] for chunk in chunks], np.int64)[owners]
+    if len(chunks) > 1:
+        offset += np.repeat(bounds[:, 0], counts)
+        if np.maximum.reduce(offset) > last:
+            return None
     head = heads_at(buffer, offset)
-    ids = np.array([index.channel_id for index in filled], dtype=np.uint32)
-    number = np.repeat(ids << 16, [len(index.entries) for index in filled])
+    number = np.repeat(np.array([i.channel_id for _, i in every], np.uint32) << 16, counts)
     stop = offset + head.size
     stop += PREFIX.size
     if (
@@ -143,9 +162,19 @@ def rows_by_index(buffer: NDArray[np.uint8], indexes: Sequence[MessageIndex]) ->
         or np.minimum.reduce(head.size) < MESSAGE_FIXED
     ):
         return None
-    others = _between_messages(buffer, offset, stop)
+    edges = [0, *accumulate(counts)]
+    if np.count_nonzero(np.maximum.reduceat(stop, edges[:-1]) > bounds[:, 1]):
+        return None
+    others = _between_messages(buffer, offset, stop, [chunk[0] for chunk in chunks[1:]])
     if others is None:
         return None
+    lengths = [sum(len(i.entries) for _, i in of_channel) for of_channel in pieces.values()]
+    inner = [0, *accumulate(lengths)]
+    groups = zip(pieces, (slice(*edge) for edge in pairwise(inner)), strict=True)
+    low, high = (of.reduceat(log, edges[:-1]).tolist() for of in (np.minimum, np.maximum))
+    times = [(1 << 64, 0)] * len(chunks)
+    for owner, begin, end in zip(owners, low, high, strict=True):
+        times[owner] = (min(times[owner][0], begin), max(times[owner][1], end))
     rows = Rows(
         buffer,
         offset,
@@ -156,38 +185,28 @@ def rows_by_index(buffer: NDArray[np.uint8], indexes: Sequence[MessageIndex]) ->
         head.publish.copy(),
         *others,
         len(buffer),
+        tuple(groups),
+        tuple(times),
     )
-    groups = _groups(offset, filled)
-    return replace(rows, groups=groups) if groups else rows.take(np.argsort(offset, kind="stable"))
-
-
-def _groups(
-    offset: NDArray[np.int64], filled: Sequence[MessageIndex]
-) -> tuple[tuple[int, slice], ...]:
-    """Return the range of each channel's messages; empty if a channel is not in stored order."""
-    edges = [0, *accumulate(len(index.entries) for index in filled)]
-    inner = edges[1:-1]
-    turns = sum(bool(offset[edge] < offset[edge - 1]) for edge in inner)
-    if np.count_nonzero(offset[1:] < offset[:-1]) != turns:
-        return ()
-    groups = {
-        index.channel_id: slice(begin, end)
-        for index, (begin, end) in zip(filled, pairwise(edges), strict=True)
-    }
-    return tuple(groups.items()) if len(groups) == len(filled) else ()
+    turns = sum(bool(offset[edge] < offset[edge - 1]) for edge in inner[1:-1])
+    is_stored_order = np.count_nonzero(offset[1:] < offset[:-1]) == turns
+    return rows if is_stored_order else rows.in_stored_order()
 
 
 def _between_messages(
-    buffer: NDArray[np.uint8], offset: NDArray[np.int64], stop: NDArray[np.int64]
+    buffer: NDArray[np.uint8],
+    offset: NDArray[np.int64],
+    stop: NDArray[np.int64],
+    borders: Sequence[int],
 ) -> tuple[list[Definition], int] | None:
     """Return the definitions and the number of other records, if no bytes are left over.
 
     Messages do not overlap if and only if the k-th end is at most the (k+1)-th start for all k.
-    Starts and ends can therefore be sorted separately.
+    Starts and ends can therefore be sorted separately. No record between messages extends past one
+    of the ``borders``, where the next chunk begins.
     """
-    begin, end = np.empty(len(offset) + 1, np.int64), np.empty(len(offset) + 1, np.int64)
-    begin[:-1], begin[-1] = offset, len(buffer)
-    end[1:], end[0] = stop, 0
+    begin = np.concatenate([offset, borders, [len(buffer)]]).astype(np.int64)
+    end = np.concatenate([[0], borders, stop]).astype(np.int64)
     begin.sort(kind="stable")
     end.sort(kind="stable")
     gaps = (end != begin).nonzero()[0]
@@ -204,41 +223,6 @@ def _between_messages(
         if len(definitions) + ignored > MAX_DEFINITIONS:
             return None
     return definitions, ignored
-
-
-def join_chunks(whole: NDArray[np.uint8], parts: Sequence[tuple[Rows, int]]) -> Rows:
-    """Join the messages of consecutive chunks.
-
-    Args:
-        whole: Shape (B,): buffer with the consecutive chunks.
-        parts: The messages of each chunk, in groups and without definitions, and the chunk's
-            offset in ``whole``.
-    """
-    if len(parts) == 1:
-        rows, begin = parts[0]
-        if not begin and len(rows.buffer) == len(whole):
-            return rows
-    pieces: dict[int, list[tuple[Rows, int, slice]]] = {}
-    for rows, begin in parts:
-        for channel_id, piece in rows.groups:
-            pieces.setdefault(channel_id, []).append((rows, begin, piece))
-    every = [piece for of_channel in pieces.values() for piece in of_channel]
-    edges = [0]
-    for of_channel in pieces.values():
-        edges.append(edges[-1] + sum(piece.stop - piece.start for _, _, piece in of_channel))
-    return Rows(
-        whole,
-        np.concatenate([rows.offset[piece] + begin for rows, begin, piece in every]),
-        np.concatenate([rows.stop[piece] + begin for rows, begin, piece in every]),
-        np.concatenate([rows.channel[piece] for rows, _, piece in every]),
-        np.concatenate([rows.sequence[piece] for rows, _, piece in every]),
-        np.concatenate([rows.log[piece] for rows, _, piece in every]),
-        np.concatenate([rows.publish[piece] for rows, _, piece in every]),
-        (),
-        sum(rows.ignored for rows, _ in parts),
-        parts[-1][1] + parts[-1][0].end,
-        tuple(zip(pieces, (slice(*edge) for edge in pairwise(edges)), strict=True)),
-    )
 
 
 def rows_by_scan(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], max_records: int) -> Rows:
