@@ -89,11 +89,11 @@ def load_network(
         )
     if backend is not None and backend not in able:
         raise VehicleError(f"{weights.name}: {backend} does not run it; one of: {', '.join(able)}")
-    name = backend or next((n for n in able if find_spec(_PACKAGE[n]) is not None), able[0])
-    if find_spec(_PACKAGE[name]) is None:
+    name = backend or next((n for n in able if not _missing(n, size_px)), able[0])
+    missing = _missing(name, size_px)
+    if missing:
         raise VehicleError(
-            f"{weights.name}: runs in {name}, which is not installed: "
-            f"pip install {_PROJECT.get(name, name)}"
+            f"{weights.name}: runs in {name}, but {missing} is not installed: pip install {missing}"
         )
     try:
         return _LOADERS[name](weights, threads, size_px)
@@ -103,6 +103,14 @@ def load_network(
         raise VehicleError(
             f"{weights.name}: {name} cannot read it: {one_line(error, 200)}; is it complete?"
         ) from None
+
+
+def _missing(name: str, size_px: Size | None) -> str:
+    """Return the project that a back end lacks; empty for none."""
+    needs = [_PACKAGE[name]]
+    if name == "onnxruntime" and size_px is not None:
+        needs.append(("onnx", "onnx"))
+    return next((project for module, project in needs if find_spec(module) is None), "")
 
 
 def _in_onnxruntime(weights: Weights, threads: int, size_px: Size | None) -> Network:
@@ -227,13 +235,13 @@ BACKENDS: Final[Mapping[str, tuple[str, ...]]] = {
     ".xml": ("openvino",),
     ".tflite": ("litert",),
 }
+# Module of each back end, and the project that installs it.
 _PACKAGE: Final = {
-    "onnxruntime": "onnxruntime",
-    "opencv": "cv2",
-    "openvino": "openvino",
-    "litert": "ai_edge_litert",
+    "onnxruntime": ("onnxruntime", "onnxruntime"),
+    "opencv": ("cv2", "opencv-python-headless"),
+    "openvino": ("openvino", "openvino"),
+    "litert": ("ai_edge_litert", "ai-edge-litert"),
 }
-_PROJECT: Final = {"opencv": "opencv-python-headless", "litert": "ai-edge-litert"}
 _LOADERS: Final[Mapping[str, Callable[[Weights, int, Size | None], Network]]] = {
     "onnxruntime": _in_onnxruntime,
     "opencv": _in_opencv,

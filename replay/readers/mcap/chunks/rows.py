@@ -132,12 +132,12 @@ def rows_by_index(
         chunks: Start and end of each chunk's records in ``buffer``, and its indexes.
     """
     pieces: dict[int, list[tuple[int, MessageIndex]]] = {}
-    for number, (_, _, indexes) in enumerate(chunks):
+    for owner, (_, _, indexes) in enumerate(chunks):
         for index in indexes:
             if len(index.entries):
-                pieces.setdefault(index.channel_id, []).append((number, index))
+                pieces.setdefault(index.channel_id, []).append((owner, index))
     every = [piece for of_channel in pieces.values() for piece in of_channel]
-    owners = [number for number, _ in every]
+    owners = [owner for owner, _ in every]
     if len({*owners}) < len(chunks):
         return None
     counts = [len(index.entries) for _, index in every]
