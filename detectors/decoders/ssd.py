@@ -21,8 +21,6 @@ from .base import (
 )
 
 _BOXES: Final = "detection_boxes"
-# Pixels from -1 to 1, of networks that do not scale bytes themselves.
-_AROUND_ZERO: Final = {"mean": (127.5,) * 3, "scale": (1 / 127.5,) * 3}
 _KEYS: Final = ("boxes", "labels", "scores")
 # Ends of the names of boxes, classes and scores in TFLite files, by their beginning.
 _TFLITE_NAMES: Final = {

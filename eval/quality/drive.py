@@ -20,7 +20,6 @@ from crosscue.replay.signals.kinds import Samples, Signal, SignalPlan
 from crosscue.replay.signals.plan import chosen_camera, plan
 from crosscue.replay.vehicle.drafting.camera import first_camera
 from crosscue.replay.vehicle.drafting.series import Series
-from crosscue.replay.vehicle.roles import Role
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 
 NOTHING: Final = SignalPlan((), {})
@@ -85,10 +84,6 @@ class QualityDrive:
         if not times:
             return 0, 0
         return min(int(t.min()) for t in times), max(int(t.max()) for t in times)
-
-    def has_role(self, role: Role) -> bool:
-        """Return whether a topic with rows has a role."""
-        return any(topic.used_as == role.value and topic.found for topic in self.topics)
 
     def series(self, signal: Signal) -> Series | None:
         """Return the readings of a signal of one column; of wheels, the mean speed of the rear."""

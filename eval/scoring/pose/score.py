@@ -47,8 +47,6 @@ from .truth_track import TruthTrack
 if TYPE_CHECKING:
     import pyarrow as pa
 
-# Max length of a gap in charts, as a fraction of the time without gaps.
-LONGEST_GAP_SHOWN: Final = 0.25
 MAX_DIFFERENCE_NS: Final = 100_000_000
 COVARIANCES: Final = ("xx_m2", "xy_m2", "xh_mrad", "yy_m2", "yh_mrad", "hh_rad2")
 PLANE: Final[tuple[Literal[2, 3], ...]] = (2, 3)
