@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -95,25 +95,31 @@ class TableFolder:
         except OSError as error:
             raise UnreadableRunError(f"{error.filename}: {error.strerror}") from None
 
-    def table(self, name: str, columns: list[str] | None = None) -> pa.Table:
-        """Read ``NAME.parquet`` and verify its page checksums.
-
-        Raises:
-            RunError: The file is missing or damaged.
-        """
+    @contextmanager
+    def _opened(self, name: str) -> Iterator[pa.NativeFile]:
         import pyarrow as pa
-        import pyarrow.parquet as pq
 
         path = self.file(f"{name}.parquet")
         try:
             with door.arrow_file(path) as file:
-                return pq.read_table(file, columns=columns, page_checksum_verification=True)
+                yield file
         except FileNotFoundError:
             raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
         except (OSError, pa.ArrowException) as error:
             raise UnreadableRunError(
                 f"{path}: damaged ({error}); run crosscue replay again"
             ) from None
+
+    def table(self, name: str, columns: list[str] | None = None) -> pa.Table:
+        """Read ``NAME.parquet`` and verify its page checksums.
+
+        Raises:
+            RunError: The file is missing or damaged.
+        """
+        import pyarrow.parquet as pq
+
+        with self._opened(name) as file:
+            return pq.read_table(file, columns=columns, page_checksum_verification=True)
 
     def schema(self, name: str) -> pa.Schema:
         """Read the schema of ``NAME.parquet``.
@@ -121,19 +127,10 @@ class TableFolder:
         Raises:
             RunError: The file is missing or damaged.
         """
-        import pyarrow as pa
         import pyarrow.parquet as pq
 
-        path = self.file(f"{name}.parquet")
-        try:
-            with door.arrow_file(path) as file:
-                return pq.read_schema(file).remove_metadata()
-        except FileNotFoundError:
-            raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
-        except (OSError, pa.ArrowException) as error:
-            raise UnreadableRunError(
-                f"{path}: damaged ({error}); run crosscue replay again"
-            ) from None
+        with self._opened(name) as file:
+            return pq.read_schema(file).remove_metadata()
 
     def batches(
         self, name: str, columns: list[str] | None = None, rows: int = 16_384
@@ -143,22 +140,13 @@ class TableFolder:
         Raises:
             RunError: The file is missing or damaged.
         """
-        import pyarrow as pa
         import pyarrow.parquet as pq
 
-        path = self.file(f"{name}.parquet")
-        try:
-            with (
-                door.arrow_file(path) as handle,
-                pq.ParquetFile(handle, page_checksum_verification=True) as file,
-            ):
-                yield from file.iter_batches(rows, columns=columns, use_threads=False)
-        except FileNotFoundError:
-            raise UnreadableRunError(f"{path}: not there; run crosscue replay again") from None
-        except (OSError, pa.ArrowException) as error:
-            raise UnreadableRunError(
-                f"{path}: damaged ({error}); run crosscue replay again"
-            ) from None
+        with (
+            self._opened(name) as handle,
+            pq.ParquetFile(handle, page_checksum_verification=True) as file,
+        ):
+            yield from file.iter_batches(rows, columns=columns, use_threads=False)
 
 
 class TableSink:
