@@ -136,11 +136,8 @@ def decode_mask(text: bytes, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     """
     width, height = size_px
     lengths = _checked(text, size_px)
-    flat = np.zeros(width * height, np.bool_)
-    edges = np.cumsum(lengths)
-    for start, stop in zip(edges[0::2], edges[1::2], strict=False):
-        flat[start:stop] = True
-    return flat.reshape(width, height).T
+    is_object = np.arange(len(lengths)) % 2 == 1
+    return np.repeat(is_object, lengths).reshape(width, height).T
 
 
 def _checked(text: bytes, size_px: tuple[int, int]) -> NDArray[np.int64]:

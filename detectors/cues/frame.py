@@ -10,7 +10,12 @@ from typing import Final
 import numpy as np
 
 from crosscue.detectors.base import Detections, RoadMask
-from crosscue.detectors.cues.tracked.judge import cars_past, count_cars
+from crosscue.detectors.cues.tracked.judge import (
+    cars_past,
+    count_cars,
+    is_past,
+    may_be_parked,
+)
 from crosscue.detectors.cues.tracked.motion import CarMotion
 from crosscue.detectors.cues.tracked.tracks import CarTracks
 from crosscue.detectors.ranging.control_tracks import ControlTracks
@@ -158,9 +163,12 @@ class CuePass:
             return None
         self._tracks = self._tracks or CarTracks(camera, cars)
         found = self._tracks(boxes, ego)
-        standing = self._tracks.standing()
+        standing = self._tracks.standing(lambda seen: may_be_parked(seen, cars))
         judged = count_cars(found, standing, self._tracks.seen, camera, cars, place)
-        judged = judged._replace(past=cars_past(self._tracks.longer(), camera, cars, place))
+        longer = self._tracks.longer(
+            lambda seen: place is not None and is_past(seen[-1], camera, place)
+        )
+        judged = judged._replace(past=cars_past(longer, camera, cars, place))
         return Pairs(
             np.array([car.step_px for car in found]).reshape(-1, 2),
             np.array([car.center_px for car in found]).reshape(-1, 2),

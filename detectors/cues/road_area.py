@@ -35,6 +35,8 @@ REACH_M: Final = 50.0
 SHARP_M: Final = 10.0
 # Margin around vehicles, as a fraction of the box, behind which the ground counts as hidden.
 MARGIN: Final = 0.05
+# What a pixel of a mask shows.
+HIDDEN, SHOWS_GROUND, SHOWS_ROAD = 0, 1, 2
 
 
 def reach_of(camera: Mounted, road: RoadMask) -> float:
@@ -105,26 +107,34 @@ class RoadArea:
         Raises:
             ValueError: The mask is damaged.
         """
-        is_road = road.pixels()
-        rows, columns, ground_m = self._ahead()
-        plane = GroundPlane.of(self.camera, road.size_px)
-        to_car = turned(self.camera.yaw_rad, pitch_rad, self.camera.roll_rad)
-        plane = GroundPlane(plane.focal_px, plane.center_px, plane.position_m, to_car)
-        with np.errstate(invalid="ignore"):
-            x, y = np.nan_to_num(plane.project(ground_m), nan=-1.0).T
-        width, height = road.size_px
-        in_view = (x >= 0.0) & (x < width) & (y >= 0.0) & (y < height)
-        for x0, y0, x1, y1 in boxes_px.tolist():
-            aside, above = MARGIN * (x1 - x0), MARGIN * (y1 - y0)
-            in_view &= ~((x > x0 - aside) & (x < x1 + aside) & (y > y0) & (y < y1 + above))
-        rows, columns, x, y, ground_m = (one[in_view] for one in (rows, columns, x, y, ground_m))
+        rows, columns, dx_m, dy_m = self._ahead()
+        cos, sin = math.cos(self._heading), math.sin(self._heading)
+        camera, (width, height) = self.camera, road.size_px
+
+        def sums(ahead: float, left: float, up: float) -> NDArray[np.float32]:
+            """Weighted sum of each cell's place from the camera."""
+            along = (ahead * cos - left * sin) * dx_m - ahead * camera.x_m - left * camera.y_m
+            across = (ahead * sin + left * cos) * dy_m - up * camera.z_m
+            return along.astype(np.float32)[:, None] + across.astype(np.float32)
+
+        ahead_m, left_m = sums(1.0, 0.0, 0.0), sums(0.0, 1.0, 0.0)
+        in_reach = (ahead_m > NEAREST_M) & (ahead_m < self._far_m - camera.x_m)
+        in_reach &= np.abs(left_m + camera.y_m) < ASIDE_M
+        # Ground in the camera's axes, forward, left and up, and in pixels of the mask.
+        forward, left, up = turned(camera.yaw_rad, pitch_rad, camera.roll_rad).T.tolist()
+        plane = GroundPlane.of(camera, road.size_px)
         mask_width, mask_height = road.mask_size_px
-        found = is_road[
-            (y * mask_height / height).astype(int), (x * mask_width / width).astype(int)
-        ]
-        away_m = np.hypot(ground_m[:, 0] - self.camera.x_m, ground_m[:, 1] - self.camera.y_m)
-        weight = np.minimum(1.0, (SHARP_M / np.maximum(away_m, 1.0)) ** 2).astype(np.float32)
-        self._road[rows, columns] += weight * found
+        across, down = mask_width / width, mask_height / height
+        scale = -plane.focal_px / np.maximum(sums(*forward), 1e-3)
+        # A border stands for everything out of the picture.
+        x = sums(*left) * (across * scale) + (plane.center_px[0] * across + 1.0)
+        y = sums(*up) * (down * scale) + (plane.center_px[1] * down + 1.0)
+        x, y = np.clip(x, 0.0, mask_width + 1.0), np.clip(y, 0.0, mask_height + 1.0)
+        shown = _shown(road.pixels(), boxes_px * [across, down, across, down])
+        found = shown.take(x.astype(np.int32) * (mask_height + 2) + y.astype(np.int32))
+        weight = SHARP_M**2 / np.maximum(ahead_m**2 + left_m**2, SHARP_M**2)
+        weight *= in_reach & (found > HIDDEN)
+        self._road[rows, columns] += weight * (found == SHOWS_ROAD)
         self._seen[rows, columns] += weight
 
     def plan(self, behind_m: float = 10.0, min_weight: float = 0.05) -> RoadPlan:
@@ -136,34 +146,46 @@ class RoadArea:
         """
         ahead_m = np.arange(-behind_m, self.reach_m + self.camera.x_m, CELL_M) + 0.5 * CELL_M
         left_m = np.arange(ASIDE_M, -ASIDE_M, -CELL_M) - 0.5 * CELL_M
-        x, y = np.meshgrid(ahead_m, left_m, indexing="ij")
         cos, sin = math.cos(self._heading), math.sin(self._heading)
-        i = self._index(self._xy_m[0] + x * cos - y * sin)
-        j = self._index(self._xy_m[1] + x * sin + y * cos)
-        seen = self._seen[i, j]
-        share = self._road[i, j] / np.maximum(seen, 1e-9)
+        rows = _index((self._xy_m[0] + ahead_m * cos)[:, None] - left_m * sin)
+        columns = _index((self._xy_m[1] + ahead_m * sin)[:, None] + left_m * cos)
+        cells = rows * CELLS + columns
+        seen = self._seen.take(cells)
+        share = self._road.take(cells) / np.maximum(seen, 1e-9)
         return RoadPlan(ahead_m, left_m, np.where(seen >= min_weight, share, np.nan))
 
-    def _ahead(self) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
-        """Cells in reach: their rows and columns, and their middles in the car's axes."""
-        reach_m = self.reach_m + abs(self.camera.x_m)
-        cos, sin = math.cos(self._heading), math.sin(self._heading)
-        middle = (
-            self._index(self._xy_m[0] + 0.5 * reach_m * cos),
-            self._index(self._xy_m[1] + 0.5 * reach_m * sin),
-        )
-        around = math.ceil(math.hypot(0.5 * reach_m, ASIDE_M) / CELL_M)
-        i, j = (np.arange(max(int(at) - around, 0), min(int(at) + around, CELLS)) for at in middle)
-        rows, columns = (one.ravel() for one in np.meshgrid(i, j, indexing="ij"))
-        dx = (rows + 0.5) * CELL_M - HALF_M - self._xy_m[0]
-        dy = (columns + 0.5) * CELL_M - HALF_M - self._xy_m[1]
-        x, y = dx * cos + dy * sin, dy * cos - dx * sin
-        in_reach = (x > NEAREST_M + self.camera.x_m) & (x < reach_m) & (np.abs(y) < ASIDE_M)
-        return rows[in_reach], columns[in_reach], np.column_stack([x, y])[in_reach]
+    @property
+    def _far_m(self) -> float:
+        return self.reach_m + abs(self.camera.x_m)
 
-    def _index(self, at_m: Floats | float) -> NDArray[np.int64]:
-        index = np.floor((np.asarray(at_m) + HALF_M) / CELL_M).astype(np.int64)
-        return np.clip(index, 0, CELLS - 1)
+    def _ahead(self) -> tuple[slice, slice, Floats, Floats]:
+        """Part of the grid around the ground in reach, and its cells' middles from the car."""
+        x, y = np.array([[0.0, self._far_m], [-ASIDE_M, ASIDE_M]])
+        cos, sin = math.cos(self._heading), math.sin(self._heading)
+        away_m = (x * cos - (y * sin)[:, None], x * sin + (y * cos)[:, None])
+        parts, middles_m = [], []
+        for at_m, corners_m in zip(self._xy_m, away_m, strict=True):
+            first, last = _index(at_m + np.array([corners_m.min(), corners_m.max()])).tolist()
+            parts.append(slice(first, last + 1))
+            middles_m.append((np.arange(first, last + 1) + 0.5) * CELL_M - HALF_M - at_m)
+        return parts[0], parts[1], middles_m[0], middles_m[1]
+
+
+def _index(at_m: Floats) -> NDArray[np.int32]:
+    return np.clip((at_m + HALF_M) / CELL_M, 0, CELLS - 1).astype(np.int32)
+
+
+def _shown(is_road: NDArray[np.bool_], boxes_px: Floats) -> NDArray[np.uint8]:
+    """Ground, road and what vehicles hide: columns of the mask, with a border of one pixel."""
+    height, width = is_road.shape
+    framed = np.zeros((width + 2, height + 2), np.uint8)
+    shown = framed[1:-1, 1:-1].T
+    np.add(is_road, np.uint8(SHOWS_GROUND), out=shown)
+    margin = MARGIN * (boxes_px[:, 2:] - boxes_px[:, :2])
+    edges = boxes_px + np.column_stack([-margin[:, 0], 0.0 * margin[:, 0], margin])
+    for x0, y0, x1, y1 in np.maximum(np.rint(edges), 0).astype(int).tolist():
+        shown[y0:y1, x0:x1] = HIDDEN
+    return framed
 
 
 def _shifted(grid: NDArray[np.float32], cells: NDArray[np.int64]) -> NDArray[np.float32]:

@@ -220,30 +220,22 @@ def _edge(plan: RoadPlan, side: int) -> _Edge:
     """Follow the road outwards from the car's axis in each row."""
     road = plan.road if side == 1 else plan.road[:, ::-1]
     left_m = plan.left_m if side == 1 else -plan.left_m[::-1]
-    rows = len(road)
-    out_m = np.full(rows, np.nan)
-    is_kerb, is_closed = np.zeros(rows, np.bool_), np.zeros(rows, np.bool_)
     is_road, is_seen = road > ROAD, np.isfinite(road)
-    middle = int(np.argmin(np.abs(left_m)))
-    around = round(STARTS_M / CELL_M)
-    for row in range(rows):
-        at = middle
-        if not is_road[row, at]:
-            near = np.flatnonzero(is_road[row, middle - around : middle + around + 1])
-            if not len(near):
-                span = is_seen[row, middle - around // 2 : middle + around // 2 + 1]
-                is_closed[row] = span.mean() > 0.8
-                continue
-            at = middle - around + int(near[np.argmin(np.abs(near - around))])
-        while at > 0 and is_road[row, at - 1]:
-            at -= 1
-        # A gap of one cell is noise.
-        while at > 2 and not is_road[row, at - 1] and is_road[row, at - 2]:
-            at -= 2
-            while at > 0 and is_road[row, at - 1]:
-                at -= 1
-        out_m[row] = left_m[at] + 0.5 * CELL_M
-        is_kerb[row] = at > 0 and bool(is_seen[row, at - 1])
+    middle, around = int(np.argmin(np.abs(left_m))), round(STARTS_M / CELL_M)
+    # The nearest road to the car's axis, of two the outer one.
+    aside = np.array(sorted(range(-around, around + 1), key=abs))
+    near = is_road[:, middle + aside]
+    starts = middle + aside[near.argmax(axis=1)]
+    # The edge is the last cell before the next one that ends the road. A gap of one cell is noise.
+    ends = ~is_road
+    ends[:, 2:] &= ~is_road[:, 1:-1]
+    cells, rows = np.arange(road.shape[1]), np.arange(len(road))
+    last = np.maximum.accumulate(np.where(ends, cells, -1), axis=1)[rows, starts - 1]
+    has_road = near.any(axis=1)
+    out_m = np.where(has_road, left_m[last + 1] + 0.5 * CELL_M, np.nan)
+    is_kerb = has_road & (last >= 0) & is_seen[rows, last]
+    span = is_seen[:, middle - around // 2 : middle + around // 2 + 1]
+    is_closed = ~has_road & (span.mean(axis=1) > 0.8)
     return _Edge(out_m, is_kerb, is_closed)
 
 
@@ -259,16 +251,14 @@ def _own_edge(plan: RoadPlan, edge: _Edge) -> tuple[float, float] | None:
     if near.sum() * CELL_M < KNOWN_M:
         return None
     x, y = plan.ahead_m[near], edge.out_m[near]
-    best, offset, slope = -1.0, 0.0, 0.0
-    for tried in np.linspace(-0.2, 0.2, 17):
-        away = y - tried * x
-        # The offset that most rows share.
-        counts = np.array([(np.abs(away - one) < 0.5).sum() for one in away])
-        score = counts.max() - 20.0 * abs(tried)
-        if score > best:
-            best, slope = score, float(tried)
-            offset = float(np.median(away[np.abs(away - away[counts.argmax()]) < 0.5]))
-    return offset, slope
+    slopes = np.linspace(-0.2, 0.2, 17)
+    away = y - slopes[:, None] * x
+    # The offset that most rows share.
+    is_same = np.abs(away[:, :, None] - away[:, None, :]) < 0.5
+    counts = is_same.sum(axis=1)
+    best = int(np.argmax(counts.max(axis=1) - 20.0 * np.abs(slopes)))
+    offset = np.median(away[best][is_same[best][:, counts[best].argmax()]])
+    return float(offset), float(slopes[best])
 
 
 def _at(line: tuple[float, float], ahead_m: Floats) -> Floats:

@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from statistics import median
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -141,6 +142,7 @@ class ObjectTrack:
         is_accepted: True once the evidence was sufficient, until it is against an object.
         is_way_unknown: True if the distance travelled to the newest frame is unknown.
         looks: Number of boxes by the result of the second look at them.
+        aspect: Height over width, as the median of its newest boxes.
     """
 
     number: int
@@ -162,6 +164,7 @@ class ObjectTrack:
     is_accepted: bool = False
     is_way_unknown: bool = False
     looks: Counter[str] = field(default_factory=Counter)
+    aspect: float = math.nan
     _way_m: list[float] = field(default_factory=list)
     _height_px: list[float] = field(default_factory=list)
     _aspect: list[float] = field(default_factory=list)
@@ -213,11 +216,6 @@ class ObjectTrack:
         """Variance of the range, including the odometer's error, which scales the range."""
         stretch = self.estimate.by_motion * self._stretch()
         return self.estimate.var_m2 + (stretch * self.estimate.mean_m) ** 2
-
-    @property
-    def aspect(self) -> float:
-        """Height over width, as the median of its newest boxes."""
-        return float(np.median(self._aspect))
 
     def _stretch(self) -> float:
         """Relative standard deviation of the distance travelled."""
@@ -291,6 +289,7 @@ class ObjectTrack:
         if width_px > 0.0:
             self._aspect.append(height_px / width_px)
             del self._aspect[:-MAX_OBSERVATIONS]
+            self.aspect = median(self._aspect)
         if self._way_m and abs(self._at_m - self._way_m[-1]) < MERGE_M and self._merged:
             self._merged += 1
             self._height_px[-1] += (height_px - self._height_px[-1]) / self._merged
@@ -410,9 +409,10 @@ class ObjectTracks:
         pairs = [
             (away, i, j)
             for j, track in enumerate(self.tracks)
-            for i in range(len(boxes_px))
-            if (away := _cost_of(track, boxes_px[i], float(spans_px[i]), slack))
-            < NEAR_HEIGHTS * slack
+            for i, (box_px, span_px) in enumerate(
+                zip(boxes_px.tolist(), spans_px.tolist(), strict=True)
+            )
+            if (away := _cost_of(track, box_px, span_px, slack)) < NEAR_HEIGHTS * slack
         ]
         found: list[ObjectTrack | None] = [None] * len(boxes_px)
         for _, i, j in sorted(pairs):
@@ -514,14 +514,13 @@ def iou(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return float(inside / (both - inside)) if both > inside else 0.0
 
 
-def _cost_of(
-    track: ObjectTrack, box_px: NDArray[np.float64], height_px: float, slack: float
-) -> float:
+def _cost_of(track: ObjectTrack, box_px: Sequence[float], height_px: float, slack: float) -> float:
     """Distance of a box from the predicted box, in heights; infinite if the heights differ."""
     if abs(math.log(height_px / track.height_px)) > slack * math.log(GROWTH):
         return math.inf
-    apart = 0.5 * (box_px[:2] + box_px[2:] - track.box_px[:2] - track.box_px[2:])
-    return float(np.hypot(*apart)) / max(height_px, track.height_px)
+    (x0, y0, x1, y1), (left, top, right, bottom) = box_px, track.box_px.tolist()
+    apart_px = math.hypot(0.5 * (x0 + x1 - left - right), 0.5 * (y0 + y1 - top - bottom))
+    return apart_px / max(height_px, track.height_px)
 
 
 def _is_over(track: ObjectTrack) -> bool:

@@ -25,7 +25,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from crosscue.detectors.cues.observed import CarCounts, Place, Sides, Ways
-from crosscue.detectors.cues.tracked.motion import HEIGHT_FRACTION, CarMotion
+from crosscue.detectors.cues.tracked.motion import HEIGHT_FRACTION, CarMotion, Observation
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
 # Bearing beyond which a car along the street looks as long as one across it.
@@ -80,6 +80,17 @@ def parked(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
         and abs(car.ahead_mps) <= settings.crossing_mps + 2.0 * car.ahead_sd_mps
         and abs(car.nose) >= MIN_NOSE
     ]
+
+
+def may_be_parked(seen: Sequence[Observation], settings: Cars) -> bool:
+    """Whether ``parked`` can select a car with these observations, however it moves."""
+    newest = seen[-1]
+    bearing = 0.5 * sum(map(math.tan, newest.edges_rad))
+    return (
+        newest.distance_m <= settings.within_m
+        and abs(bearing) <= MAX_BEARING
+        and any(one.nose for one in seen[-settings.parked_frames :])
+    )
 
 
 def count_cars(
@@ -152,7 +163,7 @@ def along(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
     ]
 
 
-def is_past(car: CarMotion, camera: Camera, place: Place) -> bool:
+def is_past(car: CarMotion | Observation, camera: Camera, place: Place) -> bool:
     """Whether a car is past the end of the intersection, with a probability of 86 %."""
     sd_m = math.hypot(HEIGHT_FRACTION * car.distance_m, place.sd_m)
     return car.distance_m + camera.x_m > place.end_m + LIKELY * sd_m

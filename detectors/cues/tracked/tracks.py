@@ -9,7 +9,7 @@ it would be if it stood.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -57,6 +57,13 @@ GROWTH: Final = 1.4
 BORDER_PX: Final = 2.0
 # Fraction of a box's lower end behind another car above which its height is not the car's.
 MAX_COVERED: Final = 0.3
+
+
+Wanted = Callable[[Sequence[Observation]], bool]
+
+
+def _any(seen: Sequence[Observation]) -> bool:
+    return True
 
 
 @dataclass(slots=True)
@@ -128,23 +135,40 @@ class CarTracks:
         self._again = [track for track in again if track.seen[-1].is_sure]
         return _motions(self._again, [self._settings.max_frames] * len(self._again))
 
-    def longer(self) -> list[CarMotion]:
+    def longer(self, wanted: Wanted = _any) -> list[CarMotion]:
         """Fit the same cars to their newest ``past_frames``, because distant cars grow slowly.
 
         The cars are assumed to be on the ego vehicle's road (``ALONG_ASIDE_MPS``). If no constant
         velocity fits all frames, fewer are used, but at least ``max_frames``: the car has started
         to move, or two cars were confused.
-        """
-        settings = self._settings
-        return _steady_motions(self._again, settings.past_frames, settings, ALONG_ASIDE_MPS)
 
-    def standing(self) -> list[CarMotion]:
+        Args:
+            wanted: Selects cars by their observations, oldest first.
+        """
+        return self._steady(self._settings.past_frames, wanted, ALONG_ASIDE_MPS)
+
+    def standing(self, wanted: Wanted = _any) -> list[CarMotion]:
         """Fit the same cars to their newest ``parked_frames``, because standing shows late.
 
         If no constant velocity fits all frames, fewer are used, as in ``longer``.
+
+        Args:
+            wanted: Selects cars by their observations, oldest first.
         """
-        settings = self._settings
-        return _steady_motions(self._again, settings.parked_frames, settings)
+        return self._steady(self._settings.parked_frames, wanted, USUAL_MPS)
+
+    def _steady(self, frames: int, wanted: Wanted, aside_mps: float) -> list[CarMotion]:
+        shortest = self._settings.max_frames
+        tracks = [one for one in self._again if wanted(one.seen)]
+        found = _motions(tracks, [frames] * len(tracks), aside_mps)
+        while again := [
+            i for i, one in enumerate(found) if not one.is_steady and one.frames > shortest
+        ]:
+            fewer = [max(found[i].frames // 2, shortest) for i in again]
+            refitted = _motions([tracks[i] for i in again], fewer, aside_mps)
+            for i, one in zip(again, refitted, strict=True):
+                found[i] = one
+        return found
 
     def _observed(
         self, found: Sequence[Detections]
@@ -157,40 +181,39 @@ class CarTracks:
         ]
         boxes_px = np.array([found.boxes_px[i] for found, i, _ in rows]).reshape(-1, 4)
         are_sure = np.array([is_sure for *_, is_sure in rows], np.bool_)
+        if not rows:
+            return []
+        size_px, focal_px = found[0].size_px, self._camera.focal_px or 0.0
+        x0, y0, x1, y1 = boxes_px.T
+        middle = 0.5 * (y0 + y1)
+        ends_px = np.column_stack([x0, middle, x1, middle]).reshape(-1, 2)
+        rays = GroundPlane.of(self._camera, size_px).rays(ends_px).reshape(-1, 2, 3)
+        high = y1 - y0
+        is_cut = (np.minimum(x0, y0) < BORDER_PX) | (x1 > size_px[0] - BORDER_PX)
+        is_cut |= (y1 > size_px[1] - BORDER_PX) | (high <= 0.0) | (x1 <= x0)
+        are_whole = ~is_cut & (rays[:, :, 0].min(axis=1) > 0.0) & (focal_px > 0.0)
+        with np.errstate(divide="ignore"):
+            away_m = focal_px * CAR_HEIGHT_M / high * rays[:, :, 0].mean(axis=1)
+        edges_rad = np.arctan2(-rays[:, :, 1], rays[:, :, 0])
+        are_hid = are_hidden(boxes_px, are_sure)
         cars = []
-        for (detections, i, is_sure), hidden in zip(
-            rows, are_hidden(boxes_px, are_sure), strict=True
-        ):
-            one = self._observation(detections, i, is_hidden=hidden, is_sure=is_sure)
-            if one is not None:
-                cars.append((detections.boxes_px[i], one))
+        for n in np.flatnonzero(are_whole & (away_m <= self._farthest_m)).tolist():
+            detections, i, is_sure = rows[n]
+            high_px, fraction = float(high[n]), HIDDEN_FRACTION if are_hid[n] else BOX_FRACTION
+            heights_px = detections.column_heights_px(i)
+            one = Observation(
+                self._t_s,
+                self._pose,
+                (float(edges_rad[n, 0]), float(edges_rad[n, 1])),
+                float(away_m[n]),
+                math.hypot(BOX_PX / high_px, fraction),
+                float(x1[n] - x0[n]) / high_px,
+                0 if heights_px is None else nose_of(heights_px),
+                are_hid[n],
+                is_sure,
+            )
+            cars.append((detections.boxes_px[i], one))
         return cars
-
-    def _observation(
-        self, found: Detections, i: int, *, is_hidden: bool, is_sure: bool
-    ) -> Observation | None:
-        width, height = found.size_px
-        x0, y0, x1, y1 = found.boxes_px[i].tolist()
-        is_cut = min(x0, y0) < BORDER_PX or x1 > width - BORDER_PX or y1 > height - BORDER_PX
-        focal_px = self._camera.focal_px or 0.0
-        if is_cut or y1 <= y0 or x1 <= x0 or focal_px <= 0.0:
-            return None
-        ends = np.array([[x0, 0.5 * (y0 + y1)], [x1, 0.5 * (y0 + y1)]])
-        rays = GroundPlane.of(self._camera, found.size_px).rays(ends)
-        if rays[:, 0].min() <= 0.0:
-            return None
-        depth_m = focal_px * CAR_HEIGHT_M / (y1 - y0)
-        distance_m = depth_m * float(rays[:, 0].mean())
-        if distance_m > self._farthest_m:
-            return None
-        left, right = np.arctan2(-rays[:, 1], rays[:, 0]).tolist()
-        error = math.hypot(BOX_PX / (y1 - y0), HIDDEN_FRACTION if is_hidden else BOX_FRACTION)
-        heights_px = found.column_heights_px(i)
-        nose = 0 if heights_px is None else nose_of(heights_px)
-        long = (x1 - x0) / (y1 - y0)
-        return Observation(
-            self._t_s, self._pose, (left, right), distance_m, error, long, nose, is_hidden, is_sure
-        )
 
     def _assign(self, cars: Sequence[tuple[NDArray[np.float64], Observation]]) -> list[_Track]:
         """Assign boxes to tracks; the remaining boxes start new tracks.
@@ -266,20 +289,6 @@ def _moved(axle: tuple[float, float, float], motion: CarStep) -> tuple[float, fl
         y + way_m * math.sin(middle),
         heading + motion.turned_rad,
     )
-
-
-def _steady_motions(
-    tracks: Sequence[_Track], frames: int, settings: Cars, aside_mps: float = USUAL_MPS
-) -> list[CarMotion]:
-    found = _motions(tracks, [frames] * len(tracks), aside_mps)
-    while again := [
-        i for i, one in enumerate(found) if not one.is_steady and one.frames > settings.max_frames
-    ]:
-        fewer = [max(found[i].frames // 2, settings.max_frames) for i in again]
-        refitted = _motions([tracks[i] for i in again], fewer, aside_mps)
-        for i, one in zip(again, refitted, strict=True):
-            found[i] = one
-    return found
 
 
 def _cost_moving(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float:
