@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 from crosscue.datasets.scenes.drive import SceneFiles, jpeg, refuse_other_drive, write_scene
-from crosscue.datasets.scenes.layout import SCORED
+from crosscue.datasets.scenes.layout import SCORED, Side
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.whole_file import write_bytes
@@ -37,6 +37,7 @@ class Approaches:
         seed: Random seed.
         rate_hz: Camera images per second: 10, 20, 25 or 50.
         width_px: Image width in pixels; height is 9/16.
+        traffic: Side of the road on which traffic drives.
     """
 
     layouts: Annotated[Sequence[str], Option(metavar="LAYOUT", is_positional=True)] = ()
@@ -46,6 +47,7 @@ class Approaches:
     seed: int = 0
     rate_hz: Annotated[int, Option("--fps")] = 10
     width_px: Annotated[int, Option("--width")] = 1280
+    traffic: Side = "right"
 
     def scenes(self) -> list[SceneSettings]:
         """Return the settings of every run of every layout.
@@ -65,7 +67,12 @@ class Approaches:
         try:
             return [
                 SceneSettings(
-                    layout=layout, run=run, seed=self.seed, rate_hz=self.rate_hz, camera=camera
+                    layout=layout,
+                    run=run,
+                    seed=self.seed,
+                    rate_hz=self.rate_hz,
+                    camera=camera,
+                    traffic=self.traffic,
                 )
                 for layout in layouts
                 for run in ([self.run] if self.run is not None else range(1, last + 1))

@@ -209,7 +209,11 @@ def write_scene(
 
 
 def _settings_of(settings: SceneSettings, imager: Imager) -> dict[str, Any]:
-    return asdict(settings) | ({"imager": imager.name} if imager.name else {})
+    made = asdict(settings) | ({"imager": imager.name} if imager.name else {})
+    if settings.traffic == "right":
+        # Files of drives on the right stay as they were.
+        del made["traffic"]
+    return made
 
 
 def refuse_other_drive(folder: Path, settings: SceneSettings, imager: Imager = PHOTOGRAPHS) -> None:
@@ -303,6 +307,7 @@ class _Record:
         """Return the text of the vehicle file."""
         text = scene_vehicle_text(
             self.settings.camera,
+            traffic=self.settings.traffic,
             mounting_yaw_rad=self._car.mounting_yaw_rad,
             declination_rad=self._car.declination_rad,
             heading_rad=self._heading_rad,

@@ -52,6 +52,7 @@ class Layout:
         is_town: True for shops, False for houses.
         has_lot: True if there is a parking lot next to the approach road.
         curve_per_m: Curvature of a gentle curve of the approach road, positive to the left.
+        traffic: Side of the road on which traffic drives.
     """
 
     name: str
@@ -72,6 +73,12 @@ class Layout:
     is_town: bool = False
     has_lot: bool = True
     curve_per_m: float = 0.0
+    traffic: Side = "right"
+
+    @property
+    def own(self) -> float:
+        """Sign of y on the ego vehicle's half of the road."""
+        return 1.0 if self.traffic == "left" else -1.0
 
     def aside_m(self, x_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the lateral position of the road's centre line, to the left of the x axis.

@@ -150,8 +150,8 @@ class Device:
     ) -> Block:
         layout, rng = self._world.layout, self._rng
         lines = lane_lines_m(layout)
-        # Without a parking lane there is no painted line on the right, only the kerb.
-        right_type = SOLID if layout.has_parking_lane else ROAD_EDGE
+        # Without a parking lane there is no painted line at the side, only the kerb.
+        outer_type = SOLID if layout.has_parking_lane else ROAD_EDGE
         rows: dict[str, list[float]] = {name: [] for name in _LANE_COLUMNS}
         for picture in pictures:
             x, y, heading = picture.view.rear_axle
@@ -160,7 +160,9 @@ class Device:
             for side, line_y in zip((1, -1), lines, strict=True):
                 lost = is_turning or rng.random() < 0.03
                 rows["side"].append(side)
-                rows["lane_type"].append(2 if lost else DOUBLE if side > 0 else right_type)
+                rows["lane_type"].append(
+                    2 if lost else outer_type if side == layout.own else DOUBLE
+                )
                 rows["quality"].append(0 if lost else quality)
                 rows["model_degree"].append(2)
                 rows["c0_m"].append(np.nan if lost else line_y - y + rng.normal(0, 0.03))
@@ -190,7 +192,8 @@ class Device:
 
 def lane_lines_m(layout: Layout) -> tuple[float, float]:
     """Return the lateral positions of the painted lines left and right of the ego lane."""
-    return 0.17, 2 * lane_y_m(layout)
+    inner_m, outer_m = -0.17 * layout.own, 2 * lane_y_m(layout)
+    return (outer_m, inner_m) if layout.traffic == "left" else (inner_m, outer_m)
 
 
 _COLUMNS: Final = {

@@ -116,9 +116,9 @@ class ApproachMotion:
 
 
 def lane_y_m(layout: Layout) -> float:
-    """Return the lateral position of the ego lane's centre, right of the road's centre line."""
+    """Return the lateral position of the ego lane's centre, from the road's centre line."""
     parking = PARKING_LANE_M if layout.has_parking_lane else 0.0
-    return -(layout.half_width_m - parking) / 2
+    return layout.own * (layout.half_width_m - parking) / 2
 
 
 def approach(layout: Layout, conditions: Conditions, rng: Generator) -> ApproachMotion:
@@ -160,11 +160,12 @@ def _curvature(layout: Layout, turn: Turn, start_x: float) -> Floats:
     straight_on = layout.end_m + 16.0
     if turn == "ahead":
         return _along_road(layout, start_x, straight_on, step)
-    lane = 0.27 if turn == "right" else 0.73
+    is_near = turn == layout.traffic
+    lane = 0.27 if is_near else 0.73
     if layout.one_way:
         lane = 0.5
     target_x = NEAR_KERB_M + lane * layout.cross_width_m
-    radius = 6.5 if turn == "right" else 9.0
+    radius = 6.5 if is_near else 9.0
     before = round((target_x - radius - start_x) / step)
     sign = 1.0 if turn == "left" else -1.0
     bend = np.full(round(radius * np.pi / 2 / step), sign / radius)

@@ -5,7 +5,8 @@ Curves, regions and thresholds of the file were chosen on layouts L only, withou
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
@@ -13,7 +14,7 @@ from crosscue.datasets.scenes.rendering.render import DEFAULTS, PictureSettings
 from crosscue.datasets.simulated.drive import CAN, HEAD, MOTION
 from crosscue.replay.errors import UsageError
 
-from .layout import Layout, layout_named
+from .layout import Layout, Side, layout_named
 from .mobileye import MOUNTING
 from .motion import Conditions, conditions_of
 from .world import World, build_world
@@ -32,6 +33,7 @@ class SceneSettings:
         rate_hz: Pictures per second.
         camera: Size, lens and mounting of the camera.
         picture: Settings of the rendering.
+        traffic: Side of the road on which traffic drives.
     """
 
     layout: str = "A"
@@ -40,6 +42,7 @@ class SceneSettings:
     rate_hz: int = 10
     camera: SceneCamera = CAMERA
     picture: PictureSettings = DEFAULTS
+    traffic: Side = "right"
 
     def __post_init__(self) -> None:
         """Check the settings.
@@ -56,7 +59,7 @@ class SceneSettings:
     @property
     def name(self) -> str:
         """Name of its folder."""
-        return f"{self.layout}-{self.run:02d}"
+        return f"{self.layout}-{self.run:02d}" + ("-left" if self.traffic == "left" else "")
 
 
 def camera_of_width(width_px: int) -> SceneCamera:
@@ -74,7 +77,7 @@ def world_of(
     settings: SceneSettings, *, is_painted: bool = True
 ) -> tuple[Layout, Conditions, World]:
     """Return layout, conditions and world of a run; see ``build_world`` for ``is_painted``."""
-    layout = layout_named(settings.layout)
+    layout = replace(layout_named(settings.layout), traffic=settings.traffic)
     conditions = conditions_of(layout, settings.run, settings.seed)
     return layout, conditions, build_world(layout, conditions, is_painted=is_painted)
 
@@ -89,11 +92,22 @@ TRAFFIC_LIGHT_M: Final = (1.00036, 4.00404)
 
 
 def scene_vehicle_text(
-    camera: SceneCamera, *, mounting_yaw_rad: float, declination_rad: float, heading_rad: float
+    camera: SceneCamera,
+    *,
+    traffic: Side = "right",
+    mounting_yaw_rad: float,
+    declination_rad: float,
+    heading_rad: float,
 ) -> str:
     """Return the file's text for a camera and compass, with the heading at the start."""
     stop, light = STOP_SIGN_M, TRAFFIC_LIGHT_M
+    left, straight, right = POLYGONS
+    if traffic == "left":
+        left, straight, right = _mirrored(right), _mirrored(straight), _mirrored(left)
     return VEHICLE.format(
+        left=left,
+        straight=straight,
+        right=right,
         bus="/can/car",
         dbc="simulated_car.dbc",
         mounting_yaw_rad=mounting_yaw_rad,
@@ -108,6 +122,18 @@ def scene_vehicle_text(
         stop_sign=[round(stop[0] * camera.focal, 3), stop[1]],
         traffic_light=[round(light[0] * camera.focal, 3), light[1]],
     )
+
+
+# Left, straight and right region where traffic drives on the right.
+POLYGONS: Final = (
+    [[0.18, 0.52], [0.38, 0.52], [0.3, 0.555], [0.18, 0.555]],
+    [[0.45, 0.495], [0.53, 0.495], [0.53, 0.518], [0.45, 0.518]],
+    [[0.55, 0.52], [0.74, 0.52], [0.74, 0.56], [0.58, 0.56]],
+)
+
+
+def _mirrored(polygon: Sequence[Sequence[float]]) -> list[list[float]]:
+    return [[round(1.0 - x, 3), y] for x, y in polygon]
 
 
 VEHICLE: Final = f"""\
@@ -130,9 +156,9 @@ center_px = {{center_px}}
 
 # Chosen on layouts L700 to L731 so that none of their roads is missed near by and no other is seen.
 [regions]
-left = [[0.18, 0.52], [0.38, 0.52], [0.3, 0.555], [0.18, 0.555]]
-straight = [[0.45, 0.495], [0.53, 0.495], [0.53, 0.518], [0.45, 0.518]]
-right = [[0.55, 0.52], [0.74, 0.52], [0.74, 0.56], [0.58, 0.56]]
+left = {{left}}
+straight = {{straight}}
+right = {{right}}
 
 [ranges.stop_sign]
 family = "pinhole-offset"

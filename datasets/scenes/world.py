@@ -398,17 +398,18 @@ def _plants(site: _Site, fixed: Generator) -> None:
 
 
 def _overgrowth(site: _Site, fixed: Generator) -> None:
-    """Add bushes along the right side up to the corner, and branches before the stop sign."""
-    w = site.layout.half_width_m
+    """Add bushes along the ego side up to the corner, and branches before the stop sign."""
+    w, own = site.layout.half_width_m, site.layout.own
     for x in np.arange(-34.0, 2.5, 2.2):
-        y = -(w + float(fixed.uniform(2.0, 3.4)))
+        y = own * (w + float(fixed.uniform(2.0, 3.4)))
         high = float(fixed.uniform(1.9, 3.2))
         site.parts.append(bush(float(x), y, 1.5, high, site.atlas, fixed))
         site.shadows.crowns.append((float(x), y, 1.4, 0.8))
     for x in (-11.5, -9.5, -7.5):
-        mesh = crown((x, -(w + 0.55), 2.75), 0.95, 0.7, 7, site.atlas, fixed)
+        mesh = crown((x, own * (w + 0.55), 2.75), 0.95, 0.7, 7, site.atlas, fixed)
         site.parts.append(mesh)
-    for x, y in ((-10.0, -(w + 2.2)), (-17.0, -(w + 2.4)), (-24.0, -(w + 2.2))):
+    for x, aside_m in ((-10.0, w + 2.2), (-17.0, w + 2.4), (-24.0, w + 2.2)):
+        y = own * aside_m
         mesh, radius, high = tree(x, y, site.atlas, fixed)
         site.parts.append(mesh)
         site.shadows.crowns.append((x, y, radius, high))
@@ -429,7 +430,7 @@ def _poles(site: _Site, fixed: Generator) -> None:
         for off in (-1.0, 0.0, 1.0):
             site.parts.append(wire((float(a), y + off, 8.9), (float(b), y + off, 8.9)))
     face = sign_face("speed_limit", site.atlas)
-    x, y = -62.0, -(layout.half_width_m + 0.9)
+    x, y = -62.0, layout.own * (layout.half_width_m + 0.9)
     site.parts += [face.placed(x, y, 0.0, 2.5), post(x, y, 2.9)]
 
 
@@ -446,14 +447,15 @@ def _sign(site: _Site, category: Category, x: float, y: float, z: float, turn: f
 def _control(site: _Site, drive: ApproachMotion) -> None:
     layout = site.layout
     w, far, end = layout.half_width_m, layout.far_kerb_m, layout.end_m
+    own = layout.own
     if layout.control == "stop_sign":
-        _sign(site, "stop_sign", 0.0, -(w + 0.95), 2.5)
+        _sign(site, "stop_sign", 0.0, own * (w + 0.95), 2.5)
     if layout.control == "traffic_light":
         _lights(site, drive)
     if layout.one_way:
         kind: Category = "one_way_left" if layout.one_way == "left" else "one_way_right"
-        _sign(site, kind, end, (w + 1.2) if layout.has_ahead else 1.2, 2.45)
-        _sign(site, kind, NEAR_KERB_M - 1.0, -(w + 3.6), 2.45)
+        _sign(site, kind, end, -own * ((w + 1.2) if layout.has_ahead else 1.2), 2.45)
+        _sign(site, kind, NEAR_KERB_M - 1.0, own * (w + 3.6), 2.45)
     if layout.do_not_enter and layout.ahead_is_closed:
         for side in (-1.0, 1.0):
             _sign(site, "do_not_enter", end + 0.6, side * (w + 0.8), 2.3)
@@ -466,10 +468,10 @@ def _control(site: _Site, drive: ApproachMotion) -> None:
 def _lights(site: _Site, drive: ApproachMotion) -> None:
     """Add two lights on an arm over the road and one on the pole, beyond the intersection."""
     layout = site.layout
-    w, end = layout.half_width_m, layout.end_m
-    site.parts.append(mast(end, -(w + 1.5), 1.2))
+    w, end, own = layout.half_width_m, layout.end_m, layout.own
+    site.parts.append(mast(end, own * (w + 1.5), -own * 1.2))
     lane = lane_y_m(layout)
-    for y, z in ((lane, 5.45), (lane + 3.4, 5.5), (-(w + 1.2), 3.2)):
+    for y, z in ((lane, 5.45), (lane - own * 3.4, 5.5), (own * (w + 1.2), 3.2)):
         red = light_head("red").placed(end, y, 0.0, z)
         green = light_head("green").placed(end, y, 0.0, z)
         size = (0.24, 0.36, 1.06)
@@ -482,10 +484,11 @@ def _lights(site: _Site, drive: ApproachMotion) -> None:
 def _parked(site: _Site, varied: Generator) -> None:
     layout = site.layout
     w, near, far = layout.half_width_m, NEAR_KERB_M, layout.far_kerb_m
+    own = layout.own
     for side, has_arm in ((1.0, layout.has_left), (-1.0, layout.has_right)):
         if not has_arm or not layout.parked_cross:
             continue
-        for x, heading in ((near + 1.15, -np.pi / 2), (far - 1.15, np.pi / 2)):
+        for x, heading in ((near + 1.15, own * np.pi / 2), (far - 1.15, -own * np.pi / 2)):
             if layout.one_way:
                 heading = np.pi / 2 if layout.one_way == "left" else -np.pi / 2
             y = w + float(varied.uniform(5.5, 8.0))
@@ -494,7 +497,7 @@ def _parked(site: _Site, varied: Generator) -> None:
                     site.add_car(any_look(varied), "parked_cross", x, side * y, heading)
                 y += float(varied.uniform(6.0, 7.5))
     if layout.has_ahead and layout.has_parking_lane:
-        for side, heading in ((-1.0, 0.0), (1.0, np.pi)):
+        for side, heading in ((own, 0.0), (-own, np.pi)):
             if layout.ahead_is_closed:
                 heading = np.pi
             x = far + float(varied.uniform(9.0, 13.0))
@@ -503,7 +506,7 @@ def _parked(site: _Site, varied: Generator) -> None:
                     site.add_car(any_look(varied), "parked_past", x, side * (w - 1.05), heading)
                 x += float(varied.uniform(6.2, 9.0))
     if layout.has_parking_lane:
-        for side, heading in ((-1.0, 0.0), (1.0, np.pi)):
+        for side, heading in ((own, 0.0), (-own, np.pi)):
             for x in np.arange(-80.0, -16.0, 7.0):
                 if varied.random() < 0.14:
                     site.add_car(any_look(varied), "other", float(x), side * (w - 1.05), heading)
@@ -514,13 +517,15 @@ def _traffic(site: _Site, conditions: Conditions, drive: ApproachMotion, varied:
     w, near, far = layout.half_width_m, NEAR_KERB_M, layout.far_kerb_m
     rate = layout.cross_traffic * conditions.traffic / 60.0
     flows = []
-    # Traffic drives on the right, so cars to the right use the near half.
+    # Where traffic drives on the right, cars to the right use the near half.
     # With only one arm there is no crossing traffic; turning cars are not simulated.
+    halves = (near + 0.27 * (far - near), far - 0.27 * (far - near))
+    to_right, to_left = halves if layout.traffic == "right" else halves[::-1]
     if layout.has_left and layout.has_right:
         if layout.one_way != "left":
-            flows.append((-np.pi / 2, near + 0.27 * (far - near)))
+            flows.append((-np.pi / 2, to_right))
         if layout.one_way != "right":
-            flows.append((np.pi / 2, far - 0.27 * (far - near)))
+            flows.append((np.pi / 2, to_left))
     for heading, x in flows:
         _stream(site, _Flow("cross", heading, x, rate), drive, varied)
     if layout.has_ahead:

@@ -245,7 +245,7 @@ def _lines(canvas: _Canvas, layout: Layout) -> None:
             if layout.has_ahead:
                 canvas.line((far + CORNER_M + 5, X_M[1]), (y - 0.05, y + 0.05), WHITE)
     if layout.control != "none":
-        canvas.line((-0.65, -0.2), (-w + 0.3, -0.35), WHITE)
+        canvas.line((-0.65, -0.2), sorted((layout.own * (w - 0.3), layout.own * 0.35)), WHITE)
         _crosswalk(canvas, (0.9, 3.3), w)
         if layout.has_ahead:
             _crosswalk(canvas, (far + 1.2, far + 3.6), w)

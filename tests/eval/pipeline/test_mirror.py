@@ -1,0 +1,247 @@
+"""The law of sides: a drive in a mirror gives the mirrored cues, ranges and beliefs."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pytest
+
+from crosscue.datasets.scenes.drive import write_scene
+from crosscue.datasets.scenes.rendering.camera import SceneCamera
+from crosscue.datasets.scenes.settings import SceneSettings
+from crosscue.detectors import rle
+from crosscue.detectors.base import Detections, Found, Frame, RoadMask, View
+from crosscue.eval.cli import run
+from crosscue.eval.runs.drive import Drive
+from crosscue.eval.runs.folder import RunFolder, open_run
+from crosscue.eval.runs.manifest import DetectManifest
+from crosscue.replay.vehicle.vehicle import BUILTIN_CUES, CUES
+from support.data import shared
+from support.mirrored import Mirror, Rows, differences, exchanged, observed, rows_of, vehicle_of
+
+SCENE: Final = SceneSettings("L0", camera=SceneCamera(width_px=192, height_px=108))
+# Label, left edge, its speed across, upper edge, width and height as fractions of the picture.
+OBJECTS: Final = (
+    ("stop sign", 0.7, 0.0, 0.3, 0.05, 0.09),
+    ("traffic light", 0.62, 0.0, 0.2, 0.04, 0.12),
+    ("car", 0.05, 0.12, 0.5, 0.2, 0.12),
+    ("car", 0.75, -0.07, 0.55, 0.2, 0.12),
+    ("car", 0.02, 0.0, 0.65, 0.2, 0.12),
+    ("car", 0.3, 0.0, 0.66, 0.2, 0.12),
+    ("one way left", 0.2, 0.0, 0.35, 0.08, 0.06),
+    ("one way right", 0.85, 0.0, 0.36, 0.08, 0.06),
+    ("do not enter", 0.4, 0.0, 0.34, 0.06, 0.1),
+)
+SIGNS: Final = ("one way left", "one way right", "do not enter")
+PERIOD_NS: Final = 5_000_000_000
+
+
+class Busy:
+    """Finds the same objects in every picture, some of which move."""
+
+    view = View(min_width_px=64)
+    labels = tuple(dict.fromkeys(one[0] for one in OBJECTS if one[0] not in SIGNS))
+    identity = "busy"
+
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        """Detect."""
+        return [self._of(frame) for frame in frames]
+
+    def _of(self, frame: Frame) -> Found:
+        width, height = frame.size_px
+        passed_s = frame.t_ns % PERIOD_NS * 1e-9
+        boxes, masks, labels = [], [], []
+        for number, (label, x, speed, y, wide, high) in enumerate(OBJECTS):
+            if label not in self.labels:
+                continue
+            size = (round(wide * width), round(high * height))
+            corner = (round((x + speed * passed_s) * width), round(y * height))
+            boxes.append([*corner, corner[0] + size[0], corner[1] + size[1]])
+            outline = np.ones(size[::-1], np.bool_)
+            # One end of a car is lower: its nose, on either side in turn.
+            quarter = slice(0, size[0] // 4) if number % 2 else slice(-(size[0] // 4), None)
+            outline[: size[1] // 2, quarter] = label != "car"
+            masks.append(rle.encode_mask(outline, corner, frame.size_px))
+            labels.append(label)
+        scores = np.full(len(labels), 0.99)
+        return Detections(
+            frame.t_ns, frame.size_px, np.array(boxes, float), scores, tuple(labels), tuple(masks)
+        )
+
+
+class Signs(Busy):
+    """Finds the signs that name a side."""
+
+    labels = SIGNS
+    identity = "signs"
+    is_for_signs = True
+
+
+class Road:
+    """Finds road that is wider on the left, and goes on for some seconds."""
+
+    labels: tuple[str, ...] = ()
+    view = View(is_grey=True)
+    identity = "road"
+
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        """Detect."""
+        mask = np.zeros((54, 96), np.bool_)
+        mask[26:] = True
+        mask[:40, 70:] = False
+        return [
+            RoadMask(one.t_ns, one.size_px, rle.encode_mask(mask, (0, 0), (96, 54)), (96, 54))
+            for one in frames
+        ]
+
+
+def busy() -> Busy:
+    """Build the detector of objects."""
+    return Busy()
+
+
+def signs() -> Signs:
+    """Build the detector of signs."""
+    return Signs()
+
+
+def road() -> Road:
+    """Build the detector of road."""
+    return Road()
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A simulated drive with a Mobileye, in which every kind of object is found."""
+    folder = tmp_path_factory.mktemp("mirror")
+    files = write_scene(folder / "drive", SCENE)
+    names = ",".join(f"{__name__}:{one}" for one in ("busy", "signs", "road"))
+    argv = ["replay", str(files.log), "--vehicle", str(files.vehicle), "--no-cache"]
+    assert run([*argv, "--detectors", names, "-o", str(folder / "run")]) == 0
+    return open_run(folder / "run")
+
+
+def both(drive_run: RunFolder, changes: Mapping[str, Any]) -> tuple[Rows, Rows]:
+    """Rows of a run, exchanged, and those of the run in a mirror."""
+    manifest = drive_run.drive_manifest()
+    detected = manifest.detected
+    assert isinstance(detected, DetectManifest)
+    frames = drive_run.table("frames", ["width_px", "height_px"])
+    size_px = (frames["width_px"][0].as_py(), frames["height_px"][0].as_py())
+    vehicle = manifest.settings
+    for section, values in changes.items():
+        changed = getattr(vehicle, section).model_copy(update=values)
+        vehicle = vehicle.model_copy(update={section: changed})
+    drive = Drive([], vehicle, segments=detected.timeline)
+    straight = observed(drive, drive_run, detected)
+    with pytest.MonkeyPatch.context() as patch:
+        Mirror(patch)
+        mirrored = observed(
+            replace(drive, vehicle=vehicle_of(vehicle, size_px)), drive_run, detected
+        )
+    return rows_of(straight, size_px[0]), mirrored
+
+
+def positive(rows: Rows) -> set[str]:
+    return {row["cue"] for row in rows["cues"] if row["count"]}
+
+
+CHANGES: Final[dict[str, dict[str, Any]]] = {
+    "published rules": {},
+    "tracks": {
+        "cars": {"kind": "tracks"},
+        "cues": {"kind": "tracks"},
+        "fusion": {"kind": "persistent"},
+    },
+    "road on the ground": {"regions": {"kind": "ground"}, "ranges": {"kind": "motion"}},
+    "accumulated road": {"regions": {"kind": "area"}, "fusion": {"kind": "temporal"}},
+}
+
+
+@pytest.mark.parametrize("changes", CHANGES.values(), ids=CHANGES)
+def test_simulated_drive_in_a_mirror_is_mirrored(
+    simulated: RunFolder, changes: dict[str, Any]
+) -> None:
+    expected, mirrored = both(simulated, changes)
+
+    assert expected["belief"]
+    assert differences(expected, mirrored) == []
+
+
+def test_every_cue_that_names_a_side_or_not_is_seen_in_the_mirrored_drives(
+    simulated: RunFolder,
+) -> None:
+    seen: set[str] = set()
+    for changes in CHANGES.values():
+        seen |= positive(both(simulated, changes)[1])
+
+    # Cars past an intersection need one whose range is known: see the real drives.
+    assert BUILTIN_CUES.keys() - seen <= {"oncoming_cars", "outgoing_cars"}
+
+
+def test_mirror_finds_a_rule_that_assumes_a_side(
+    simulated: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A law that cannot fail would say nothing."""
+    from crosscue.detectors.cues import cars
+
+    def more_to_the_left(pairs: cars.Pairs, settings: object) -> cars.Sides:
+        x = pairs.step_px[:, 0]
+        return cars.Sides(int((x < 0).sum()), int((x > 2.0).sum()))
+
+    monkeypatch.setattr(cars, "cross_traffic", more_to_the_left)
+    expected, mirrored = both(simulated, {})
+
+    assert any("cross_traffic" in one for one in differences(expected, mirrored))
+
+
+def test_each_cue_of_a_side_has_the_same_row_on_the_other() -> None:
+    for cue in CUES.values():
+        other = CUES[exchanged(cue.name)]
+        assert other.supports == tuple(map(exchanged, cue.supports))
+        assert other.excludes == tuple(map(exchanged, cue.excludes))
+        same = replace(cue, name="", supports=(), excludes=(), colour=(0, 0, 0), label=None)
+        assert (
+            replace(other, name="", supports=(), excludes=(), colour=(0, 0, 0), label=None) == same
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("folder", "pictures", "camera"),
+    [
+        (
+            "kitti_t_junction",
+            "image_0/*.png",
+            "[camera]\nfocal_px = 707.0912\ncenter_px = [601.8873, 183.1104]\nz_m = 1.65\n",
+        ),
+        ("camvid_0016e5_light", "*.jpg", ""),
+    ],
+)
+def test_real_drive_in_a_mirror_is_mirrored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, pictures: str, camera: str
+) -> None:
+    pytest.importorskip("openvino")
+    weights = shared("weights", "road-segmentation-adas-0001")
+    monkeypatch.setenv("CROSSCUE_DATA", str(weights.parents[1]))
+    monkeypatch.setenv("CROSSCUE_MODELS", str(tmp_path / "models"))
+    names = ["yolox-nano", "road-segmentation-adas-0001"]
+    assert run(["model", "fetch", *names]) == 0
+    (tmp_path / "front").mkdir()
+    for path in sorted(shared("sequences", folder).glob(pictures)):
+        shutil.copy(path, tmp_path / "front")
+    (tmp_path / "front" / "timestamps.txt").write_text("rate_hz: 10\n")
+    (tmp_path / "car.toml").write_text(f"version = 1\n{camera}")
+    argv = ["replay", str(tmp_path / "front"), "--vehicle", str(tmp_path / "car.toml")]
+    argv += ["--detectors", ",".join(names), "--no-cache", "-o", str(tmp_path / "run")]
+    assert run(argv) == 0
+
+    expected, mirrored = both(open_run(tmp_path / "run"), {})
+
+    assert expected["belief"]
+    assert differences(expected, mirrored) == []
