@@ -19,6 +19,8 @@ from .world import CATEGORIES, SceneObject
 # Min size of a recognizable object.
 MIN_PIXELS: Final = 12
 PAST_REACH_M: Final = 110.0
+# Lateral distance from the road's centre line beyond which a car is in a leg.
+LEG_ASIDE_M: Final = 12.0
 LANES_REACH_M: Final = 45.0
 
 
@@ -72,6 +74,15 @@ def _crossing(*, left: bool) -> Simulated:
     return _things(shows)
 
 
+def _in_leg(*, left: bool) -> Simulated:
+    def shows(_: Layout, thing: SceneObject, t_s: float) -> bool:
+        moves = thing.velocity != (0.0, 0.0)
+        y_m = float(thing.at[1] + thing.shift(t_s)[1])
+        return _is_car(thing, "cross") and moves and (y_m if left else -y_m) > LEG_ASIDE_M
+
+    return _things(shows)
+
+
 def _parked(*, left: bool) -> Simulated:
     return _things(
         lambda _, thing, __: _is_car(thing, "parked_cross") and _goes_left(thing) == left
@@ -110,6 +121,8 @@ SIMULATED: Final[dict[str, Simulated]] = {
     "road_right": _always(lambda layout, _: layout.has_right),
     "cross_traffic_left": _crossing(left=True),
     "cross_traffic_right": _crossing(left=False),
+    "leg_traffic_left": _in_leg(left=True),
+    "leg_traffic_right": _in_leg(left=False),
     "parked_left": _parked(left=True),
     "parked_right": _parked(left=False),
     "oncoming_cars": _cars_past("oncoming"),

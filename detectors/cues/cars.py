@@ -229,6 +229,17 @@ def count_outgoing(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> Count | None
     return None if past is None else _past(pairs, past.outgoing)
 
 
+def count_in_leg(pairs: Pairs, vehicle: Vehicle, cue: CueSpec) -> Count | None:
+    """Count cars that move in the leg that the cue supports; None where unknown or not wanted."""
+    legs = None if pairs.judged is None else pairs.judged.in_leg
+    if legs is None or not vehicle.cars.leg_traffic:
+        return None
+    number = of_side(legs, cue)
+    skipped = {BELOW_SCORE: pairs.cars.low}
+    skipped[ELSEWHERE] = len(pairs.cars.scores) - pairs.cars.low - number
+    return _count(pairs.cars, number, skipped)
+
+
 def _of_pairs(pairs: Pairs, number: int) -> Count:
     """Return a count of cars in two frames; a car is skipped for the first rule that it fails."""
     cars, again = pairs.cars, len(pairs.nose)

@@ -13,6 +13,7 @@ from crosscue.detectors.base import Detections, RoadMask
 from crosscue.detectors.cues.tracked.judge import (
     cars_past,
     count_cars,
+    in_legs,
     is_past,
     may_be_parked,
 )
@@ -168,7 +169,9 @@ class CuePass:
         longer = self._tracks.longer(
             lambda seen: place is not None and is_past(seen[-1], camera, place)
         )
-        judged = judged._replace(past=cars_past(longer, camera, cars, place))
+        judged = judged._replace(
+            past=cars_past(longer, camera, cars, place), in_leg=in_legs(found, camera, cars, place)
+        )
         return Pairs(
             np.array([car.step_px for car in found]).reshape(-1, 2),
             np.array([car.center_px for car in found]).reshape(-1, 2),

@@ -82,6 +82,8 @@ class CarCounts(NamedTuple):
         seen: Number of cars that were completely visible and near enough.
         followed: Number of those that were seen in enough frames.
         past: Cars that move along the road past the intersection; None if its position is unknown.
+        in_leg: Cars that move in the left and in the right leg of the intersection; None if its
+            position is unknown.
     """
 
     crossing: Sides
@@ -91,6 +93,7 @@ class CarCounts(NamedTuple):
     seen: int
     followed: int
     past: Ways | None = None
+    in_leg: Sides | None = None
 
 
 def nose_of(heights_px: NDArray[np.float64]) -> int:

@@ -6,6 +6,7 @@ row in this table and a function for its ``rule``. The simulator also has a func
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 from crosscue.replay.colours import FEATURES
@@ -76,6 +77,11 @@ def _cars(
 
 def _crossing(side: str) -> CueSpec:
     return _cars("cross_traffic", "cross traffic", "cars:count_crossing", 0.86, side, MOVES_FADE_S)
+
+
+def _leg_traffic(side: str) -> CueSpec:
+    row = _cars("leg_traffic", "traffic in a leg", "cars:count_in_leg", 0.86, side, MOVES_FADE_S)
+    return replace(row, absence_counts=False)
 
 
 # Precision on eight simulated drives with perfect boxes (``benchmarks/tracked_cars.py``). It is the
@@ -166,6 +172,8 @@ BUILTIN_CUES: Final[dict[str, CueSpec]] = {
         _crossing("right"),
         _cars("parked", "parked cars", "cars:count_parked", 0.83, "left"),
         _cars("parked", "parked cars", "cars:count_parked", 0.83, "right"),
+        _leg_traffic("left"),
+        _leg_traffic("right"),
         _cars_past("oncoming"),
         _cars_past("outgoing"),
         _past("lanes_past", "lane lines past", per_detection=False),

@@ -255,6 +255,9 @@ class Cars(Section):
     greater."""
     past_aside_m: Positive = 12.0
     """Maximum lateral distance of these cars from the ego path, about three lanes."""
+    leg_traffic: bool = False
+    """With ``kind = "tracks"``: cars that move in a leg of the intersection, further aside than
+    ``past_aside_m``, support that leg. Off, because no real drive here has a case for it."""
     past_frames: Annotated[int, Field(ge=3, le=100)] = 30
     """Number of most recent frames used to classify these cars."""
 

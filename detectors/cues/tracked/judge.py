@@ -163,6 +163,28 @@ def along(cars: Sequence[CarMotion], settings: Cars) -> list[CarMotion]:
     ]
 
 
+def in_legs(
+    cars: Sequence[CarMotion], camera: Camera, settings: Cars, place: Place | None
+) -> Sides | None:
+    """Count cars that move across within the left and the right leg; None where unknown.
+
+    A car that comes out of a leg, turns into it or crosses is in that leg while it is further
+    aside than the ego road is wide. Cars that stand there, in a queue or parked, do not count.
+
+    Args:
+        cars: Tracked cars.
+        camera: Mounting of the camera.
+        settings: Thresholds.
+        place: Position of the intersection.
+    """
+    if place is None or place.end_m <= 0.0:
+        return None
+    here = [car for car in crossing(cars, settings) if is_at(car, camera, place)]
+    right_m = [car.bearing * car.distance_m for car in here]
+    aside_m = settings.past_aside_m
+    return Sides(sum(at < -aside_m for at in right_m), sum(at > aside_m for at in right_m))
+
+
 def is_past(car: CarMotion | Observation, camera: Camera, place: Place) -> bool:
     """Whether a car is past the end of the intersection, with a probability of 86 %."""
     sd_m = math.hypot(HEIGHT_FRACTION * car.distance_m, place.sd_m)

@@ -21,6 +21,7 @@ NO_OBJECTS: Final = "no detector of objects"
 NO_ROAD: Final = "no detector of road"
 NO_MOBILEYE: Final = "no Mobileye, or no range to an intersection"
 NO_PLACE: Final = 'no range to an intersection, or not cars.kind = "tracks"'
+NOT_WANTED: Final = "not cars.leg_traffic = true, or no range to an intersection"
 NO_MASKS: Final = "only masks show which way a parked car faces (eq. 16), and all cars are boxes"
 NEVER: Final = "no frame in which they could be computed"
 
@@ -79,6 +80,8 @@ def not_looked_for(
             return max(not_followed, key=lambda why: not_followed[why])
         if has_any and cue in CUES and CUES[cue].group == "cars_past":
             return NO_PLACE
+        if has_any and cue in CUES and CUES[cue].group == "leg_traffic":
+            return NOT_WANTED
         return NEVER if has_any else NO_OBJECTS
 
     return {cue: why(cue) for cue in cue_labels if cue not in looked}

@@ -14,13 +14,28 @@ from hypothesis import strategies as st
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.candidates import ELSEWHERE
+from crosscue.detectors.cues.cars import CarCandidates, count_in_leg, no_pairs
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import FrameDetections, Place, Sides, Ways
-from crosscue.detectors.cues.tracked.judge import cars_past, count_cars, crossing, parked
+from crosscue.detectors.cues.observed import (
+    NONE,
+    CarCounts,
+    FrameDetections,
+    Place,
+    Sides,
+    Ways,
+)
+from crosscue.detectors.cues.tracked.judge import (
+    cars_past,
+    count_cars,
+    crossing,
+    in_legs,
+    parked,
+)
 from crosscue.detectors.cues.tracked.motion import CAR_HEIGHT_M, CarMotion
 from crosscue.detectors.cues.tracked.tracks import CarTracks, are_hidden
 from crosscue.detectors.ranging.object_tracks import CarStep
-from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Cars, Vehicle
+from crosscue.replay.vehicle.vehicle import CUES, SIMULATED_CAR, Camera, Cars, Vehicle
 
 SIZE = (1280, 720)
 CAMERA = Camera(x_m=1.7, z_m=1.4, focal_px=704.0, center_px=(640.0, 360.0))
@@ -377,3 +392,40 @@ def test_car_rules_default_to_pairs_only_for_the_simulated_car() -> None:
     assert Vehicle(version=1, name="Golf").cars.kind == "tracks"
     assert Vehicle(version=1, name=SIMULATED_CAR).cars.kind == "pairs"
     assert Vehicle(version=1, name=SIMULATED_CAR, cars=RULES).cars.kind == "tracks"
+
+
+@pytest.mark.parametrize(
+    ("aside_m", "right_mps", "distance_m", "legs"),
+    [
+        # It comes out of the left leg, turns into it, or crosses in the right one.
+        (-20.0, 6.0, 30.0, Sides(1, 0)),
+        (-20.0, -6.0, 30.0, Sides(1, 0)),
+        (20.0, 6.0, 30.0, Sides(0, 1)),
+        # On the ego road, standing in a queue, and behind the intersection.
+        (-8.0, 6.0, 30.0, Sides(0, 0)),
+        (-20.0, 0.0, 30.0, Sides(0, 0)),
+        (-20.0, 6.0, 70.0, Sides(0, 0)),
+    ],
+)
+def test_car_that_moves_across_counts_for_the_leg_in_which_it_is(
+    aside_m: float, right_mps: float, distance_m: float, legs: Sides
+) -> None:
+    bearing = aside_m / distance_m
+    car = CarMotion(1, 10, distance_m, bearing, right_mps, 0.3, 0.0, 0.5, True, 2.5, 0.0)
+
+    assert in_legs([car], CAMERA, RULES, Place(25.0, 40.0, 1.0)) == legs
+    assert in_legs([car], CAMERA, RULES, None) is None
+
+
+def test_traffic_in_legs_is_looked_for_on_request_only() -> None:
+    judged = CarCounts(NONE, NONE, NONE, NONE, 1, 1, in_leg=Sides(2, 0))
+    pairs = replace(no_pairs(640), judged=judged, cars=CarCandidates((0.9, 0.9, 0.9)))
+    wanted = Vehicle(version=1, cars=Cars(leg_traffic=True))
+
+    for side, number in (("left", 2), ("right", 0)):
+        cue = CUES[f"leg_traffic_{side}"]
+        found = count_in_leg(pairs, wanted, cue)
+        assert found is not None
+        assert (found.number, found.skipped[ELSEWHERE]) == (number, 3 - number)
+        assert count_in_leg(pairs, Vehicle(version=1), cue) is None
+        assert count_in_leg(no_pairs(640), wanted, cue) is None
