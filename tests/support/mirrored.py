@@ -21,6 +21,7 @@ from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
+from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.eval.runs.tables.travelled import Odometer, Way
 from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -109,10 +110,10 @@ class Mirror:
     """Patches the scene stage so that it sees every run in a mirror."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        frames, until, at = stage.stored_frames, Odometer.until, StoredMobileye.at
+        until, at = Odometer.until, StoredMobileye.at
 
         def mirrored_frames(*args: Any, **named: Any) -> Iterator[FrameDetections]:
-            return map(frame_of, frames(*args, **named))
+            return map(frame_of, stored_frames(*args, **named))
 
         def mirrored_until(self: Odometer, t_ns: int) -> Way:
             way = until(self, t_ns)

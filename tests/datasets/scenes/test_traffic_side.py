@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 import pytest
 
-from crosscue.datasets.scenes.layout import Layout, layout_named
+from crosscue.datasets.scenes.layout import Layout, Side, layout_named
 from crosscue.datasets.scenes.mobileye import lane_lines_m
 from crosscue.datasets.scenes.motion import approach, conditions_of, lane_y_m
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
@@ -15,6 +16,9 @@ from crosscue.datasets.scenes.settings import SceneSettings, scene_vehicle_text
 from crosscue.datasets.scenes.world import SceneObject, build_world
 from crosscue.datasets.simulate import Approaches
 from crosscue.replay.vehicle.vehicle import parse
+
+# Sign of y on the side on which traffic drives.
+OWN: Final[dict[Side, float]] = {"right": -1.0, "left": 1.0}
 
 
 def things(layout: Layout) -> tuple[SceneObject, ...]:
@@ -34,7 +38,7 @@ def test_things_beside_the_road_change_sides(name: str) -> None:
             for one in things(replace(layout, traffic=side))
             if one.role == "furniture" and one.category in ("stop_sign", "traffic_light")
         )
-        for side, sign in (("right", 1.0), ("left", -1.0))
+        for side, sign in OWN.items()
     }
 
     assert there["left"]
@@ -43,7 +47,7 @@ def test_things_beside_the_road_change_sides(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["A", "C", "E"])
 def test_every_car_keeps_to_its_side(name: str) -> None:
-    for side, own in (("right", -1.0), ("left", 1.0)):
+    for side, own in OWN.items():
         layout = replace(layout_named(name), traffic=side)
         middle_m = 4.5 + 0.5 * layout.cross_width_m
         moving = [one for one in things(layout) if one.velocity != (0.0, 0.0)]
@@ -59,7 +63,7 @@ def test_every_car_keeps_to_its_side(name: str) -> None:
 @pytest.mark.parametrize("name", ["B", "E", "G"])
 def test_parked_cars_face_along_their_side(name: str) -> None:
     layout = layout_named(name)
-    for side, own in (("right", -1.0), ("left", 1.0)):
+    for side, own in OWN.items():
         parked = [one for one in things(replace(layout, traffic=side)) if "parked" in one.role]
         assert parked
         for car in parked:

@@ -16,6 +16,7 @@ from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Found, Frame, RoadMask, View
+from crosscue.detectors.cues.observed import Sides
 from crosscue.eval.cli import run
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, open_run
@@ -154,12 +155,12 @@ def positive(rows: Rows) -> set[str]:
 CHANGES: Final[dict[str, dict[str, Any]]] = {
     "published rules": {},
     "tracks": {
-        "cars": {"kind": "tracks"},
+        "cars": {"kind": "tracks", "leg_traffic": True},
         "cues": {"kind": "tracks"},
         "fusion": {"kind": "persistent"},
     },
     "road on the ground": {"regions": {"kind": "ground"}, "ranges": {"kind": "motion"}},
-    "accumulated road": {"regions": {"kind": "area"}, "fusion": {"kind": "temporal"}},
+    "accumulated road": {"regions": {"kind": "area"}, "fusion": {"kind": "persistent"}},
 }
 
 
@@ -180,8 +181,9 @@ def test_every_cue_that_names_a_side_or_not_is_seen_in_the_mirrored_drives(
     for changes in CHANGES.values():
         seen |= positive(both(simulated, changes)[1])
 
-    # Cars past an intersection need one whose range is known: see the real drives.
-    assert BUILTIN_CUES.keys() - seen <= {"oncoming_cars", "outgoing_cars"}
+    # Cars beyond an intersection and in its legs need one whose range is known: see real drives.
+    unseen = BUILTIN_CUES.keys() - seen
+    assert {BUILTIN_CUES[cue].group for cue in unseen} <= {"cars_past", "leg_traffic"}
 
 
 def test_mirror_finds_a_rule_that_assumes_a_side(
@@ -190,9 +192,9 @@ def test_mirror_finds_a_rule_that_assumes_a_side(
     """A law that cannot fail would say nothing."""
     from crosscue.detectors.cues import cars
 
-    def more_to_the_left(pairs: cars.Pairs, settings: object) -> cars.Sides:
+    def more_to_the_left(pairs: cars.Pairs, settings: object) -> Sides:
         x = pairs.step_px[:, 0]
-        return cars.Sides(int((x < 0).sum()), int((x > 2.0).sum()))
+        return Sides(int((x < 0).sum()), int((x > 2.0).sum()))
 
     monkeypatch.setattr(cars, "cross_traffic", more_to_the_left)
     expected, mirrored = both(simulated, {})
@@ -217,8 +219,14 @@ def test_each_cue_of_a_side_has_the_same_row_on_the_other() -> None:
     [
         (
             "kitti_t_junction",
-            "image_0/*.png",
+            "image_0/*.*",
             "[camera]\nfocal_px = 707.0912\ncenter_px = [601.8873, 183.1104]\nz_m = 1.65\n",
+        ),
+        (
+            "kitti_seq2_right_turn_98deg",
+            "image_l/*.*",
+            "[cars]\nleg_traffic = true\n"
+            "[camera]\nfocal_px = 718.856\ncenter_px = [607.1928, 185.2157]\nz_m = 1.65\n",
         ),
         ("camvid_0016e5_light", "*.jpg", ""),
     ],
