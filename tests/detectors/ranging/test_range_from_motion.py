@@ -112,3 +112,14 @@ def test_invalid_observations_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match="expected"):
         range_from_motion(np.array(travelled_m), np.array(height_px), focal_px, LIGHT)
+
+
+@pytest.mark.parametrize("height_px", [300.0, 40.0, 8.0, 2.5])
+def test_one_observation_says_nothing_by_motion_at_any_range(height_px: float) -> None:
+    """The variance before motion is in closed form; with one observation it is that on the grid.
+
+    At 2.5 px the greatest range cuts the distribution off.
+    """
+    found = range_from_motion(np.zeros(1), np.array([height_px]), 1000.0, SizePrior(1.0, 0.2))
+
+    assert found.by_motion == pytest.approx(0.0, abs=2e-3)
