@@ -209,11 +209,7 @@ def write_scene(
 
 
 def _settings_of(settings: SceneSettings, imager: Imager) -> dict[str, Any]:
-    made = asdict(settings) | ({"imager": imager.name} if imager.name else {})
-    if settings.traffic == "right":
-        # Files of drives on the right stay as they were.
-        del made["traffic"]
-    return made
+    return asdict(settings) | ({"imager": imager.name} if imager.name else {})
 
 
 def refuse_other_drive(folder: Path, settings: SceneSettings, imager: Imager = PHOTOGRAPHS) -> None:
