@@ -18,7 +18,7 @@ import inspect
 import io
 import types
 import typing
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
@@ -31,8 +31,9 @@ from crosscue.replay.meanings import meanings
 from crosscue.results import Result
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from sphinx.application import Sphinx
+
+    from crosscue.eval.runs.tables.columns import Column
 
 
 class Commands(SphinxDirective):
@@ -259,11 +260,14 @@ class Tables(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """One section for each table."""
+        from crosscue.eval.runs.tables.columns import OF_RUN, OF_SCORE
+
+        scores = {f"score/{name}": columns for name, columns in OF_SCORE.items()}
         found: list[nodes.Node] = []
-        for name, schema in _schemas().items():
+        for name, columns in {**OF_RUN, **scores}.items():
             block = nodes.section(ids=[nodes.make_id(f"table {name}")])
             block += nodes.title(text=f"{name}.parquet")
-            block += _table(("column", "type"), [(one.name, str(one.type)) for one in schema])
+            block += _columns(columns)
             found.append(block)
         return found
 
@@ -273,30 +277,20 @@ class Columns(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """One section for each table."""
-        from crosscue.eval.catalog.query.columns import INDEXED, OWN
+        from crosscue.eval.runs.tables.columns import INDEXED, QUERIED
 
         found: list[nodes.Node] = []
-        for name, columns in {**INDEXED, **OWN}.items():
+        for name, columns in {**INDEXED, **QUERIED}.items():
             block = nodes.section(ids=[nodes.make_id(f"columns {name}")])
             block += nodes.title(text=name)
-            rows = [(column, one.kind, one.meaning) for column, one in columns.items()]
-            block += _table(("column", "type", "meaning"), rows)
+            block += _columns(columns)
             found.append(block)
         return found
 
 
-def _schemas() -> dict[str, pa.Schema]:
-    from crosscue.eval.pipeline import detect
-    from crosscue.eval.pipeline.scene import stage as scene
-    from crosscue.eval.runs.tables import measurements, pose_tables, skipped
-
-    return {
-        **detect.detect_schemas(),
-        **scene.scene_schemas(gives_reasons=True),
-        "pose": pose_tables.pose_schema(),
-        measurements.TABLE: measurements.measurement_schema(),
-        "skipped": skipped.skipped_schema(),
-    }
+def _columns(columns: Mapping[str, Column]) -> nodes.table:
+    rows: list[tuple[str, ...]] = [(name, *column) for name, column in columns.items()]
+    return _table(("column", "type", "meaning"), rows)
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> nodes.table:

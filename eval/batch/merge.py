@@ -35,6 +35,7 @@ from crosscue.eval.runs.manifest import (
     MergedManifest,
 )
 from crosscue.eval.runs.settings_hash import settings_sha256
+from crosscue.eval.runs.tables.columns import DRIVE, arrow_schema
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tags import read_tags
 from crosscue.replay.errors import RunError, UnreadableRunError, UsageError, one_line
@@ -49,7 +50,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-DRIVE: Final = "drive"
 FOLDER: Final = MERGED
 
 
@@ -123,16 +123,16 @@ def _named(batch: pa.RecordBatch, drive: str, schema: pa.Schema) -> dict[str, ob
     columns: dict[str, object] = {
         name: batch[name] if name in there else pa.nulls(batch.num_rows, schema.field(name).type)
         for name in schema.names
-        if name != DRIVE
+        if name not in DRIVE
     }
-    return {DRIVE: pa.repeat(pa.scalar(drive), batch.num_rows), **columns}
+    return {"drive": pa.repeat(pa.scalar(drive), batch.num_rows), **columns}
 
 
 def _schema(kind: str, holding: Sequence[_Drive]) -> pa.Schema:
     """Return the columns of all drives, preceded by the drive's name."""
     import pyarrow as pa
 
-    whole = pa.schema([(DRIVE, pa.string())])
+    whole = arrow_schema(DRIVE)
     for one in holding:
         try:
             whole = pa.unify_schemas([whole, one.run.schema(kind)])

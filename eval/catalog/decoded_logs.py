@@ -39,7 +39,6 @@ from crosscue.results import HIDDEN, Result, json_key
 
 if TYPE_CHECKING:
     import numpy as np
-    import pyarrow as pa
     from numpy.typing import NDArray
 
 # Min rows of a row group; rows of a table are buffered until then.
@@ -78,7 +77,10 @@ class _Table:
             return
         columns = _labelled(topic_columns(self.held), self.timeline, self.clock)
         if self.sink is None:
-            sink = TableSink(self.run, self.name, _schema_of(columns))
+            import pyarrow as pa
+
+            schema = pa.table({name: values[:0] for name, values in columns.items()}).schema
+            sink = TableSink(self.run, self.name, schema)
             self.sink = self.stack.enter_context(sink)
         self.sink.write(columns)
         self.rows += self.held_rows
@@ -323,9 +325,3 @@ def _labelled(
             values = np.asarray(values, np.int64) - (t_ns - log_t_ns)
         found[f"{name}_" if name == "segment" else name] = values
     return found
-
-
-def _schema_of(columns: Mapping[str, NDArray[np.generic]]) -> pa.Schema:
-    import pyarrow as pa
-
-    return pa.schema([(name, pa.array(values[:0]).type) for name, values in columns.items()])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from crosscue.eval.report.html import style_of
 from crosscue.eval.report.svg_plot import Panel, SvgChart
-from crosscue.eval.runs.tables.log_time import LABELS
+from crosscue.eval.runs.tables.columns import LOG_TIME
 from crosscue.replay.vehicle.fusion import NOT_FEATURES
 
 from .record import Failure
@@ -61,7 +61,7 @@ def belief_around(rows: ChartTables, failure: Failure) -> Markup | None:
     drawing.rect(left, panel.top, max(right - left, 1.0), panel.height, "span")
     drawing.axes(panel, "seconds from the failure", "", y_ticks=[0.0, 0.5, 1.0])
     drawing.rule(panel.left, panel.y(THRESHOLD), panel.right, panel.y(THRESHOLD), "line dash")
-    names = [name for name in rows.belief.column_names if name not in (*NOT_FEATURES, *LABELS)]
+    names = [name for name in rows.belief.column_names if name not in (*NOT_FEATURES, *LOG_TIME)]
     breaks = np.flatnonzero(np.diff(t_s[near]) > BREAK_S) + 1
     times = np.insert(t_s[near], breaks, np.nan)
     for name in names:

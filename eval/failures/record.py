@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
+from crosscue.eval.runs.tables.columns import INT, REAL, TEXT, TEXTS, Column, arrow_schema
 from crosscue.replay.errors import AnnotationError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree, spelled, strict_json, unspelled
@@ -118,20 +119,13 @@ def distance_bin(distance_m: float | None) -> str:
 
 def failure_schema() -> pa.Schema:
     """Return the schema of a table of failures."""
-    import pyarrow as pa
-
-    types = {
-        "str": pa.string(),
-        "int": pa.int64(),
-        "float": pa.float64(),
-        "tuple[str, ...]": pa.list_(pa.string()),
-    }
-    columns = []
+    kinds = {"int": INT, "float": REAL, "tuple[str, ...]": TEXTS}
+    columns = {}
     for one in fields(Failure):
-        name = str(one.type).removesuffix(" | None")
-        kind = types.get(name, pa.string())
-        columns.append(pa.field(one.name, kind, nullable=name != str(one.type)))
-    return pa.schema(columns)
+        kind, _, is_optional = str(one.type).partition(" | ")
+        kind = kinds.get(kind, TEXT)
+        columns[one.name] = Column(kind if is_optional else f"{kind} NOT NULL", "")
+    return arrow_schema(columns)
 
 
 def failure_table(failures: Sequence[Failure]) -> pa.Table:

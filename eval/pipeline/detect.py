@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -52,7 +51,6 @@ from crosscue.eval.runs.manifest import (
     selection_record,
 )
 from crosscue.eval.runs.tables.labelled import LabelledSink
-from crosscue.eval.runs.tables.parquet import INT, REAL, TEXT, schema_of
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.replay.base import Log, Selection
 from crosscue.replay.columns import Block, Int64s, Topic
@@ -71,10 +69,7 @@ from .clocks import clock_rows
 from .drive_time import time_segments
 from .empty_result import empty_result
 from .visual import TABLE as VISUAL
-from .visual import VisualPass, uses_pictures, visual_schema
-
-if TYPE_CHECKING:
-    import pyarrow as pa
+from .visual import VisualPass, uses_pictures
 
 
 @dataclass(frozen=True, slots=True)
@@ -361,10 +356,9 @@ class DetectTables:
         with ExitStack() as stack:
             timeline = self.drive.segments
             clock = timeline.clock(self.drive.only_camera()[0])
-            for name, schema in detect_schemas().items():
-                if name == VISUAL and self.visual is None:
-                    continue
-                sink = LabelledSink(self.run, name, schema, timeline, clock)
+            tables = ("frames", "detections", "road")
+            for name in tables if self.visual is None else (VISUAL, *tables):
+                sink = LabelledSink(self.run, name, timeline, clock)
                 self._sinks[name] = stack.enter_context(sink)
                 self._held[name] = {}
             self._open = stack.pop_all()
@@ -485,26 +479,3 @@ class DetectTables:
         columns, self._held[name] = self._held[name], {}
         if columns.get("t_ns"):
             self._sinks[name].write(columns)
-
-
-def detect_schemas() -> dict[str, pa.Schema]:
-    """Return the schemas of the tables that this stage writes."""
-    frame = {"frame": INT, "t_ns": INT, "camera": TEXT}
-    found = ("score", "x0", "y0", "x1", "y1")
-    texts = ("lens", "look", "same_as")
-    fractions = ("fraction_left", "fraction_straight", "fraction_right")
-    columns = {
-        "frames": frame | dict.fromkeys(("width_px", "height_px"), "int32"),
-        "detections": frame
-        | {"detector": TEXT, "label": TEXT}
-        | dict.fromkeys(found, REAL)
-        | {"mask": "binary", "height_px": REAL}
-        | dict.fromkeys(texts, TEXT)
-        | dict.fromkeys(("range_m", "range_sd_m"), REAL)
-        | dict.fromkeys(("picture_width_px", "picture_height_px"), "int32"),
-        "road": frame
-        | dict.fromkeys(fractions, REAL)
-        | {"mask": "binary"}
-        | dict.fromkeys(("mask_width_px", "mask_height_px"), "int32"),
-    }
-    return {VISUAL: visual_schema(), **{name: schema_of(one) for name, one in columns.items()}}

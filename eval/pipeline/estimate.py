@@ -33,7 +33,7 @@ from crosscue.eval.runs.tables import measurements
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.mobileye_tables import MobileyeSink
 from crosscue.eval.runs.tables.parquet import TableSink
-from crosscue.eval.runs.tables.pose_tables import PoseTally, pose_rows, pose_schema
+from crosscue.eval.runs.tables.pose_tables import PoseTally, pose_rows
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.localization.pose_track import PoseColumns
@@ -176,10 +176,9 @@ class EstimateStage:
         if self._visual is not None and self.found is not None:
             clock = timeline.clock(self.found.camera_log)
         device = self._clock_of(Signal.MOBILEYE_OBSTACLES)
-        measured = measurements.TABLE, measurements.measurement_schema()
         with (
-            LabelledSink(self._run, "pose", pose_schema(), timeline, clock) as poses,
-            LabelledSink(self._run, *measured, timeline, clock) as inputs,
+            LabelledSink(self._run, "pose", timeline, clock) as poses,
+            LabelledSink(self._run, measurements.TABLE, timeline, clock) as inputs,
             MobileyeSink(self._run, timeline, device) as mobileye,
         ):
             yield PoseTables(self.pose, poses, inputs, mobileye, self._tally)

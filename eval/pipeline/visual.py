@@ -19,9 +19,9 @@ from crosscue.detectors.images import decode
 from crosscue.detectors.runner import FrameResult
 from crosscue.eval.runs.account import Line, line
 from crosscue.eval.runs.drive import Drive
-from crosscue.eval.runs.tables.parquet import INT, REAL, TableFolder, schema_of
+from crosscue.eval.runs.tables.parquet import TableFolder
 from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
-from crosscue.localization.visual_odometry import HEIGHT_SD, VisualOdometry, VisualStep
+from crosscue.localization.visual_odometry import HEIGHT_SD, VisualOdometry
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.signals.kinds import Signal
@@ -29,7 +29,7 @@ from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    import pyarrow as pa
+    pass
 
 TABLE: Final = "visual_odometry"
 # COCO's classes that move, beside the vehicle file's labels of cars; their boxes are masked.
@@ -102,12 +102,6 @@ def with_visual_scale(vehicle: Vehicle) -> Vehicle:
     scale_sd = max(vehicle.odometry.scale_sd, HEIGHT_SD)
     odometry = vehicle.odometry.model_copy(update={"scale_sd": scale_sd})
     return vehicle.model_copy(update={"odometry": odometry})
-
-
-def visual_schema() -> pa.Schema:
-    """Return the schema of ``visual_odometry.parquet``."""
-    kinds = dict.fromkeys(VisualStep._fields, REAL) | {"is_standing": "bool"}
-    return schema_of(kinds | dict.fromkeys(("start_ns", "t_ns", "corners", "patches"), INT))
 
 
 @dataclass(frozen=True, slots=True)

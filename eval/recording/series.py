@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 import rerun as rr
 from numpy.typing import NDArray
 
-from crosscue.eval.runs.tables.log_time import LABELS
+from crosscue.eval.runs.tables.columns import LOG_TIME
 from crosscue.eval.scoring.truth import TrueRanges
 from crosscue.replay.colours import END, QUIET, START, TRUTH, Colour, of_feature
 from crosscue.replay.vehicle import cue_table
@@ -34,7 +34,7 @@ POSE: Final[Mapping[str, str]] = {
     "heading_sd": "s.d. deg",
     "ellipse": "Ellipse m",
 }
-NOT_IN_BELIEF: Final = (*NOT_FEATURES, *LABELS)
+NOT_IN_BELIEF: Final = (*NOT_FEATURES, *LOG_TIME)
 
 
 def log_pose_series(

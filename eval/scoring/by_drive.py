@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
+from crosscue.eval.runs.tables.columns import OF_SCORE, arrow_schema
+
 from .metric_values import MetricValue, metric_values
 
 if TYPE_CHECKING:
@@ -175,14 +177,5 @@ def by_drive_table(parts: Iterator[DriveMetric]) -> pa.Table:
     """Return the table ``by_drive.parquet``."""
     import pyarrow as pa
 
-    schema = pa.schema(
-        {
-            "log": pa.string(),
-            "metric": pa.string(),
-            "kind": pa.string(),
-            "total": pa.float64(),
-            "rows": pa.int64(),
-            "places": pa.list_(pa.string()),
-        }
-    )
+    schema = arrow_schema(OF_SCORE[BY_DRIVE])
     return pa.Table.from_pylist([one._asdict() for one in parts], schema)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from crosscue.eval.runs.tables.columns import OF_SCORE, arrow_schema
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_table, write_text
 
@@ -56,10 +57,7 @@ def _parts(one: RunScored) -> Iterator[DriveMetric]:
 
 
 def curve_table(judged: Sequence[DriveJudged]) -> pa.Table:
-    """Return probabilities and true distance, one row per step of each matched approach.
-
-    Columns: drive, approach (id in the truth), intersection, t_ns, distance_m, then features.
-    """
+    """Return probabilities and true distance, one row per step of each matched approach."""
     import pyarrow as pa
 
     curves = [
@@ -81,31 +79,10 @@ def curve_table(judged: Sequence[DriveJudged]) -> pa.Table:
 
 
 def approach_table(judged: Sequence[DriveJudged]) -> pa.Table:
-    """Return each approach of the truth with its result; unknown distances are null.
-
-    Columns: drive, approach (number in the run), truth (id in the truth), intersection, control,
-    conditions, present, detected_m, full_m, features_m, false_features and the two reasons why not.
-    """
+    """Return each approach of the truth with its result; unknown distances are null."""
     import pyarrow as pa
 
-    texts = pa.list_(pa.string())
-    schema = pa.schema(
-        {
-            "drive": pa.string(),
-            "approach": pa.int64(),
-            "truth": pa.int64(),
-            "intersection": pa.string(),
-            "control": pa.string(),
-            "conditions": texts,
-            "present": texts,
-            "detected_m": pa.float64(),
-            "full_m": pa.float64(),
-            "features_m": pa.map_(pa.string(), pa.float64()),
-            "false_features": texts,
-            "why_not_detected": pa.string(),
-            "why_not_full": pa.string(),
-        }
-    )
+    schema = arrow_schema(OF_SCORE[APPROACHES])
     results = [
         one for drive in judged if drive.approaches is not None for one in drive.approaches.results
     ]
@@ -128,11 +105,7 @@ def _known(distance_m: float | None) -> float | None:
 
 
 def cue_frame_table(judged: Sequence[DriveJudged]) -> pa.Table:
-    """Return each frame in which a cue was searched, with the truth about it.
-
-    Columns: drive, t_ns, cue, count, approach, distance_m, object, feature (1 true, 0 false,
-    null unknown), true_count (null unknown), visible.
-    """
+    """Return each frame in which a cue was searched, with the truth about it."""
     import pyarrow as pa
 
     rows = [cue for one in judged for cue in one.cues if len(cue.t_ns)]

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.runs.tables.log_time import LABELS, table_in_log_time
+from crosscue.eval.runs.tables.columns import LOG_TIME
+from crosscue.eval.runs.tables.log_time import table_in_log_time
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import UnreadableRunError
 from crosscue.replay.time.segments import Timeline
@@ -108,7 +109,7 @@ def _ranges(table: pa.Table, where: str) -> RangeRows:
 def _belief(table: pa.Table, where: str) -> BeliefRows:
     features: dict[str, Floats] = {}
     for name in table.column_names:
-        if name in (*NOT_FEATURES, *LABELS):
+        if name in (*NOT_FEATURES, *LOG_TIME):
             continue
         values = _numbers(table, name, where)
         # NaN compares false here; it is left out and counted later.

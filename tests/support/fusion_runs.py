@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from crosscue.datasets.truth.truth import Approach, Features, Truth, save
-from crosscue.eval.pipeline.scene.stage import scene_schemas
+from crosscue.eval.pipeline.scene.stage import scene_columns
 from crosscue.eval.runs.folder import RunFolder, create, write_manifest
-from crosscue.eval.runs.tables import measurements
+from crosscue.eval.runs.tables.columns import OF_RUN, arrow_schema
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.fusion.approaches import Approaches, Step
 from crosscue.fusion.evidence import FrameEvidence
@@ -53,10 +53,9 @@ def write_run(
     taken = list(evidence)
     steps = [loop(one) for one in taken]
     _write_steps(run, steps)
-    with TableSink(run, measurements.TABLE, measurements.measurement_schema()) as sink:
-        empty: dict[str, list[object]] = {
-            field.name: [None] * len(taken) for field in measurements.measurement_schema()
-        }
+    columns = OF_RUN["measurements"]
+    with TableSink(run, "measurements", arrow_schema(columns)) as sink:
+        empty: dict[str, list[object]] = {name: [None] * len(taken) for name in columns}
         sink.write(
             empty
             | {
@@ -85,7 +84,7 @@ def _write_steps(run: RunFolder, steps: list[Step]) -> None:
         if s.approach is not None
     ]
     for name, rows in (("cues", cues), ("range", ranges), ("belief", beliefs)):
-        schema = scene_schemas()[name]
+        schema = arrow_schema(scene_columns()[name])
         with TableSink(run, name, schema) as sink:
             if rows:
                 sink.write(dict(zip(schema.names, zip(*rows, strict=True), strict=True)))

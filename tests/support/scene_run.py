@@ -10,12 +10,11 @@ import numpy as np
 import pyarrow as pa
 
 from crosscue.detectors import rle
-from crosscue.eval.pipeline.detect import detect_schemas
 from crosscue.eval.runs.account import account, line
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import ClockRow
+from crosscue.eval.runs.tables.columns import OF_RUN, arrow_schema
 from crosscue.eval.runs.tables.labelled import with_labels
-from crosscue.eval.runs.tables.pose_tables import pose_schema
 from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.ledger import Ledger
@@ -83,7 +82,7 @@ def detections(frames: int = FRAMES) -> pa.Table:
                     "picture_height_px": SIZE[1],
                 }
             )
-    return pa.Table.from_pylist(rows, schema=detect_schemas()["detections"])
+    return pa.Table.from_pylist(rows, schema=arrow_schema(OF_RUN["detections"]))
 
 
 def road(frames: int = FRAMES) -> pa.Table:
@@ -103,7 +102,7 @@ def road(frames: int = FRAMES) -> pa.Table:
         }
         for frame in range(frames)
     ]
-    return pa.Table.from_pylist(rows, schema=detect_schemas()["road"])
+    return pa.Table.from_pylist(rows, schema=arrow_schema(OF_RUN["road"]))
 
 
 def frames_seen(frames: int = FRAMES) -> pa.Table:
@@ -113,12 +112,12 @@ def frames_seen(frames: int = FRAMES) -> pa.Table:
         {"frame": i, "t_ns": t, "camera": TOPIC, "width_px": SIZE[0], "height_px": SIZE[1]}
         for i, t in enumerate(times)
     ]
-    return pa.Table.from_pylist(rows, schema=detect_schemas()["frames"])
+    return pa.Table.from_pylist(rows, schema=arrow_schema(OF_RUN["frames"]))
 
 
 def poses(frames: int = FRAMES) -> pa.Table:
     """Poses of a drive straight to the east at 10 m/s."""
-    schema = pose_schema()
+    schema = arrow_schema(OF_RUN["pose"])
     rows = [
         {name: None if name == "landmark" else 1.0 for name in schema.names}
         | {"t_ns": at(frame), "x_m": float(frame), "y_m": 0.0, "heading_rad": 0.0, "cov_xy_m2": 0.0}

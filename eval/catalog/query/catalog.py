@@ -8,11 +8,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from crosscue.eval.runs.tables.columns import INDEXED, QUERIED
 from crosscue.replay.errors import UnreadableRunError, UsageError
 from crosscue.replay.remote.address import is_remote
 
 from . import database, parts
-from .columns import INDEXED, OWN, VIEWS
 from .index import Index, Runs, open_index
 from .local import LocalRuns
 from .remote import RemoteRuns
@@ -135,10 +135,10 @@ class Catalog:
 
         listed = [
             (table, name, column.kind, column.meaning)
-            for table, columns in {**INDEXED, **OWN}.items()
+            for table, columns in {**INDEXED, **QUERIED}.items()
             for name, column in columns.items()
         ]
-        further = sorted(self._names - {*INDEXED, *OWN})
+        further = sorted(self._names - {*INDEXED, *QUERIED})
         listed += [(table, "run, ...", "", f"{table}.parquet of the runs") for table in further]
         head = ("table", "column", "type", "meaning")
         columns = zip(*listed, strict=True)
@@ -166,7 +166,7 @@ class Catalog:
     @cached_property
     def _names(self) -> set[str]:
         files = {name for names in self._listed("tables") for name in names}
-        return {*INDEXED, *OWN, *parts.table_names(files)}
+        return {*INDEXED, *QUERIED, *parts.table_names(files)}
 
     def _parts(self, table: str) -> parts.RunsTable:
         file = parts.file_of(table)
@@ -184,10 +184,10 @@ class Catalog:
 
 def _views(table: str, found: parts.RunsTable) -> dict[str, Any]:
     """Return the data set and, if the table is computed, the SQL of its view, by name."""
-    if table not in VIEWS:
+    if table not in parts.VIEWS:
         return {table: found.dataset}
     base = f"{table}_of_runs"
-    return {base: found.dataset, table: VIEWS[table].format(table=base)}
+    return {base: found.dataset, table: parts.VIEWS[table].format(table=base)}
 
 
 def catalog(place: Path | str) -> Catalog:

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
+from crosscue.eval.runs.tables.columns import INDEXED, arrow_schema
 from crosscue.replay.errors import OutputError, UnreadableRunError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import spelled
 from crosscue.replay.remote.address import is_remote
 
-from .columns import INDEXED, arrow_schema
 from .local import CUT_SHORT, FoundRun
 from .records import RunRows, run_rows
 from .stored import StoredIndex, write_index

@@ -11,9 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from crosscue.eval.runs.tables.columns import QUERIED, RUN, arrow_schema
 from crosscue.replay.files import door
-
-from .columns import FILES, OWN, arrow_schema
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -22,8 +21,18 @@ if TYPE_CHECKING:
 
 WORKERS: Final = 8
 SCORE: Final = "score/"
-# Columns of a table without a readable file, whose own columns are unknown.
-ONLY_RUN: Final = {"run": OWN["cues"]["run"]}
+# Path of a table in a run, if it is not stored under its own name.
+FILES: Final[Mapping[str, str]] = {
+    "scores": "score/by_drive.parquet",
+    "cue_frames": "score/cue_frames.parquet",
+    "curves": "score/curves.parquet",
+}
+# SQL of the tables that are computed from a file.
+VIEWS: Final[Mapping[str, str]] = {
+    "scores": "select run, log, metric, kind, total, rows, places, case kind when 'sum' then total "
+    "when 'rms' then sqrt(total / nullif(rows, 0)) else total / nullif(rows, 0) end as value "
+    "from {table}",
+}
 
 
 def file_of(table: str) -> str:
@@ -64,7 +73,7 @@ class RunsTable:
         scan = ds.ParquetFragmentScanOptions(pre_buffer=True, page_checksum_verification=True)
         self._form: Final = ds.ParquetFileFormat(default_fragment_scan_options=scan)
         self._fragments: Final[dict[str, ds.Fragment]] = {}
-        schema = pa.schema([("run", pa.string())])
+        schema = arrow_schema(RUN)
         for run, fragment, found in _opened(runs, filesystem, self._form):
             try:
                 if isinstance(found, Exception):
@@ -74,7 +83,7 @@ class RunsTable:
                 self.left_out[run] = _why(runs[run], error)
                 continue
             self._fragments[run] = fragment
-        self._schema: Final = schema if self._fragments else arrow_schema(OWN.get(table, ONLY_RUN))
+        self._schema: Final = schema if self._fragments else arrow_schema(QUERIED.get(table, RUN))
 
     @property
     def dataset(self) -> ds.Dataset:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from crosscue.detectors.base import is_repeated
 from crosscue.detectors.cues.frame import CuePass
@@ -25,9 +25,10 @@ from crosscue.eval.runs.candidates import candidate_rows
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import ApproachRow, DetectManifest, SceneSummary
+from crosscue.eval.runs.tables.columns import OF_RUN, PROBABILITY, Columns
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.mobileye_tables import StoredMobileye
-from crosscue.eval.runs.tables.parquet import INT, REAL, TEXT, TableFolder, schema_of
+from crosscue.eval.runs.tables.parquet import TableFolder
 from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.eval.runs.tables.travelled import Odometer, odometer_of
 from crosscue.fusion.approaches import Approaches, RangeRow, Step
@@ -39,9 +40,6 @@ from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .roads import Roads, pitches_of
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 ROWS_HELD: Final = 8192
 # Min fraction of the time between two frames that odometry must cover to measure the distance.
@@ -428,8 +426,8 @@ def tables_of_scene(
     features, reasons = features_of(vehicle), gives_reasons(vehicle)
     with ExitStack() as stack:
         sinks = {
-            name: stack.enter_context(LabelledSink(run, name, schema, timeline, clock))
-            for name, schema in scene_schemas(features, gives_reasons=reasons).items()
+            name: stack.enter_context(LabelledSink(run, name, timeline, clock, columns))
+            for name, columns in scene_columns(features, gives_reasons=reasons).items()
         }
         tables = SceneTables(lambda name, rows: sinks[name].write(rows), features, reasons)
         yield tables
@@ -448,27 +446,10 @@ def gives_reasons(vehicle: Vehicle) -> bool:
 
 def scene_columns(
     features: Sequence[str] = FEATURES, *, gives_reasons: bool = False
-) -> dict[str, dict[str, str]]:
-    """Return the columns of the tables of the scene with their types, in the order of rows."""
-    step = {"t_ns": INT, "approach": INT}
-    return {
-        "cues": step | {"cue": TEXT, "count": INT},
-        "range": step
-        | {"reference": TEXT}
-        | dict.fromkeys(("range_m", "var_m2", "measured_m"), REAL),
-        "belief": step
-        | dict.fromkeys(features, REAL)
-        | {"established": "bool"}
-        | ({"not_believed": TEXT} if gives_reasons else {}),
-        "ranged_objects": {"t_ns": INT, "cue": TEXT, "object": INT, "facing": TEXT}
-        | {"reference": TEXT}
-        | dict.fromkeys(("range_m", "var_m2", "height_m", "x0", "y0", "x1", "y1"), REAL),
-    }
-
-
-def scene_schemas(
-    features: Sequence[str] = FEATURES, *, gives_reasons: bool = False
-) -> dict[str, pa.Schema]:
-    """Return the schemas of the tables that this stage writes."""
-    columns = scene_columns(features, gives_reasons=gives_reasons)
-    return {name: schema_of(found) for name, found in columns.items()}
+) -> dict[str, Columns]:
+    """Return the columns of the tables of the scene, in the order of rows."""
+    belief = OF_RUN["belief"]
+    last = ("established", *(("not_believed",) if gives_reasons else ()))
+    names = ("t_ns", "approach", *features, *last)
+    found = {name: OF_RUN[name] for name in ("cues", "range", "belief", "ranged_objects")}
+    return found | {"belief": {name: belief.get(name, PROBABILITY) for name in names}}

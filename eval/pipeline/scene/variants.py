@@ -9,10 +9,11 @@ from crosscue.eval.pipeline.scene.stage import (
     SceneTables,
     features_of,
     gives_reasons,
-    scene_schemas,
+    scene_columns,
 )
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.tables.columns import arrow_schema
 from crosscue.eval.runs.tables.labelled import with_labels
 from crosscue.replay.errors import RunError
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -42,7 +43,8 @@ def scene_tables(
         raise RunError(f"{run.path}: no detector ran on its camera; replay with detectors")
     settings = manifest.settings if vehicle is None else vehicle
     features, reasons = features_of(settings), gives_reasons(settings)
-    wanted = scene_schemas(features, gives_reasons=reasons)
+    columns = scene_columns(features, gives_reasons=reasons)
+    wanted = {name: arrow_schema(each) for name, each in columns.items()}
     parts: dict[str, list[pa.Table]] = {
         name: [schema.empty_table()] for name, schema in wanted.items()
     }

@@ -9,17 +9,11 @@ import numpy as np
 
 from crosscue.replay.time.segments import LogClock, Timeline
 
+from .columns import LOG_TIME, OF_RUN, Columns, arrow_schema
 from .parquet import TableFolder, TableSink, arrow_column
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-
-def labelled(schema: pa.Schema) -> pa.Schema:
-    """Return a table's schema with the two columns appended."""
-    import pyarrow as pa
-
-    return schema.append(pa.field("segment", pa.int32())).append(pa.field("log_t_ns", pa.int64()))
 
 
 def with_labels(table: pa.Table, timeline: Timeline, clock: LogClock) -> pa.Table:
@@ -36,10 +30,24 @@ class LabelledSink(TableSink):
     """A table of a run; each row's segment and original stamp are added by its ``t_ns``."""
 
     def __init__(
-        self, run: TableFolder, name: str, schema: pa.Schema, timeline: Timeline, clock: LogClock
+        self,
+        run: TableFolder,
+        name: str,
+        timeline: Timeline,
+        clock: LogClock,
+        columns: Columns | None = None,
     ) -> None:
-        """Create ``NAME.parquet``; ``clock`` is that of the log that the rows come from."""
-        super().__init__(run, name, labelled(schema))
+        """Create ``NAME.parquet``.
+
+        Args:
+            run: The run.
+            name: Name of the table.
+            timeline: The drive's time segments.
+            clock: Clock of the log that the rows come from.
+            columns: The table's columns, without the two, if they are not those of ``OF_RUN``.
+        """
+        own = OF_RUN[name] if columns is None else columns
+        super().__init__(run, name, arrow_schema({**own, **LOG_TIME}))
         self._timeline = timeline
         self._clock = clock
 

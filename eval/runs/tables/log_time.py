@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,6 @@ from crosscue.replay.time.segments import Cause, Timeline
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-# Columns that every table has in addition to its own.
-LABELS: Final = frozenset({"segment", "log_t_ns"})
 
 
 @dataclass(frozen=True, slots=True)

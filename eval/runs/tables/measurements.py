@@ -9,7 +9,7 @@ motion assumed between two time segments), ``heading`` (accepted headings), ``la
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -19,40 +19,10 @@ from crosscue.localization.landmarks.sighting import Sighting
 from crosscue.localization.odometry import Increments
 from crosscue.localization.pose_track import ACCEPTED, HeadingColumns
 
-if TYPE_CHECKING:
-    import pyarrow as pa
+from .columns import OF_RUN, REAL
 
 TABLE: Final = "measurements"
-NUMBERS: Final = (
-    "distance_m",
-    "turn_rad",
-    "distance_var_m2",
-    "turn_var_rad2",
-    "speed_mps",
-    "speed_var_m2ps2",
-    "heading_rad",
-    "heading_var_rad2",
-    "x_m",
-    "y_m",
-    "xx_m2",
-    "xy_m2",
-    "yy_m2",
-)
-
-
-def measurement_schema() -> pa.Schema:
-    """Return the schema of ``measurements.parquet``."""
-    import pyarrow as pa
-
-    return pa.schema(
-        [
-            ("kind", pa.dictionary(pa.int8(), pa.string())),
-            ("start_ns", pa.int64()),
-            ("t_ns", pa.int64()),
-            *((name, pa.float64()) for name in NUMBERS),
-            ("landmark", pa.string()),
-        ]
-    )
+NUMBERS: Final = tuple(name for name, one in OF_RUN[TABLE].items() if one.kind == REAL)
 
 
 def start_rows(belief: PoseBelief) -> dict[str, object]:
@@ -78,8 +48,7 @@ def start_rows(belief: PoseBelief) -> dict[str, object]:
 
 def odometry_rows(made: Increments) -> dict[str, object]:
     """Return increments of odometry as rows."""
-    names = NUMBERS[:6]
-    columns: dict[str, object] = {name: getattr(made, name) for name in names}
+    columns: dict[str, object] = {name: getattr(made, name) for name in NUMBERS[:6]}
     return _rows("odometry", made.stop_ns, columns | {"start_ns": made.start_ns})
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -30,20 +30,10 @@ from crosscue.replay.vehicle.mobileye_cues import Past
 from .labelled import LabelledSink
 from .parquet import TableFolder
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-
 TABLES: Final[Mapping[Signal, tuple[str, tuple[str, ...]]]] = {
     Signal.MOBILEYE_OBSTACLES: ("mobileye_obstacles", OBSTACLE_COLUMNS),
     Signal.MOBILEYE_LANES: ("mobileye_lanes", LANE_COLUMNS),
 }
-
-
-def mobileye_schema(signal: Signal) -> pa.Schema:
-    """Return the schema of one of the two tables."""
-    import pyarrow as pa
-
-    return pa.schema([("t_ns", pa.int64()), *((name, pa.float64()) for name in TABLES[signal][1])])
 
 
 class MobileyeSink:
@@ -52,8 +42,7 @@ class MobileyeSink:
     def __init__(self, run: TableFolder, timeline: Timeline, clock: LogClock) -> None:
         self._stack: Final = ExitStack()
         self._sinks: Final = {
-            signal: LabelledSink(run, name, mobileye_schema(signal), timeline, clock)
-            for signal, (name, _) in TABLES.items()
+            signal: LabelledSink(run, name, timeline, clock) for signal, (name, _) in TABLES.items()
         }
 
     def write(self, samples: Mapping[Signal, Samples]) -> None:

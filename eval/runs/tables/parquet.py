@@ -24,18 +24,6 @@ if TYPE_CHECKING:
 GROUP_ROWS: Final = 8192
 
 
-INT: Final = "int64"
-REAL: Final = "double"
-TEXT: Final = "string"
-
-
-def schema_of(columns: Mapping[str, str]) -> pa.Schema:
-    """Return the schema of a table, from its columns with Arrow's names of their types."""
-    import pyarrow as pa
-
-    return pa.schema([pa.field(name, kind) for name, kind in columns.items()])
-
-
 def arrow_column(values: Any, kind: pa.DataType) -> pa.Array:
     """Return values, None where one is missing, as a column of Arrow.
 

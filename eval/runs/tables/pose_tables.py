@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from crosscue.localization.pose_track import PoseColumns
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 COVARIANCES: Final = ("xx_m2", "xy_m2", "xh_mrad", "yy_m2", "yh_mrad", "hh_rad2")
 
@@ -37,28 +34,6 @@ class PoseTally:
         self.last_ns = int(poses.t_ns[-1])
         if self.first_ns is None:
             self.first_ns = int(poses.t_ns[0])
-
-
-def pose_schema() -> pa.Schema:
-    """Return the schema of ``pose.parquet``."""
-    import pyarrow as pa
-
-    numbers = [
-        "x_m",
-        "y_m",
-        "heading_rad",
-        "speed_mps",
-        *(f"cov_{name}" for name in COVARIANCES),
-        "major_axis_m",
-        "travelled_m",
-    ]
-    return pa.schema(
-        [
-            ("t_ns", pa.int64()),
-            *((name, pa.float64()) for name in numbers),
-            ("landmark", pa.string()),
-        ]
-    )
 
 
 def pose_rows(poses: PoseColumns, landmarks: Sequence[str | None]) -> dict[str, object]:

@@ -11,28 +11,11 @@ from crosscue.eval.runs.account import UNATTRIBUTED, LogAccount, TopicLine
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 
-from .labelled import labelled
+from .columns import LOG_TIME, OF_RUN, arrow_schema
 from .parquet import TableFolder, TableSink
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-
-def skipped_schema() -> pa.Schema:
-    """Return the schema of ``skipped.parquet``."""
-    import pyarrow as pa
-
-    return pa.schema(
-        [
-            ("t_ns", pa.int64()),
-            ("topic", pa.string()),
-            ("reason", pa.string()),
-            ("detail", pa.string()),
-            ("count", pa.int64()),
-            ("is_dropped", pa.bool_()),
-            ("log", pa.string()),
-        ]
-    )
 
 
 def _skipped_rows(ledger: Ledger) -> list[dict[str, Any]]:
@@ -58,7 +41,8 @@ def write_skipped(
     """
     rows = [row for ledger in ledgers for row in _skipped_rows(ledger)]
     earlier = [] if kept is None else kept.to_pylist()
-    with TableSink(run, "skipped", labelled(skipped_schema())) as sink:
+    names = OF_RUN["skipped"]
+    with TableSink(run, "skipped", arrow_schema({**names, **LOG_TIME})) as sink:
         for log in reading:
             for topic, account in log.topics.items():
                 # Rows of unknown topics are this stage's; others the earlier stage's if it has any.
@@ -68,7 +52,6 @@ def write_skipped(
                         break
                 mine += _in_bulk(mine, log.log, topic, account)
                 if mine:
-                    names = skipped_schema().names
                     times = [row["t_ns"] for row in mine]
                     numbers = [timeline.number_of_stamp(t_ns) for t_ns in times]
                     columns = {name: [row[name] for row in mine] for name in names}

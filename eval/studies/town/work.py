@@ -22,6 +22,7 @@ import numpy as np
 
 from crosscue.eval.batch.ray_jobs import connect_ray
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.tables.columns import REAL, SMALL, TEXT, Column, arrow_schema
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import DriveResult, Keys, drive_many, drive_one
@@ -39,6 +40,17 @@ if TYPE_CHECKING:
 CHUNK_DRIVES: Final = 100
 CHUNKS: Final = "chunks"
 DRIVES: Final = "drives"
+# Columns of ``drives.parquet``: the conditions of a drive, then its ``DriveResult``.
+CONDITIONS: Final = {
+    "case": Column(SMALL, "index of the case"),
+    "drive": Column(SMALL, "number of the drive in its case"),
+    "seed": Column("UBIGINT", "seed of the drive"),
+    "compass_2sigma_deg": Column(REAL, "two standard deviations of the compass"),
+    "strategy": Column(TEXT, "how the car chooses its way"),
+    "landmarks_per_km2": Column(REAL, "density of landmarks"),
+    "detection_rate": Column(REAL, "fraction of landmarks that are detected"),
+}
+RESULTS: Final = dict.fromkeys(DriveResult._fields, Column(REAL, "see DriveResult"))
 DriveMany = Callable[[TownDrive, Keys], Floats]
 
 
@@ -133,7 +145,7 @@ def run(
         else _on_ray(missing, workers, ray_address)
     )
     for chunk, rows in finished:
-        with TableSink(kept, chunk.name, _chunk_schema()) as sink:
+        with TableSink(kept, chunk.name, arrow_schema(RESULTS)) as sink:
             sink.write(dict(zip(DriveResult._fields, rows.T, strict=True)))
         done += 1
         yield done
@@ -146,7 +158,7 @@ def assemble(chunks: Sequence[DriveBatch], folder: Path) -> None:
         RunError: A chunk is missing or damaged.
     """
     kept, run_folder = RunFolder(folder / CHUNKS), RunFolder(folder)
-    with TableSink(run_folder, DRIVES, drives_schema()) as sink:
+    with TableSink(run_folder, DRIVES, arrow_schema({**CONDITIONS, **RESULTS})) as sink:
         for chunk in chunks:
             rows = _read(kept, chunk)
             if rows is None:
@@ -165,24 +177,6 @@ def split(table: pa.Table) -> Iterator[dict[str, Floats]]:
         yield {name: column[part] for name, column in columns.items()}
 
 
-def drives_schema() -> pa.Schema:
-    """Return the columns of ``drives.parquet``."""
-    import pyarrow as pa
-
-    return pa.schema(
-        [
-            ("case", pa.int32()),
-            ("drive", pa.int32()),
-            ("seed", pa.uint64()),
-            ("compass_2sigma_deg", pa.float64()),
-            ("strategy", pa.string()),
-            ("landmarks_per_km2", pa.float64()),
-            ("detection_rate", pa.float64()),
-            *_chunk_schema(),
-        ]
-    )
-
-
 def _with_conditions(chunk: DriveBatch, rows: dict[str, Floats]) -> dict[str, object]:
     n, settings = chunk.count, chunk.settings
     return {
@@ -195,12 +189,6 @@ def _with_conditions(chunk: DriveBatch, rows: dict[str, Floats]) -> dict[str, ob
         "detection_rate": [settings.sensors.detection_rate] * n,
         **rows,
     }
-
-
-def _chunk_schema() -> pa.Schema:
-    import pyarrow as pa
-
-    return pa.schema([(name, pa.float64()) for name in DriveResult._fields])
 
 
 @cache
