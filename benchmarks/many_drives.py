@@ -35,7 +35,7 @@ from crosscue.datasets.simulated.drive import DriveSettings, vehicle_text
 from crosscue.eval import cli
 from crosscue.eval.batch.jobs import Job, in_turn, run_many
 from crosscue.eval.batch.merge import gathered, merge_runs
-from crosscue.eval.batch.processes import Processes
+from crosscue.eval.batch.ray_jobs import Processes
 from crosscue.eval.runs.folder import RunFolder, clear, create, locked, open_run, write_manifest
 from crosscue.eval.runs.tables.parquet import TableSink
 

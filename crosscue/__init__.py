@@ -40,58 +40,6 @@ def _public() -> dict[str, str]:
 
 _MODULES: Final = _public()
 __all__ = [*_MODULES]
-# Present homes of former names of this module.
-_FORMER: Final = """
-crosscue.check: check_card check_seal check_truth check_vehicle
-crosscue.datasets.simulate: Approaches
-crosscue.datasets.truth.truth: truth_schema
-crosscue.detectors.base: nothing_found
-crosscue.detectors.catalog.cards: CardDraft
-crosscue.detectors.catalog.known_models: FetchedModel Model Models
-crosscue.detectors.result_cache: default_cache
-crosscue.detectors.settings: Settings identity_of settings_of
-crosscue.detectors.signs.templates: draw_sign
-crosscue.errors: AccountError AnnotationError CanDatabaseError EmptyResultError
-  LogFormatError LogTooLargeError MissingTopicError OutputError PluginWarning RunError SchemaError
-  StudyFileError UnknownFormatError UnreadableRunError VehicleError WorkerError
-crosscue.eval.batch.journal: BatchStatus
-crosscue.eval.batch.drive_list: DriveList
-crosscue.eval.batch.merge: MergedRuns
-crosscue.eval.catalog.compare: Comparison
-crosscue.eval.catalog.decoded_logs: Decoded
-crosscue.eval.catalog.history: History
-crosscue.eval.catalog.query.catalog: Catalog
-crosscue.eval.check: Checks
-crosscue.eval.drives.demo: Demo KnownDrive fetch_drive
-crosscue.eval.drives.detector_score: DetectorScore
-crosscue.eval.drives.many: ReplayedDrives find_drives
-crosscue.eval.drives.score: ScoredRun
-crosscue.eval.drives.score_runs: ScoredRuns
-crosscue.eval.drives.tracking: MlflowSink open_mlflow
-crosscue.eval.failures.browse: Site
-crosscue.eval.failures.imported_truth: ImportedLabels ImportedTruth
-crosscue.eval.failures.labels: ExportedLabels
-crosscue.eval.failures.record: Failure
-crosscue.eval.failures.search: Failures
-crosscue.eval.fleet.tags: TaggedRuns
-crosscue.eval.logs.convert: Converted
-crosscue.eval.logs.log: CameraFrame LogTopic Signals Topics UnopenedLog
-crosscue.eval.logs.seals: SealCheck Sealed Seals
-crosscue.eval.logs.summary: DriveSummary
-crosscue.eval.pipeline.run: run_schema
-crosscue.eval.studies.intersections.settings: IntersectionStudy
-crosscue.eval.studies.layouts.settings: LayoutStudy
-crosscue.eval.studies.town.settings: FieldStudy LandmarkStudy RangeStudy
-crosscue.eval.training.mask_rcnn: MaskRcnnTrainingSettings Measuring
-crosscue.eval.training.road: RoadTrainingSettings
-crosscue.import_truth: import_labels
-"""
-
-
-def _former_names() -> dict[str, str]:
-    """Return the present home of each former name."""
-    entries = re.findall(r"^(\S+):((?:\s+\w+\b(?!\.|:))+)", _FORMER, re.MULTILINE)
-    return {name: home for home, names in entries for name in names.split()}
 
 
 def __getattr__(name: str) -> object:
@@ -103,9 +51,7 @@ def __getattr__(name: str) -> object:
         module = import_module(f"crosscue.{name}" if is_module else _MODULES[name])
         found = module if is_module else getattr(module, name)
     else:
-        home = _former_names().get(name)
-        hint = "" if home is None else f"; see {home}"
-        raise AttributeError(f"module 'crosscue' has no attribute {name!r}{hint}")
+        raise AttributeError(f"module 'crosscue' has no attribute {name!r}")
     globals()[name] = found
     return found
 

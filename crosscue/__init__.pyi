@@ -81,5 +81,3 @@ from crosscue.replay.vehicle.vehicle import Vehicle as Vehicle
 
 __all__: list[str]
 __version__: str
-
-def _former_names() -> dict[str, str]: ...

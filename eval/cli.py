@@ -101,14 +101,6 @@ FRONT: Final = {
     "look": ("view", "query"),
 }
 
-# Former commands, and what replaces them.
-MOVED: Final = {
-    "vehicle check": "check V.toml LOG",
-    "truth check": "check T.json LOG",
-    "model check": "check MODEL",
-    "seal --check": "check LOG.seal",
-}
-
 EXIT_STATUS: Final = """\
 exit status:
   0  all done
@@ -235,10 +227,6 @@ def run(argv: Sequence[str]) -> int:
     if argv[0] == "--version":
         print(f"crosscue {installed('crosscue')}")
         return 0
-    for former, now in MOVED.items():
-        if former.split() == list(argv[:2]):
-            print(f"crosscue: {former}: is now 'crosscue {now}'", file=sys.stderr)
-            return 2
     name = _command_of(argv)
     if name is None:
         return _unknown(argv)

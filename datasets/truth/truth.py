@@ -7,11 +7,11 @@ section is optional.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Protocol, cast
+from typing import Annotated, Any, Final, Literal, TypeAlias, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -167,12 +167,8 @@ class Truth(TruthSection):
     picture."""
 
 
-class Writer(Protocol):
-    """Signature of a data set's truth function."""
-
-    def __call__(self, path: Path, folder: Path) -> Path:
-        """Write ``truth.json`` for the data set at ``path`` to ``folder``, and return its path."""
-        ...
+# Writes ``truth.json`` for the data set at a path to a folder, and returns its path.
+Writer: TypeAlias = Callable[[Path, Path], Path]
 
 
 def write_carried(format_name: str, path: Path, folder: Path) -> Path:

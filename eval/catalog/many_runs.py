@@ -4,27 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 from crosscue.eval.scoring.by_drive import DriveMetric, no_longer_scored
 from crosscue.replay.errors import RunError, UnreadableRunError, UsageError
 
 from .compare import Comparison, Tolerance, allowed_by, is_whole_run, open_scored, run_contributions
 from .paired import compare_drives
-
-if TYPE_CHECKING:
-    import pyarrow as pa
+from .query.catalog import Catalog
 
 # Each drive's contribution to the metrics (None if not scored); True if no rows were dropped.
 Scored: TypeAlias = tuple[list[DriveMetric] | None, bool]
-
-
-class Queryable(Protocol):
-    """A catalog of runs."""
-
-    def query(self, sql: str) -> pa.Table:
-        """Return the rows that a query selects."""
-        ...
 
 
 class _Side(NamedTuple):
@@ -56,7 +46,7 @@ def read_scored(path: Path | str) -> Scored:
     return run_contributions(run), is_whole_run(run)
 
 
-def score_reader(catalog: Queryable) -> Callable[[Path | str], Scored]:
+def score_reader(catalog: Catalog) -> Callable[[Path | str], Scored]:
     """Return a function from a run's name in a catalog, local or on a store, to its score."""
     outcomes = catalog.query("select run, outcome from runs").to_pydict()
     is_whole = {run: outcome == "whole" for run, outcome in zip(*outcomes.values(), strict=True)}

@@ -292,7 +292,12 @@ def score_runs(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> S
     sink = None if settings.mlflow is None else open_mlflow(settings.mlflow, settings.experiment)
     found = _scored(runs, settings)
     if sink is not None:
-        sink.log(found)
+        for one in found.runs:
+            sink.log_run(one)
+        if found.is_many:
+            name = "all" if found.report is None else found.report.parent.name
+            tags = {"crosscue.runs": str(len(found.runs))}
+            sink.log(name, found.metrics, tags, found.report)
     return found
 
 
@@ -321,10 +326,7 @@ def _scored(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> Scor
     if is_many:
         # Between the headlines of the runs and the scores of all.
         emit("")
-    together = _pool if is_many else _one
-    found = together(
-        scored, failed, work.settings, folder, settings.has_attribution, settings.has_figures
-    )
+    found = _together(scored, failed, settings, work.settings)
     if not bounds:
         return found
     tree = found.metrics
@@ -335,44 +337,28 @@ def _scored(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> Scor
     return replace(found, gates=results)
 
 
-def _one(
+def _together(
     runs: Sequence[ScoredRun],
     failed: Mapping[Path, CrosscueError],
-    settings: ScoreSettings,
-    output: Path | None,
-    has_attribution: bool,
-    has_figures: bool,
+    settings: ScoringSettings,
+    judged_by: ScoreSettings,
 ) -> ScoredRuns:
-    """Return the scores of one run, with the attribution added to its files."""
-    (run,) = runs
-    one, metrics, report = run.one, run.metrics, run.report
-    scores = pooled_scores([one], settings)
-    worth = _attribution([one], metrics, settings) if has_attribution else {}
-    if worth:
-        with locked(one.run):
-            write_files(one.run.file(FOLDER), [one], scores, metrics, has_figures=has_figures)
-    if output is not None:
-        report = write_files(output, [one], scores, metrics, has_figures=has_figures)
-    return ScoredRuns(tuple(runs), failed, metrics, scores, (), worth, report)
-
-
-def _pool(
-    runs: Sequence[ScoredRun],
-    failed: Mapping[Path, CrosscueError],
-    settings: ScoreSettings,
-    output: Path | None,
-    has_attribution: bool,
-    has_figures: bool,
-) -> ScoredRuns:
-    """Return the scores of all runs together, written to ``output`` if it is not None."""
+    """Return the scores of all runs, with the attribution of a single run added to its files."""
     ones = [run.one for run in runs]
-    scores = pooled_scores(ones, settings)
-    tree = metrics_of(ones, scores)
-    tree["coverage"]["failed"] = {str(path): str(error) for path, error in failed.items()}
-    worth = _attribution(ones, tree, settings) if has_attribution else {}
-    report = None
-    if output is not None:
-        report = write_files(output, ones, scores, tree, has_figures=has_figures)
+    scores = pooled_scores(ones, judged_by)
+    is_many = len(runs) + len(failed) > 1
+    tree = metrics_of(ones, scores) if is_many else runs[0].metrics
+    if is_many:
+        tree["coverage"]["failed"] = {str(path): str(error) for path, error in failed.items()}
+    worth = _attribution(ones, tree, judged_by) if settings.has_attribution else {}
+    report = None if is_many else runs[0].report
+    if worth and not is_many:
+        with locked(ones[0].run):
+            place = ones[0].run.file(FOLDER)
+            write_files(place, ones, scores, tree, has_figures=settings.has_figures)
+    if settings.output is not None:
+        folder = Path(settings.output)
+        report = write_files(folder, ones, scores, tree, has_figures=settings.has_figures)
     return ScoredRuns(tuple(runs), failed, tree, scores, (), worth, report)
 
 

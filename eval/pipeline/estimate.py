@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
 from crosscue.eval.pipeline.scene.looked_for import detector_notices
@@ -33,7 +33,6 @@ from crosscue.eval.runs.tables import measurements
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.mobileye_tables import MobileyeSink
 from crosscue.eval.runs.tables.parquet import TableSink
-from crosscue.eval.runs.tables.pose_tables import PoseTally, pose_rows
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.localization.pose_track import PoseColumns
@@ -65,6 +64,8 @@ from .visual import visual_source, with_visual_scale
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+COVARIANCES: Final = ("xx_m2", "xy_m2", "xh_mrad", "yy_m2", "yh_mrad", "hh_rad2")
 
 
 @dataclass(frozen=True, slots=True)
@@ -392,3 +393,42 @@ def _no_scene(found: DetectManifest | None, drive: Drive) -> list[str]:
     if not any(role_of(topic) is Role.CAMERA for _, topic in drive.topics):
         return ["no camera in the logs, so no cue and no belief"]
     return ["no detector ran on the camera, so no cue and no belief; name some"]
+
+
+@dataclass(slots=True)
+class PoseTally:
+    """Running summary of all poses of a run."""
+
+    rows: int = 0
+    travelled_m: float = 0.0
+    major_axis_m: float = float("nan")
+    first_ns: int | None = None
+    last_ns: int = 0
+
+    @property
+    def seconds(self) -> float:
+        """Time from the first row to the last."""
+        return 0.0 if self.first_ns is None else (self.last_ns - self.first_ns) * 1e-9
+
+    def add(self, poses: PoseColumns) -> None:
+        """Add a non-empty batch of poses."""
+        self.rows += len(poses)
+        self.travelled_m = float(poses.travelled_m[-1])
+        self.major_axis_m = float(poses.major_axis_m[-1])
+        self.last_ns = int(poses.t_ns[-1])
+        if self.first_ns is None:
+            self.first_ns = int(poses.t_ns[0])
+
+
+def pose_rows(poses: PoseColumns, landmarks: Sequence[str | None]) -> dict[str, object]:
+    """Return rows of ``pose.parquet``, with the landmark that corrected each pose."""
+    rows: dict[str, object] = {
+        "t_ns": poses.t_ns,
+        "x_m": poses.x_m,
+        "y_m": poses.y_m,
+        "heading_rad": poses.heading_rad,
+        "speed_mps": poses.speed_mps,
+    }
+    rows |= {f"cov_{name}": poses.cov_xyh[:, i] for i, name in enumerate(COVARIANCES)}
+    rows |= {"major_axis_m": poses.major_axis_m, "travelled_m": poses.travelled_m}
+    return rows | {"landmark": list(landmarks)}

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Final, Protocol
+from typing import Final, TypeAlias
 
 from pydantic import Field
 
@@ -136,12 +136,8 @@ class SummedAccount(Record):
         yield from _named("scoring", self.scoring)
 
 
-class HasLines(Protocol):
-    """Any of the accounts."""
-
-    def lines(self) -> Iterator[tuple[str, str, Counts]]:
-        """Stage, name and counts of everything, in order."""
-        ...
+# Any of the accounts.
+HasLines: TypeAlias = Account | SummedAccount
 
 
 def _named(stage: str, part: Mapping[str, Counts]) -> Iterator[tuple[str, str, Counts]]:

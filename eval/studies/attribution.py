@@ -7,9 +7,9 @@ approach by approach, so their intervals are those of paired differences.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -41,12 +41,8 @@ PASSED_OVER: Final = frozenset(
 )
 
 
-class EstimateWithout(Protocol):
-    """Function that estimates a drive again as if some cues had not been searched."""
-
-    def __call__(self, cues: frozenset[str], /) -> RunTables:
-        """Return the run's tables without these cues."""
-        ...
+# Estimates a drive again as if some cues had not been searched.
+EstimateWithout: TypeAlias = Callable[[frozenset[str]], RunTables]
 
 
 class AttributedDrive(NamedTuple):

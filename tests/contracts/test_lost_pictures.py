@@ -69,7 +69,7 @@ LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
     },
     "eval/vehicle/check.py": {"check": "check {log} {car} -o {out}.html"},
     "eval/recording/camera.py": {"view": "view {run} -o {out}.rrd"},
-    "eval/failures/export.py": {"export": "export {failures} -o {out}"},
+    "eval/failures/labels.py": {"export": "export {failures} -o {out}"},
     "eval/report/frame_pictures.py": {"browse": "browse {failures} -o {out}"},
 }
 # Reasons why other files have no command in the table above.

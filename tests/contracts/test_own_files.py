@@ -188,7 +188,7 @@ PAST_THE_DOOR: Final[dict[str, str]] = {
     "detectors/training/loop.py": PACKAGE,
     "eval/catalog/query/records.py": HANDLE,
     "eval/catalog/query/remote.py": "a file of a remote store",
-    "eval/catalog/query/stored.py": "a table in memory",
+    "eval/catalog/query/index.py": "a table in memory",
     "eval/check.py": NAMED,
     "eval/cli.py": PACKAGE,
     "eval/failures/record.py": NEW,

@@ -54,9 +54,8 @@ class Check:
                     self.known[alias.asname or "crosscue"] = crosscue
             return
         if isinstance(node, ast.ImportFrom):
-            homes = crosscue._former_names()
-            # A record or a helper that the reference describes under its module.
-            if all(homes.get(alias.name) == node.module for alias in node.names):
+            # A record or a helper that is documented in its module.
+            if (node.module or "").startswith("crosscue.") and node.module not in PUBLIC:
                 home = import_module(node.module or "")
                 self.known |= {one.name: getattr(home, one.name) for one in node.names}
                 return

@@ -1,24 +1,32 @@
-"""Catalog of all runs below a folder or URL, queried by SQL."""
+"""Catalog of all runs below a folder or URL, queried by SQL.
+
+Arrow reads only the needed columns and row groups and verifies page checksums. The run is a
+partition column with one value per file, so the files of other runs are not opened.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from crosscue.eval.runs.tables.columns import INDEXED, QUERIED
+from crosscue.eval.runs.tables.columns import INDEXED, QUERIED, RUN, arrow_schema
 from crosscue.replay.errors import UnreadableRunError, UsageError
+from crosscue.replay.files import door
 from crosscue.replay.remote.address import is_remote
 
-from . import database, parts
+from . import database
 from .index import Index, Runs, open_index
 from .local import LocalRuns
 from .remote import RemoteRuns
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    import pyarrow.dataset as ds
+    import pyarrow.fs
 
 _WORD: Final = re.compile(r"\w+")
 _SEVERAL: Final = """
@@ -29,6 +37,21 @@ select list(run) as examples from (
 group by identity having count(*) > 1 order by min(run)
 """
 _OF_CONDITION: Final = "select run from runs where (\n{}\n) order by run"
+
+WORKERS: Final = 8
+SCORE: Final = "score/"
+# Path of a table in a run, if it is not stored under its own name.
+FILES: Final[Mapping[str, str]] = {
+    "scores": "score/by_drive.parquet",
+    "cue_frames": "score/cue_frames.parquet",
+    "curves": "score/curves.parquet",
+}
+# SQL of the tables that are computed from a file.
+VIEWS: Final[Mapping[str, str]] = {
+    "scores": "select run, log, metric, kind, total, rows, places, case kind when 'sum' then total "
+    "when 'rms' then sqrt(total / nullif(rows, 0)) else total / nullif(rows, 0) end as value "
+    "from {table}",
+}
 
 
 class Catalog:
@@ -166,28 +189,28 @@ class Catalog:
     @cached_property
     def _names(self) -> set[str]:
         files = {name for names in self._listed("tables") for name in names}
-        return {*INDEXED, *QUERIED, *parts.table_names(files)}
+        return {*INDEXED, *QUERIED, *table_names(files)}
 
-    def _parts(self, table: str) -> parts.RunsTable:
-        file = parts.file_of(table)
+    def _parts(self, table: str) -> RunsTable:
+        file = file_of(table)
         places = {
             run: self._places.place(run, file)
             for run, files in zip(self._listed("run"), self._listed("tables"), strict=True)
             if file in files
         }
-        return parts.RunsTable(table, places, self._places.filesystem)
+        return RunsTable(table, places, self._places.filesystem)
 
     def __repr__(self) -> str:
         counts = f"{len(self._listed('run'))} runs, {len(self.left_out)} left out"
         return f"{self._places.name}: {counts}; tables: {', '.join(sorted(self._names))}"
 
 
-def _views(table: str, found: parts.RunsTable) -> dict[str, Any]:
+def _views(table: str, found: RunsTable) -> dict[str, Any]:
     """Return the data set and, if the table is computed, the SQL of its view, by name."""
-    if table not in parts.VIEWS:
+    if table not in VIEWS:
         return {table: found.dataset}
     base = f"{table}_of_runs"
-    return {base: found.dataset, table: parts.VIEWS[table].format(table=base)}
+    return {base: found.dataset, table: VIEWS[table].format(table=base)}
 
 
 def catalog(place: Path | str) -> Catalog:
@@ -208,3 +231,111 @@ def catalog(place: Path | str) -> Catalog:
             raise UnreadableRunError(f"{folder}: not a folder; expected a folder of runs")
         places = LocalRuns(folder)
     return Catalog(places, open_index(places))
+
+
+def file_of(table: str) -> str:
+    """Return the path of a table in a run."""
+    return FILES.get(table, f"{table}.parquet")
+
+
+def table_names(files: Iterable[str]) -> set[str]:
+    """Return the names of the tables that these files contain."""
+    inside = {name: table for table, name in FILES.items()}
+    plain = {name.removesuffix(".parquet") for name in files if not name.startswith(SCORE)}
+    return plain | {inside[name] for name in files if name in inside}
+
+
+class RunsTable:
+    """One table over many runs.
+
+    Attributes:
+        left_out: Reason why a run's file could not be read, by run.
+    """
+
+    def __init__(
+        self, table: str, runs: Mapping[str, str], filesystem: pyarrow.fs.FileSystem
+    ) -> None:
+        """Read the schema of every file.
+
+        Args:
+            table: Name of the table.
+            runs: Path of each run's file in the file system, by run.
+            filesystem: File system of the runs.
+        """
+        import pyarrow as pa
+        import pyarrow.dataset as ds
+
+        self.left_out: Final[dict[str, str]] = {}
+        self._places: Final = runs
+        self._filesystem: Final = filesystem
+        scan = ds.ParquetFragmentScanOptions(pre_buffer=True, page_checksum_verification=True)
+        self._form: Final = ds.ParquetFileFormat(default_fragment_scan_options=scan)
+        self._fragments: Final[dict[str, ds.Fragment]] = {}
+        schema = arrow_schema(RUN)
+        for run, fragment, found in _opened(runs, filesystem, self._form):
+            try:
+                if isinstance(found, Exception):
+                    raise found
+                schema = pa.unify_schemas([schema, found], promote_options="permissive")
+            except (OSError, pa.ArrowException) as error:
+                self.left_out[run] = _why(runs[run], error)
+                continue
+            self._fragments[run] = fragment
+        self._schema: Final = schema if self._fragments else arrow_schema(QUERIED.get(table, RUN))
+
+    @property
+    def dataset(self) -> ds.Dataset:
+        """Rows of all runs whose file can be read."""
+        import pyarrow.dataset as ds
+
+        fragments = list(self._fragments.values())
+        return ds.FileSystemDataset(fragments, self._schema, self._form, self._filesystem)
+
+    def drop_damaged(self) -> int:
+        """Read every file completely, leave out unreadable ones, and return their number."""
+        import pyarrow as pa
+
+        damaged = {}
+        for run, fragment in self._fragments.items():
+            try:
+                for _ in fragment.to_batches():
+                    pass
+            except (OSError, pa.ArrowException) as error:
+                damaged[run] = _why(self._places[run], error)
+        for run in damaged:
+            del self._fragments[run]
+        self.left_out.update(damaged)
+        return len(damaged)
+
+
+def _opened(
+    runs: Mapping[str, str], filesystem: pyarrow.fs.FileSystem, form: ds.ParquetFileFormat
+) -> Iterator[tuple[str, ds.Fragment, pa.Schema | Exception]]:
+    import pyarrow as pa
+    import pyarrow.dataset as ds
+
+    def schema_of(fragment: ds.Fragment) -> pa.Schema | Exception:
+        try:
+            return fragment.physical_schema.remove_metadata()
+        except (OSError, pa.ArrowException) as error:
+            return error
+
+    def fragment_of(run: str, path: str) -> ds.Fragment:
+        is_run = ds.field("run") == run
+        try:
+            return form.make_fragment(path, filesystem, partition_expression=is_run)
+        except UnicodeEncodeError:
+            # Arrow's file systems refuse a name that is not UTF-8. This file stays open.
+            file = door.arrow_file(Path(path))
+            return form.make_fragment(file, partition_expression=is_run)
+
+    fragments = [fragment_of(run, path) for run, path in runs.items()]
+    with ThreadPoolExecutor(WORKERS) as pool:
+        yield from zip(runs, fragments, pool.map(schema_of, fragments), strict=True)
+
+
+def _why(path: str, error: Exception) -> str:
+    name = path.rpartition("/")[2]
+    if isinstance(error, FileNotFoundError):
+        return f"{name}: deleted; open the catalog again"
+    return f"{name}: damaged or of other types ({' '.join(str(error).split())[:200]}); replay again"

@@ -3,30 +3,35 @@
 The index is one file below the folder of the catalog, or in the cache if that folder is read-only.
 It records a stamp for each run. Only runs whose stamp changed are read again, and rows of deleted
 runs are removed.
+
+The index is only a cache: if it is damaged, the runs are read again. Its members are stored without
+further compression, and the checksums of zip reveal damage.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import os
-from collections.abc import Callable, Iterator, Mapping
+import zipfile
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from crosscue.eval.runs.tables.columns import INDEXED, arrow_schema
-from crosscue.replay.errors import OutputError, UnreadableRunError
+from crosscue.replay.errors import OutputError, UnreadableRunError, one_line
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import spelled
+from crosscue.replay.files.whole_file import write_bytes
 from crosscue.replay.remote.address import is_remote
 
-from .local import CUT_SHORT, FoundRun
+from .local import CUT_SHORT, FoundRun, LocalRuns
 from .records import RunRows, run_rows
-from .stored import StoredIndex, write_index
+from .remote import RemoteRuns
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    import pyarrow.fs
 
 # Name of the folder of the index.
 NAME: Final = ".catalog"
@@ -38,44 +43,10 @@ KEPT: Final = ("runs", "approaches", "dropped")
 # Version of the index; it changes with the list of columns.
 _MARK: Final = hashlib.sha256(repr((1, INDEXED)).encode()).hexdigest()
 
-
-class Runs(Protocol):
-    """Storage of runs, such as ``local.LocalRuns``."""
-
-    @property
-    def name(self) -> str:
-        """Name used in messages."""
-        ...
-
-    @property
-    def home(self) -> Path | None:
-        """Folder to which an index can be written, or None."""
-        ...
-
-    @property
-    def filesystem(self) -> pyarrow.fs.FileSystem:
-        """Arrow's view of the storage."""
-        ...
-
-    def find(self) -> Iterator[FoundRun]:
-        """Yield every run folder."""
-        ...
-
-    def files(self, run: str) -> list[str]:
-        """Return the names of a run's tables, then of its score's tables, tags and failure log."""
-        ...
-
-    def read(self, run: str, file: str) -> bytes:
-        """Return the content of one of a run's files."""
-        ...
-
-    def place(self, run: str, file: str) -> str:
-        """Return the path of a file in ``filesystem``."""
-        ...
-
-    def path(self, run: str) -> Path:
-        """Return the folder of a run."""
-        ...
+_STAMP: Final = ("stamp_0", "stamp_1", "stamp_2", "stamp_3")
+FORMAT: Final = "format"
+# Storage of runs.
+Runs: TypeAlias = LocalRuns | RemoteRuns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,9 +139,6 @@ def _read_index(path: Path | None) -> _Earlier:
     return _Earlier(dict(zip(named, zip(*stamps, strict=True), strict=True)), left_out, tables)
 
 
-_STAMP: Final = ("stamp_0", "stamp_1", "stamp_2", "stamp_3")
-
-
 def _entries(complete: Mapping[str, FoundRun], unreadable: Mapping[str, str]) -> pa.Table:
     import pyarrow as pa
 
@@ -227,3 +195,59 @@ def _index(tables: Mapping[str, Any], left_out: Mapping[str, str], notice: str) 
     schema = arrow_schema(INDEXED["left_out"])
     listed = pa.table([[*left_out.keys()], [*left_out.values()]], schema=schema)
     return Index({**tables, "left_out": listed}, left_out, notice)
+
+
+class StoredIndex:
+    """An index in memory; its tables are opened when they are used."""
+
+    def __init__(self, content: bytes, mark: str) -> None:
+        """Check the version.
+
+        Args:
+            content: Content of the file.
+            mark: Version that this crosscue writes.
+
+        Raises:
+            ValueError: The file is damaged or of another version.
+        """
+        try:
+            self._archive: Final = zipfile.ZipFile(io.BytesIO(content))
+            written = self._archive.read(FORMAT)
+        except (zipfile.BadZipFile, KeyError, OSError) as error:
+            raise ValueError(f"damaged ({one_line(error)})") from None
+        if written != mark.encode():
+            raise ValueError("of another version")
+
+    def table(self, name: str) -> Any:
+        """Return one of its tables as a data set, which decodes only the columns that are used.
+
+        Raises:
+            ValueError: The table is damaged.
+        """
+        import pyarrow as pa
+        import pyarrow.dataset as ds
+
+        form = ds.ParquetFileFormat()
+        try:
+            fragment = form.make_fragment(pa.py_buffer(self._archive.read(name)))
+            return ds.FileSystemDataset([fragment], fragment.physical_schema, form)
+        except (zipfile.BadZipFile, KeyError, OSError, pa.ArrowException) as error:
+            raise ValueError(f"damaged ({one_line(error)})") from None
+
+
+def write_index(path: Path, mark: str, tables: Mapping[str, pa.Table]) -> None:
+    """Write an index atomically.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    import pyarrow.parquet as pq
+
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.writestr(FORMAT, mark)
+        for name, table in tables.items():
+            member = io.BytesIO()
+            pq.write_table(table, member, compression="zstd")
+            archive.writestr(name, member.getvalue())
+    write_bytes(path, content.getvalue())

@@ -6,11 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.eval.runs.tables.travelled import Odometer
 from crosscue.eval.scoring.columns import AMBIGUOUS, RangeRows, RunTables
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.places import cluster_numbers
@@ -92,23 +93,6 @@ class RangeScore:
     by_control: dict[str, RangeBin]
 
 
-class _Way(Protocol):
-    @property
-    def distance_m(self) -> float: ...
-    @property
-    def var_m2(self) -> float: ...
-    @property
-    def covered_ns(self) -> int: ...
-
-
-class MonotonicOdometer(Protocol):
-    """Odometer that is read at non-decreasing times."""
-
-    def until(self, t_ns: int, /) -> _Way:
-        """Return the distance travelled since the last call."""
-        ...
-
-
 def sds_off(judged: RangeJudged) -> NDArray[np.float64]:
     """Return absolute errors in standard deviations, shape (N,)."""
     return np.asarray(np.abs(judged.error_m) / np.sqrt(judged.var_m2), np.float64)
@@ -155,7 +139,7 @@ def judge_range(tables: RunTables, truth: DriveTruth) -> list[RangeJudged]:
 
 
 def score_smoothed(
-    tables: RunTables, truth: DriveTruth, odometer: MonotonicOdometer
+    tables: RunTables, truth: DriveTruth, odometer: Odometer
 ) -> dict[str, FilterAndSmoother]:
     """Return errors of the range filter and of its smoother, by reference."""
     if tables.ranges is None:
@@ -171,7 +155,7 @@ def score_smoothed(
     }
 
 
-def smoothed_rows(rows: RangeRows, odometer: MonotonicOdometer) -> RangeRows:
+def smoothed_rows(rows: RangeRows, odometer: Odometer) -> RangeRows:
     """Return the rows smoothed backwards with the later measurements.
 
     Smoothing stops where odometry is missing or a range restarted.

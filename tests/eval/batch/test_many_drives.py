@@ -19,7 +19,7 @@ from crosscue.eval.batch.jobs import (
     run_many,
     state_of,
 )
-from crosscue.eval.batch.processes import Processes
+from crosscue.eval.batch.ray_jobs import Processes
 from crosscue.replay.losses import losses_heard
 from support.drive_work import letters, write_jobs
 from support.trees import tree
@@ -130,7 +130,7 @@ from collections.abc import Callable
 from pathlib import Path
 from crosscue.eval.cli import _guarded
 from crosscue.eval.batch.jobs import run_many
-from crosscue.eval.batch.processes import Processes
+from crosscue.eval.batch.ray_jobs import Processes
 from support.drive_work import letters, write_jobs
 import argparse
 

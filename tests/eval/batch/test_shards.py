@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crosscue.eval.batch.shards import Shard, read_shard
+from crosscue.eval.batch.drive_list import Shard, read_shard
 from crosscue.replay.errors import UsageError
 
 IDENTITIES = st.sets(st.text("0123456789abcdef", min_size=8, max_size=8), max_size=40)

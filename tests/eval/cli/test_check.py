@@ -139,12 +139,3 @@ def test_setting_that_applies_to_no_file_is_refused(
     Path("car.toml").write_text(CAR)
 
     assert message in refusal(2, "check", *line.split())
-
-
-@pytest.mark.parametrize("former", cli.MOVED)
-def test_former_command_names_the_one_that_replaces_it(
-    former: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run([*former.split(), "x"]) == 2
-    captured = capsys.readouterr().err
-    assert captured == f"crosscue: {former}: is now 'crosscue {cli.MOVED[former]}'\n"

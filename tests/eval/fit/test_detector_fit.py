@@ -15,7 +15,7 @@ from crosscue.datasets.truth.box_labels import read_box_labels
 from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.class_scores import Platt
 from crosscue.detectors.training.operating_point import fit_isotonic, fit_platt
-from crosscue.eval.fit.detector.threshold import (
+from crosscue.eval.fit.detector.class_fit import (
     TRIED,
     bounded_threshold,
     fewest_detections,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from importlib import import_module
 
 import pytest
 
@@ -31,20 +30,6 @@ def test_public_name_exists_and_is_documented(name: str) -> None:
 
 def test_public_names_are_few() -> None:
     assert len(crosscue.__all__) <= 80
-    assert not set(crosscue.__all__) & crosscue._former_names().keys()
-
-
-@pytest.mark.parametrize("name", crosscue._former_names())
-def test_former_name_names_its_present_home(name: str) -> None:
-    home = crosscue._former_names()[name]
-
-    with pytest.raises(AttributeError, match=rf"no attribute '{name}'; see {re.escape(home)}$"):
-        getattr(crosscue, name)
-    package, _, last = home.rpartition(".")
-    if package == "crosscue" and last in crosscue.__all__ and last != "errors":
-        assert callable(getattr(crosscue, last))
-    else:
-        assert hasattr(import_module(home), name)
 
 
 def test_errors_are_in_one_module() -> None:

@@ -21,12 +21,13 @@ from crosscue.eval.scoring.pose.errors import (
     align,
     ape,
     pair_poses,
+    product,
+    rotate,
     rpe,
     squared_errors,
     statistics,
     summarise_nees,
 )
-from crosscue.eval.scoring.pose.quaternions import product, rotate
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import UsageError
 
