@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from crosscue.eval.failures.find import failures_beside_truth
 from crosscue.eval.failures.order import diverse
-from crosscue.eval.pipeline.run import Run, run_given
+from crosscue.eval.pipeline.run import Run, moved_to, run_given
 from crosscue.eval.report.opening import Mistake
 from crosscue.eval.report.page import MAX_FRAMES, write_report
 from crosscue.eval.report.summary import headline, pose_summary, scores_text
@@ -30,9 +31,9 @@ from crosscue.eval.scoring.runs import (
     smoothed_ranges,
 )
 from crosscue.replay.errors import CrosscueError, UsageError
-from crosscue.replay.limits import DEFAULT_LIMITS, Limits
-from crosscue.replay.processes import in_processes
+from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.results import HIDDEN, Result
+from crosscue.verb import Option
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -52,30 +53,72 @@ class Failed:
 
 
 @dataclass(frozen=True, slots=True)
-class ScoreWork:
-    """Scoring of one run, in this process or in another.
+class ScoringSettings:
+    """Settings of the scores of runs; called with a run, they score it.
 
     Attributes:
-        truth: The truth of all runs; None for that of each run's last score, or next to its log.
-        settings: Settings of the scores.
-        rpe_m: Distances of the relative pose error.
-        has_smoother: True to also run the batch smoother.
-        any_log: True to accept truth that names the hash of another file.
-        logs: Folder that the runs' logs have moved to.
+        truth: Truth of all runs (default: that of each run's last score, or truth.json next to
+            its log).
+        output: Folder for metrics, report and junit.xml, pooled over all runs.
+        gates: File with bounds on metrics; the exit status is 1 when one is violated.
+        threshold: Probability above which a feature counts as detected.
+        detection: Confirmed: a detection counts when 3 frames confirm it and its range is within
+            its 95 % interval; published: from the first frame, with any range.
+        rpe_m: Distances of the relative pose error, in metres.
+        has_attribution: Run an ablation: estimate without each cue, and report the change in every
+            metric.
+        smoother: Also run a batch smoother on the same measurements and compare its error.
+        any_log: Accept truth made for another file of the same drive, such as a converted log.
+        logs: Folder that the run's logs have moved to; they are recognised by content.
+        without_images: Leave out camera images, so the run's logs are not needed.
         limits: Limits for reading the runs' logs.
-        has_figures: True to draw figures for the report.
-        without_images: True to omit pictures of the worst frames, so that logs are not needed.
+        has_figures: Write a report without figures, which is much faster.
+        workers: Number of runs in parallel.
+        mlflow: Also log scores, tags and report to the MLflow server or store at this address.
+        experiment: Experiment in MLflow.
     """
 
-    truth: Path | None
-    settings: ScoreSettings
-    rpe_m: tuple[float, ...]
-    has_smoother: bool = False
+    truth: Path | str | None = None
+    output: Path | str | None = None
+    _: KW_ONLY
+    gates: Annotated[Path | str | None, Option("--gate", metavar="G.toml")] = None
+    threshold: float = 0.9
+    detection: Definition = "confirmed"
+    rpe_m: Annotated[Sequence[float], Option("--rpe", metavar="M")] = (10.0, 100.0)
+    has_attribution: bool = False
+    smoother: Literal["gtsam"] | None = None
     any_log: bool = False
-    logs: Path | None = None
-    limits: Limits = DEFAULT_LIMITS
-    has_figures: bool = True
+    logs: Annotated[Path | str | None, Option(metavar="DIR")] = None
     without_images: bool = False
+    limits: LimitsGiven = DEFAULT_LIMITS
+    has_figures: bool = True
+    workers: int = 1
+    mlflow: Annotated[str | None, Option(metavar="URI")] = None
+    experiment: str = "crosscue"
+
+    def __post_init__(self) -> None:
+        """Check numbers.
+
+        Raises:
+            UsageError: A number is out of range.
+        """
+        if self.workers < 1:
+            raise UsageError(f"workers: {self.workers}, expected 1 or more")
+        for distance_m in self.rpe_m:
+            if not (math.isfinite(distance_m) and distance_m > 0.0):
+                raise UsageError(f"rpe_m: {distance_m}, expected metres, above 0")
+
+    @property
+    def judged_by(self) -> ScoreSettings:
+        """The part of the settings that the scores depend on.
+
+        Raises:
+            UsageError: A value is out of range.
+        """
+        try:
+            return ScoreSettings(threshold=self.threshold, detection=self.detection)
+        except ValueError as error:
+            raise UsageError(f"score: {error}") from None
 
     def __call__(self, path: Path) -> ScoredRun:
         """Score one run and write its files.
@@ -83,14 +126,15 @@ class ScoreWork:
         Raises:
             CrosscueError: The run cannot be scored.
         """
-        folder = open_run(path, self.logs, without_images=self.without_images, limits=self.limits)
-        truth_path = find_truth(folder, self.truth)
+        judged_by, logs = self.judged_by, moved_to(self.logs)
+        folder = open_run(path, logs, without_images=self.without_images, limits=self.limits)
+        truth_path = find_truth(folder, None if self.truth is None else Path(self.truth))
         with locked(folder):
-            one = judge_run(folder, truth_path, self.settings, self.rpe_m, any_log=self.any_log)
-            scores = pooled_scores([one], self.settings)
+            one = judge_run(folder, truth_path, judged_by, tuple(self.rpe_m), any_log=self.any_log)
+            scores = pooled_scores([one], judged_by)
             metrics = metrics_of([one], scores)
             smoothed = None
-            if self.has_smoother:
+            if self.smoother is not None:
                 smoothed = score_smoother(folder, truth_path, smoothed_ranges(one))
                 metrics["smoother"] = asdict(smoothed)
             report = write_files(
@@ -138,18 +182,6 @@ def mistakes_of(ones: Sequence[RunScored], threshold: float) -> list[Mistake]:
         Mistake(one.run, one.t_ns, one.at_s, one.kind, one.what, f"{one.cause}: {one.reported}")
         for one in diverse(found, MAX_FRAMES)
     ]
-
-
-def settings_given(threshold: float, detection: Definition) -> ScoreSettings:
-    """Return settings of scores.
-
-    Raises:
-        UsageError: A value is out of range.
-    """
-    try:
-        return ScoreSettings(threshold=threshold, detection=detection)
-    except ValueError as error:
-        raise UsageError(f"score: {error}") from None
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -244,21 +276,14 @@ def score_run(
         UsageError: No truth is passed, and there is no truth next to the log.
     """
     of = run_given(run)
-    settings = settings_given(threshold, detection)
-    work = ScoreWork(
-        None if truth is None else Path(truth),
-        settings,
-        tuple(rpe_m),
+    settings = ScoringSettings(
+        truth,
+        threshold=threshold,
+        detection=detection,
+        rpe_m=rpe_m,
         any_log=any_log,
         logs=of.folder.logs,
         limits=of.folder.limits,
         has_figures=has_figures,
     )
-    return work(of.path)
-
-
-def score_each(
-    paths: Sequence[Path], work: ScoreWork, workers: int = 1
-) -> Iterator[ScoredRun | Failed]:
-    """Score runs and yield the results in order, with ``workers`` processes."""
-    return in_processes(work.attempt, paths, workers)
+    return settings(of.path)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.pipeline.outcome import MAX_LINES
-from crosscue.eval.pipeline.run import Run, moved_to
+from crosscue.eval.pipeline.run import Run
 from crosscue.eval.report.junit import write_junit
 from crosscue.eval.report.opening import judged_sentences
 from crosscue.eval.report.summary import (
@@ -22,7 +21,7 @@ from crosscue.eval.report.summary import (
 )
 from crosscue.eval.runs.account import account_lines
 from crosscue.eval.runs.folder import locked
-from crosscue.eval.scoring.drives import Definition, PooledScores, ScoreSettings
+from crosscue.eval.scoring.drives import PooledScores, ScoreSettings
 from crosscue.eval.scoring.files import FOLDER
 from crosscue.eval.scoring.gates import GateResult, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import metric_values
@@ -43,13 +42,13 @@ from crosscue.eval.studies.attribution import (
     estimate_of,
 )
 from crosscue.replay.errors import CrosscueError, UsageError, one_line
-from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
+from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.safe_text import visible
 from crosscue.results import HIDDEN, Result
-from crosscue.verb import Option, keywords
+from crosscue.verb import keywords
 
-from .score import Failed, ScoredRun, ScoreWork, score_each, settings_given, write_files
+from .score import Failed, ScoredRun, ScoringSettings, write_files
 from .tracking import open_mlflow
 
 
@@ -189,77 +188,6 @@ def _ones(found: ScoredRuns) -> list[RunScored]:
     return [run.one for run in found.runs]
 
 
-@dataclass(frozen=True, slots=True)
-class ScoringSettings:
-    """Settings of the scores of runs.
-
-    Attributes:
-        truth: Truth of all runs (default: that of each run's last score, or truth.json next to
-            its log).
-        output: Folder for metrics, report and junit.xml, pooled over all runs.
-        gates: File with bounds on metrics; the exit status is 1 when one is violated.
-        threshold: Probability above which a feature counts as detected.
-        detection: Confirmed: a detection counts when 3 frames confirm it and its range is within
-            its 95 % interval; published: from the first frame, with any range.
-        rpe_m: Distances of the relative pose error, in metres.
-        has_attribution: Run an ablation: estimate without each cue, and report the change in every
-            metric.
-        smoother: Also run a batch smoother on the same measurements and compare its error.
-        any_log: Accept truth made for another file of the same drive, such as a converted log.
-        logs: Folder that the run's logs have moved to; they are recognised by content.
-        without_images: Leave out camera images, so the run's logs are not needed.
-        limits: Limits for reading the runs' logs.
-        has_figures: Write a report without figures, which is much faster.
-        workers: Number of runs in parallel.
-        mlflow: Also log scores, tags and report to the MLflow server or store at this address.
-        experiment: Experiment in MLflow.
-    """
-
-    truth: Path | str | None = None
-    output: Path | str | None = None
-    _: KW_ONLY
-    gates: Annotated[Path | str | None, Option("--gate", metavar="G.toml")] = None
-    threshold: float = 0.9
-    detection: Definition = "confirmed"
-    rpe_m: Annotated[Sequence[float], Option("--rpe", metavar="M")] = (10.0, 100.0)
-    has_attribution: bool = False
-    smoother: Literal["gtsam"] | None = None
-    any_log: bool = False
-    logs: Annotated[Path | str | None, Option(metavar="DIR")] = None
-    without_images: bool = False
-    limits: LimitsGiven = DEFAULT_LIMITS
-    has_figures: bool = True
-    workers: int = 1
-    mlflow: Annotated[str | None, Option(metavar="URI")] = None
-    experiment: str = "crosscue"
-
-    def __post_init__(self) -> None:
-        """Check numbers.
-
-        Raises:
-            UsageError: A number is out of range.
-        """
-        if self.workers < 1:
-            raise UsageError(f"workers: {self.workers}, expected 1 or more")
-        for distance_m in self.rpe_m:
-            if not (math.isfinite(distance_m) and distance_m > 0.0):
-                raise UsageError(f"rpe_m: {distance_m}, expected metres, above 0")
-
-    def work(self) -> ScoreWork:
-        """Return the scoring of one run with these settings."""
-        return ScoreWork(
-            None if self.truth is None else Path(self.truth),
-            settings_given(self.threshold, self.detection),
-            tuple(self.rpe_m),
-            self.smoother is not None,
-            self.any_log,
-            moved_to(self.logs),
-            self.limits,
-            self.has_figures,
-            self.without_images,
-        )
-
-
 @keywords(ScoringSettings)
 def score_runs(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> ScoredRuns:
     """Score runs against truth: metrics, figures, report, gates.
@@ -307,11 +235,11 @@ def _scored(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> Scor
     is_many = len(paths) > 1
     if settings.gates is not None and is_many and folder is None:
         raise UsageError("score: several runs with --gate: add -o DIR, the folder for junit.xml")
-    work = settings.work()
+    judged_by = settings.judged_by
     bounds = () if settings.gates is None else load_gates(Path(settings.gates))
     scored: list[ScoredRun] = []
     failed: dict[Path, CrosscueError] = {}
-    for one in score_each(paths, work, settings.workers):
+    for one in in_processes(settings.attempt, paths, settings.workers):
         if isinstance(one, Failed):
             failed[one.path] = one.error
             if is_many:
@@ -326,7 +254,7 @@ def _scored(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> Scor
     if is_many:
         # Between the headlines of the runs and the scores of all.
         emit("")
-    found = _together(scored, failed, settings, work.settings)
+    found = _together(scored, failed, settings, judged_by)
     if not bounds:
         return found
     tree = found.metrics

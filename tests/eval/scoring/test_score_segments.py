@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from crosscue.eval.drives.score import ScoreWork
+from crosscue.eval.drives.score import ScoringSettings
 from crosscue.eval.report.summary import pose_summary, scores_text
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import ambiguous
 from crosscue.eval.scoring.columns import AMBIGUOUS
-from crosscue.eval.scoring.drives import ScoreSettings
 from crosscue.eval.scoring.runs import pooled_scores
 from support.gap_drive import Clock, replayed, write_drive
 
@@ -34,7 +33,7 @@ def test_rows_with_repeated_log_time_are_counted_in_all_scores(tmp_path: Path) -
     frames, belief, ranges = (_ambiguous_rows(run, name) for name in ("frames", "belief", "range"))
     assert min(frames, belief, ranges) > 0
 
-    scored = ScoreWork(tmp_path / "truth.json", ScoreSettings(), (10.0,))(run.path)
+    scored = ScoringSettings(tmp_path / "truth.json", rpe_m=(10.0,))(run.path)
 
     metrics = json.loads(run.file("score/metrics.json").read_text())
     assert metrics["coverage"]["frames"] == run.table("frames").num_rows
