@@ -75,8 +75,11 @@ class Result:
 
     @property
     def exit_status(self) -> int:
-        """Exit status of the command: 0, 1 for a failed gate, 3 for reported losses."""
-        return 0
+        """Exit status of the command: 0, 1 for a failed gate, 3 for reported losses.
+
+        A result that may have losses says so in ``is_whole``.
+        """
+        return 0 if getattr(self, "is_whole", True) else 3
 
     @property
     def reported(self) -> Result:

@@ -58,11 +58,6 @@ class AddedLandmarks(Result):
     is_whole: bool = field(metadata=HIDDEN, default=True)
     also: ClassVar = {one.name: f"counts.{one.name}" for one in fields(AddCounts)}
 
-    @property
-    def exit_status(self) -> int:
-        """0, or 3 when something of the log was dropped."""
-        return 0 if self.is_whole else 3
-
     def lines(self) -> Iterator[str]:
         """Yield the numbers of pictures."""
         counts = self.counts

@@ -7,7 +7,7 @@ messages into it; in log odds, it is their sum.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Final, Self
 
 from crosscue.replay.vehicle.fusion import Fade, Fusion
@@ -156,19 +156,8 @@ def graph_of(fusion: Fusion) -> FactorGraph:
     return FactorGraph(
         tuple(Feature(name, f.prior, f.establishes) for name, f in features.items()),
         tuple(
-            CueNode(
-                name,
-                c.precision,
-                c.can_start,
-                c.per_detection,
-                c.absence_counts,
-                c.seen_frames,
-                c.of_frames,
-                c.within_m,
-                c.fade,
-                c.at_most,
-            )
-            for name, c in cues.items()
+            CueNode(name, **{one.name: getattr(cue, one.name) for one in fields(CueNode)[1:]})
+            for name, cue in cues.items()
         ),
         tuple(edges),
     )

@@ -222,7 +222,7 @@ def mixed_kind(seed: int) -> Kind:
 def mixed_layout(seed: int) -> Layout:
     """Return an intersection of one of the kinds in turn, or a road without one."""
     rng = np.random.default_rng([seed, 0x4D])
-    kind, side = mixed_kind(seed), _side(rng)
+    kind, side = mixed_kind(seed), "left" if rng.random() < 0.5 else "right"
     missing = WITHOUT.get(kind, ())
     if kind == "bend":
         missing = ("ahead", "right" if side == "left" else "left")
@@ -256,10 +256,6 @@ def mixed_layout(seed: int) -> Layout:
 def _curve(rng: np.random.Generator, side: Side) -> float:
     """Draw a curvature with a radius of 130 to 250 m."""
     return (1.0 if side == "left" else -1.0) / float(rng.uniform(130.0, 250.0))
-
-
-def _side(rng: np.random.Generator) -> Side:
-    return "left" if rng.random() < 0.5 else "right"
 
 
 def layout_named(name: str) -> Layout:

@@ -271,11 +271,6 @@ class BatchStatus(Result):
         return not any(self.count(state) for state in (DriveState.FAILED, DriveState.STALE))
 
     @property
-    def exit_status(self) -> int:
-        """3 when a drive has failed or is stale, else 0."""
-        return 0 if self.is_whole else 3
-
-    @property
     def counts(self) -> dict[str, int]:
         """Number of drives in each state."""
         return {state.value: self.count(state) for state in DriveState}

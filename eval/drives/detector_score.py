@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field
@@ -12,17 +13,22 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 import numpy as np
 
 from crosscue.datasets.truth.box_labels import BoxLabels, LabelFormat, Meanings, read_box_labels
+from crosscue.detectors.base import View
 from crosscue.detectors.catalog.class_names import class_names_given
+from crosscue.detectors.images import Encoded, decode
+from crosscue.detectors.overlay import FOUND, TRUE, write_label
 from crosscue.eval.pipeline.run import Run, open_run
 from crosscue.eval.report.html import write_page
 from crosscue.eval.report.scene_figures import draw_calibration
-from crosscue.eval.report.worst_boxes import worst_pictures
+from crosscue.eval.runs.stored_images import StoredCamera, picture_at, run_camera
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
 from crosscue.eval.scoring.boxes.reliability import Reliability, class_calibration
 from crosscue.eval.scoring.boxes.scores import SEED, IntervalEstimate, PartScore, score_parts
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS
-from crosscue.replay.errors import UsageError
+from crosscue.replay import colours
+from crosscue.replay.columns import Bytes, Floats
+from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
@@ -35,6 +41,13 @@ if TYPE_CHECKING:
 
 FOLDER: Final = "score"
 MEASURES: Final = ("ap50", "ap", "precision", "recall")
+
+# Pictures closer in time than this show the same mistakes, so only the worst is shown.
+APART_NS: Final = 1_000_000_000
+WIDTH_PX: Final = 960
+QUALITY: Final = 80
+WRONG: Final = colours.bgr(colours.WRONG)
+GREY: Final = (150, 150, 150)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -91,11 +104,6 @@ class DetectorScore(Result):
     def part_rows(self) -> list[dict[str, object]]:
         """One row per class and part, with 95 % intervals."""
         return [_row(one) for one in self.scores]
-
-    @property
-    def exit_status(self) -> int:
-        """3 when the run has drops."""
-        return 0 if self.is_whole else 3
 
     @property
     def is_whole(self) -> bool:
@@ -342,3 +350,111 @@ def calibration_of(of: LabelledRun, overlap: float) -> tuple[Reliability, ...]:
         judged = ~matched.is_out[0] & bool(len(matched.labels))
         found.append(class_calibration(name, matched.scores[judged], matched.is_right[0][judged]))
     return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """A box to draw."""
+
+    box_px: Floats
+    colour: tuple[int, int, int]
+    text: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WorstPicture:
+    """One picture with mistakes.
+
+    Attributes:
+        name: Name of the picture in the labels.
+        t_ns: Time of the frame.
+        wrong: Number of detections above the threshold that match no label.
+        missed: Number of labels that no detection above the threshold matches.
+        picture: JPEG in base64, or None if it cannot be read.
+    """
+
+    name: str
+    t_ns: int
+    wrong: int
+    missed: int
+    picture: str | None = None
+
+
+def worst_pictures(labelled: LabelledRun, overlap: float, max_count: int) -> list[WorstPicture]:
+    """Return the pictures with the most mistakes, at most one for each moment.
+
+    Raises:
+        RunError: The log with the pictures is not found.
+        LogError: That log cannot be opened.
+    """
+    marks = _marks(labelled, overlap)
+    order = sorted(
+        (i for i in range(len(marks)) if any(one.colour in (WRONG, TRUE) for one in marks[i])),
+        key=lambda i: (-sum(one.colour in (WRONG, TRUE) for one in marks[i]), i),
+    )
+    chosen: list[int] = []
+    for i in order:
+        if len(chosen) < max_count and all(
+            abs(int(labelled.t_ns[i] - labelled.t_ns[k])) >= APART_NS for k in chosen
+        ):
+            chosen.append(i)
+    camera = run_camera(labelled.run) if chosen else None
+    return [
+        WorstPicture(
+            labelled.names[i],
+            int(labelled.t_ns[i]),
+            sum(one.colour == WRONG for one in marks[i]),
+            sum(one.colour == TRUE for one in marks[i]),
+            _picture(camera, int(labelled.t_ns[i]), marks[i]),
+        )
+        for i in chosen
+    ]
+
+
+def _marks(labelled: LabelledRun, overlap: float) -> list[list[Drawn]]:
+    """Return the ignored, right, missed and wrong boxes of each picture."""
+    truth, found = labelled.truth, labelled.found
+    marks: list[list[Drawn]] = [[] for _ in labelled.names]
+    for row in np.flatnonzero(truth.is_ignored).tolist():
+        marks[truth.picture[row]].append(Drawn(truth.boxes_px[row], GREY, ""))
+    for k, name in enumerate(labelled.classes):
+        matched = match(truth, found, k, overlaps=np.array([overlap]))
+        sure = matched.scores > labelled.threshold(name)
+        hit = set(matched.took[0][sure].tolist())
+        for row in np.flatnonzero((truth.label == k) & ~truth.is_ignored).tolist():
+            if row not in hit:
+                missed = Drawn(truth.boxes_px[row], TRUE, f"missed {name}")
+                marks[truth.picture[row]].append(missed)
+        for is_some, colour in ((matched.is_right[0], FOUND), (matched.is_wrong[0], WRONG)):
+            for i in np.flatnonzero(is_some & sure).tolist():
+                row = matched.row[i]
+                text = f"{name} {matched.scores[i]:.2f}"
+                marks[found.picture[row]].append(Drawn(found.boxes_px[row], colour, text))
+    return marks
+
+
+def _picture(camera: StoredCamera | None, t_ns: int, marks: Sequence[Drawn]) -> str | None:
+    if camera is None:
+        return None
+    try:
+        found = picture_at(camera, t_ns)
+        return None if found is None else _drawn(found, marks)
+    except CrosscueError:
+        # The page states that this picture cannot be read.
+        return None
+
+
+def _drawn(picture: Encoded, marks: Sequence[Drawn]) -> str | None:
+    import cv2
+
+    pixels, whole = decode(picture, View(min_width_px=WIDTH_PX))
+    size = (WIDTH_PX, round(whole[1] * WIDTH_PX / whole[0]))
+    canvas: Bytes = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    for one in marks:
+        x0, y0, x1, y1 = np.rint(one.box_px * (size[0] / whole[0])).astype(int).tolist()
+        thick = 1 if one.colour in (GREY, FOUND) else 2
+        cv2.rectangle(canvas, (x0, y0), (x1, y1), one.colour, thick)
+        if thick == 2:
+            write_label(canvas, one.text, (x0, max(y0 - 4, 12)), one.colour, 0.4)
+    ok, jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return base64.b64encode(jpeg.tobytes()).decode() if ok else None

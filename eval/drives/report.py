@@ -25,11 +25,6 @@ class UnscoredReport(Result):
     report: Path
     is_whole: bool = field(metadata=HIDDEN)
 
-    @property
-    def exit_status(self) -> int:
-        """3 when the run has drops, else 0."""
-        return 0 if self.is_whole else 3
-
     def lines(self) -> Iterator[str]:
         """Yield the name of the file."""
         yield str(self.report)

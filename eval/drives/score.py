@@ -15,8 +15,9 @@ from crosscue.eval.report.opening import Mistake
 from crosscue.eval.report.page import MAX_FRAMES, write_report
 from crosscue.eval.report.summary import headline, pose_summary, scores_text
 from crosscue.eval.runs.folder import locked, open_run
-from crosscue.eval.scoring.drives import Definition, PooledScores, ScoreSettings
-from crosscue.eval.scoring.files import FOLDER, curve_table, write_scores
+from crosscue.eval.scoring.by_drive import FOLDER
+from crosscue.eval.scoring.drives import PooledScores, ScoreSettings
+from crosscue.eval.scoring.files import curve_table, write_scores
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.pose.score import load_truth
 from crosscue.eval.scoring.pose.smoother import SmootherScore, score_smoother
@@ -30,6 +31,7 @@ from crosscue.eval.scoring.runs import (
     remember_truth,
     smoothed_ranges,
 )
+from crosscue.eval.scoring.scene.detection import Definition
 from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.results import HIDDEN, Result

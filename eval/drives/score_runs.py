@@ -21,8 +21,8 @@ from crosscue.eval.report.summary import (
 )
 from crosscue.eval.runs.account import account_lines
 from crosscue.eval.runs.folder import locked
+from crosscue.eval.scoring.by_drive import FOLDER
 from crosscue.eval.scoring.drives import PooledScores, ScoreSettings
-from crosscue.eval.scoring.files import FOLDER
 from crosscue.eval.scoring.gates import GateResult, check_gates, load_gates
 from crosscue.eval.scoring.metric_values import metric_values
 from crosscue.eval.scoring.pose.smoother import smoother_text

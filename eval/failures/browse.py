@@ -57,11 +57,6 @@ class Site(Result):
         return self.found is None or not self.found.failed
 
     @property
-    def exit_status(self) -> int:
-        """3 when a run could not be examined, else 0."""
-        return 0 if self.is_whole else 3
-
-    @property
     def failed(self) -> Mapping[Path, CrosscueError]:
         """Errors of the runs that could not be examined."""
         return {} if self.found is None else self.found.failed

@@ -47,11 +47,6 @@ class QueryResult(Result):
 
     formats: ClassVar = {"csv": "print the result as CSV"}
 
-    @property
-    def exit_status(self) -> int:
-        """3 when a run could not be read, else 0."""
-        return 0 if self.is_whole else 3
-
     def as_dict(self) -> Any:
         """Return the rows, or where they were written."""
         if self.output is not None:

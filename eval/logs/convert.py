@@ -66,11 +66,6 @@ class Converted(Result):
         return _is_whole(self.ledger)
 
     @property
-    def exit_status(self) -> int:
-        """0 when every selected row is in the file, 3 when some are dropped or skipped."""
-        return 0 if self.is_whole else 3
-
-    @property
     def integrity(self) -> str:
         """Verification of the log."""
         return self.ledger.integrity

@@ -87,11 +87,6 @@ class SealCheck(Result):
         return not self.spans and not self.files_changed
 
     @property
-    def exit_status(self) -> int:
-        """0 if the log matches its seal, else 3."""
-        return 0 if self.is_whole else 3
-
-    @property
     def damaged(self) -> list[dict[str, object]]:
         """Byte ranges that differ, by file."""
         return [{"file": one.name, "from": one.start, "to": one.stop} for one in self.spans]

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
     from .columns import DriveTime
 
-__all__ = ["save_rrd"]
-
 
 def save_rrd(
     run: RunFolder,

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 from crosscue.eval.pipeline.run import PicturedRun, Run, run_given
-from crosscue.eval.runs.moments import TableFolder, approach_spans, moment_ns
+from crosscue.eval.runs.moments import approach_spans, moment_ns
+from crosscue.eval.runs.tables.parquet import TableFolder
 from crosscue.replay.errors import CrosscueError, OutputError, UsageError
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
@@ -112,11 +113,6 @@ class Recording(Result):
     recording: Path
     is_shown: bool = field(metadata=HIDDEN)
     is_whole: bool = field(metadata=HIDDEN)
-
-    @property
-    def exit_status(self) -> int:
-        """3 when the run has drops, else 0."""
-        return 0 if self.is_whole else 3
 
     def lines(self) -> Iterator[str]:
         """Yield the name of the file, unless it was shown."""

@@ -16,16 +16,6 @@ from .tables.parquet import TableFolder
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = [
-    "TableFolder",
-    "approach_spans",
-    "frame_times",
-    "moment_ns",
-    "run_between",
-    "seconds_into",
-    "span_ns",
-]
-
 # Tables that define a run's time span; the first that has rows is used.
 TABLES: Final = ("frames", "pose")
 

@@ -23,11 +23,13 @@ from crosscue.eval.scoring.scene.cues import (
     match_cues,
     score_cues,
 )
-from crosscue.eval.scoring.scene.detection import RULES
-from crosscue.eval.scoring.scene.detection import Definition as Definition
-from crosscue.eval.scoring.scene.ranges import FilterAndSmoother as FilterAndSmoother
-from crosscue.eval.scoring.scene.ranges import RangeJudged, RangeScore, judge_range, score_range
-from crosscue.eval.scoring.scene.ranges import score_smoothed as score_smoothed
+from crosscue.eval.scoring.scene.detection import RULES, Definition
+from crosscue.eval.scoring.scene.ranges import (
+    RangeJudged,
+    RangeScore,
+    judge_range,
+    score_range,
+)
 from crosscue.replay.errors import SchemaError
 
 from . import intervals

@@ -14,9 +14,7 @@ from crosscue.eval.runs.tables.columns import OF_SCORE, arrow_schema
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_table, write_text
 
-from .by_drive import BY_DRIVE, DriveMetric, by_drive_table, drive_contributions
-from .by_drive import FOLDER as FOLDER
-from .by_drive import METRICS as METRICS
+from .by_drive import BY_DRIVE, METRICS, DriveMetric, by_drive_table, drive_contributions
 from .drives import DriveJudged, as_metrics, pool_scores
 from .runs import RunScored
 from .truth import FEATURES

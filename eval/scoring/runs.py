@@ -23,6 +23,8 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.logs import log_location
 from crosscue.eval.runs.manifest import LogRow
 from crosscue.eval.runs.tables.travelled import odometer_of
+from crosscue.eval.scoring.pose.errors import FilterAndSmoother
+from crosscue.eval.scoring.scene.ranges import score_smoothed
 from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import RunError, SchemaError, UsageError
 from crosscue.replay.files import door
@@ -36,13 +38,11 @@ from .columns import AMBIGUOUS, NONE, RunTables
 from .drives import (
     DEFAULTS,
     DriveJudged,
-    FilterAndSmoother,
     PooledScores,
     ScoreSettings,
     as_metrics,
     pool_scores,
     score_drive,
-    score_smoothed,
 )
 from .places import group_places
 from .pose import score as score_pose

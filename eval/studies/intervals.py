@@ -14,8 +14,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.eval.scoring.intervals import MIN_CLUSTERS, wilson
-from crosscue.eval.scoring.intervals import TOO_FEW as TOO_FEW
+from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW, wilson
 
 Floats: TypeAlias = NDArray[np.float64]
 

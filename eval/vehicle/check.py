@@ -11,7 +11,7 @@ import numpy as np
 
 from crosscue.detectors.images import decode, encoded, lose
 from crosscue.replay.base import Log, Selection, name_of
-from crosscue.replay.columns import Bytes, Floats, Int64s, Topic
+from crosscue.replay.columns import Bytes, Floats, Topic
 from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.signals.extractor import SampleExtractor, pictures_of
@@ -228,7 +228,7 @@ def _rows(
             signal.name.lower(),
             f"{source.topic.name}{': ' if names else ''}{', '.join(names)}",
             len(found.t_ns),
-            _rate_hz(found.t_ns),
+            Series("", found.t_ns, np.zeros(len(found.t_ns))).rate_hz,
             float(known.min() * scale) if len(known) else math.nan,
             float(known.max() * scale) if len(known) else math.nan,
             unit,
@@ -257,10 +257,6 @@ def _named(signal: Signal, vehicle: Vehicle) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for name in names if name is not None))
     section = {Signal.YAW_RATE: can.yaw_rate, Signal.STEERING: can.steering}.get(signal)
     return () if section is None else (section.signal,)
-
-
-def _rate_hz(t_ns: Int64s) -> float:
-    return Series("", t_ns, np.zeros(len(t_ns))).rate_hz
 
 
 def _series(

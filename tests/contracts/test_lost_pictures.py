@@ -82,7 +82,7 @@ HOW_OTHERS_DO: Final = {
     "eval/landmarks.py": "files that the user names",
     "eval/logs/log.py": "a call of the user for one picture, which raises",
     "eval/pipeline/visual.py": "frames with detections, thus decoded before",
-    "eval/report/worst_boxes.py": "frames with detections, thus decoded before",
+    "eval/drives/detector_score.py": "frames with detections, thus decoded before",
     "eval/studies/intersections/figures.py": "frames with detections, thus decoded before",
     "eval/vehicle/picture_pass.py": "a function of its own below, because it needs intrinsics",
     "localization/landmarks/images.py": "for the commands of landmarks",

@@ -202,7 +202,7 @@ PAST_THE_DOOR: Final[dict[str, str]] = {
     "eval/scoring/truth.py": NAMED,
     "eval/studies/simulated_drives.py": PACKAGE,
     "eval/studies/town/work.py": PACKAGE,
-    "localization/landmarks/file.py": NAMED,
+    "localization/landmarks/database.py": NAMED,
     "replay/can/layout_cache.py": PACKAGE,
     "replay/compiled.py": PACKAGE,
     "replay/files/bounded.py": NAMED,

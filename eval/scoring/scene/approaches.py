@@ -334,7 +334,7 @@ def _result(
         conditions=one.conditions,
         present=present,
         run_approach=number,
-        overlap_s=_overlap_s(steps),
+        overlap_s=float(steps.t_ns[-1] - steps.t_ns[0]) * 1e-9 if len(steps.t_ns) else 0.0,
         splits=splits,
         steps=len(steps.t_ns),
         detected_m=_first(detected, distance),
@@ -371,10 +371,6 @@ def _is_range_right(
         return np.ones(len(t_ns), np.bool_)
     true_m = truth.ranges.at(rows.t_ns, truth.approach_at(rows.t_ns))
     return is_range_right(rows, true_m, number, t_ns)
-
-
-def _overlap_s(steps: BeliefRows) -> float:
-    return float(steps.t_ns[-1] - steps.t_ns[0]) * 1e-9 if len(steps.t_ns) else 0.0
 
 
 def _first(holds: NDArray[np.bool_], distance_m: NDArray[np.float64]) -> float | None:

@@ -16,8 +16,7 @@ from crosscue.eval.scoring.columns import AMBIGUOUS, RangeRows, RunTables
 from crosscue.eval.scoring.intervals import Mean, mean
 from crosscue.eval.scoring.places import cluster_numbers
 from crosscue.eval.scoring.pooling import BINS_M, distance_bins, first_reasons, sum_counts
-from crosscue.eval.scoring.pose.errors import FilterAndSmoother as FilterAndSmoother
-from crosscue.eval.scoring.pose.errors import NeesSummary, summarise_nees
+from crosscue.eval.scoring.pose.errors import FilterAndSmoother, NeesSummary, summarise_nees
 from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.fusion.intersection_range import RangeBelief, predict, smooth_ranges
 

@@ -17,7 +17,7 @@ from crosscue.eval.scoring.intervals import Mean, fraction, mean
 from crosscue.eval.scoring.scene.belief import brier, log_score
 from crosscue.eval.scoring.scene.detection import CONFIRM_FRAMES, held
 from crosscue.eval.scoring.scene.trade import Reached, TradePoint, reached, trade_off
-from crosscue.eval.scoring.truth import FEATURES as FEATURES
+from crosscue.eval.scoring.truth import FEATURES
 from crosscue.replay.columns import Floats, Int64s
 
 THRESHOLD: Final = 0.9

@@ -16,7 +16,7 @@ from crosscue.eval.recording import save_rrd
 from crosscue.eval.report.summary import pose_summary
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
-from crosscue.eval.scoring.files import FOLDER, METRICS
+from crosscue.eval.scoring.by_drive import FOLDER, METRICS
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, measure_pose, truth_track
 from crosscue.localization.town.drive import Traced, drive_traced
 from crosscue.localization.town.settings import Navigation, Sensors, TownDrive

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, over
 from crosscue.eval.runs.folder import RunFolder, locked
 from crosscue.eval.studies.intervals import km, percent
 from crosscue.eval.studies.study import PageTable, StudyResult, Written, claim
-from crosscue.localization.town.drive import DriveResult as DriveResult
-from crosscue.localization.town.drive import drive_traced
+from crosscue.localization.town.drive import DriveResult, drive_traced
 from crosscue.replay.progress import Progress, emit
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option

@@ -181,7 +181,7 @@ def _add(path: Path, names: list[str], max_pages: int = 1_000_000) -> None:
 def test_second_concurrent_writer_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("crosscue.localization.landmarks.file._BUSY_S", 0.05)
+    monkeypatch.setattr("crosscue.localization.landmarks.database._BUSY_S", 0.05)
     path = database_of(tmp_path / "lm.sqlite", GRID[:1])
 
     with LandmarkWriter(path, "orb") as first:
