@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from crosscue.replay.errors import one_line
 from crosscue.replay.files.tree_text import strict_json
@@ -27,52 +27,32 @@ if TYPE_CHECKING:
 EVERY_S: Final = 0.1
 
 
-class Done(NamedTuple):
-    """Progress of a command.
-
-    Attributes:
-        amount: Amount done.
-        total: Amount to do; None or 0 where unknown.
-        unit: Unit of both, as a plural noun.
-    """
-
-    amount: float
-    total: float | None
-    unit: str
-
-
 class ProgressLine:
     """Progress line of one command; a context manager, or closed by ``end``."""
 
-    def __init__(self, what: str, *, is_shown: bool) -> None:
-        """Create a line that draws nothing before the first ``at``, or unless ``is_shown``.
-
-        Args:
-            what: The text before the bar.
-            is_shown: True to draw on stderr, which must then be a terminal.
-        """
+    def __init__(self, *, is_shown: bool) -> None:
+        """Create a line that draws nothing before the first ``at``, or unless ``is_shown``."""
         self.is_shown = is_shown
-        self._what = what
         self._began = time.monotonic()
         self._shown = -EVERY_S
         self._bar: Progress | None = None
         self._task: TaskID | None = None
         self._unit = ""
 
-    def at(self, done: Done, what: str = "") -> None:
-        """Show the progress; ``what`` replaces the text before the bar, for another stage."""
+    def at(self, event: Progressed) -> None:
+        """Show the progress on stderr, which must be a terminal."""
         now = time.monotonic()
         if not self.is_shown or now - self._shown < EVERY_S:
             return
         self._shown = now
-        bar, task = self._task_for(done.unit)
-        total = done.total if done.total and done.total >= done.amount else None
+        bar, task = self._task_for(event.unit)
+        total = event.total if event.total and event.total >= event.done else None
         bar.update(
             task,
-            description=visible(what or self._what),
-            completed=done.amount,
+            description=visible(event.doing),
+            completed=event.done,
             total=total,
-            amount=self._amount(done._replace(total=total)),
+            amount=self._amount(event, total),
             left="left" if total else "",
         )
         # Nothing is drawn before the first progress.
@@ -85,10 +65,10 @@ class ProgressLine:
         self._bar = self._task = None
         self._began = time.monotonic()
 
-    def _amount(self, done: Done) -> str:
-        rate = done.amount / max(time.monotonic() - self._began, 1e-9)
-        of = "" if done.total is None else f" of {done.total:,.0f}"
-        return f"{done.amount:,.0f}{of} {done.unit}, {rate:,.{0 if rate >= 10 else 1}f} a second"
+    def _amount(self, event: Progressed, total: float | None) -> str:
+        rate = event.done / max(time.monotonic() - self._began, 1e-9)
+        of = "" if total is None else f" of {total:,.0f}"
+        return f"{event.done:,.0f}{of} {event.unit}, {rate:,.{0 if rate >= 10 else 1}f} a second"
 
     def _task_for(self, unit: str) -> tuple[Progress, TaskID]:
         if self._bar is None:
@@ -111,11 +91,11 @@ class ProgressLine:
 @contextmanager
 def watched(args: argparse.Namespace) -> Iterator[None]:
     """Show progress on a terminal, and print parts of a result as they are finished."""
-    with ProgressLine("", is_shown=is_shown(args)) as line:
+    with ProgressLine(is_shown=is_shown(args)) as line:
 
         def show(event: object) -> None:
             if isinstance(event, Progressed):
-                line.at(Done(event.done, event.total, event.unit), event.doing)
+                line.at(event)
             else:
                 line.end()
                 _print_part(event, args)

@@ -8,7 +8,8 @@ import sys
 import pytest
 
 from crosscue.eval import terminal as progress
-from crosscue.eval.terminal import Done, ProgressLine
+from crosscue.eval.terminal import ProgressLine
+from crosscue.replay.progress import Progress
 
 
 class Terminal(io.StringIO):
@@ -41,10 +42,10 @@ def test_line_shows_amount_rate_and_time_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     terminal = replaced_stderr(monkeypatch)
-    with ProgressLine("converting", is_shown=True) as line:
-        line.at(Done(1500, 6000, "rows"))
+    with ProgressLine(is_shown=True) as line:
+        line.at(Progress("converting", 1500, 6000, "rows"))
         text = shown_text(line, terminal)
-        line.at(Done(3000, 6000, "rows"))
+        line.at(Progress("converting", 3000, 6000, "rows"))
 
         assert "converting" in text
         assert "1,500 of 6,000 rows" in text
