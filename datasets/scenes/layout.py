@@ -222,7 +222,8 @@ def mixed_kind(seed: int) -> Kind:
 def mixed_layout(seed: int) -> Layout:
     """Return an intersection of one of the kinds in turn, or a road without one."""
     rng = np.random.default_rng([seed, 0x4D])
-    kind, side = mixed_kind(seed), "left" if rng.random() < 0.5 else "right"
+    kind = mixed_kind(seed)
+    side: Side = "left" if rng.random() < 0.5 else "right"
     missing = WITHOUT.get(kind, ())
     if kind == "bend":
         missing = ("ahead", "right" if side == "left" else "left")
