@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import os
 
+from hypothesis import HealthCheck, settings
+
 # Tests do not read or fill the user's cache; tests of the cache name a folder.
 os.environ["CROSSCUE_DBC_CACHE"] = "off"
 # Tests run in parallel, one process per core. Further threads would only wait for each other, and
@@ -12,6 +14,15 @@ os.environ["CROSSCUE_DBC_CACHE"] = "off"
 os.environ["OMP_WAIT_POLICY"] = "passive"
 for library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(library, "1")
+
+# An example of a law may take any time. With CI set, hypothesis draws the same ones in every run.
+settings.register_profile(
+    "laws",
+    settings.default,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+settings.load_profile("laws")
 
 
 def pytest_collection_finish() -> None:

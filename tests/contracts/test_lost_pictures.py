@@ -51,7 +51,7 @@ LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
     },
     "eval/pipeline/landmarks.py": {
         "replay --landmarks": "replay {log} -o {out} --vehicle {car} --detectors grey --no-cache "
-        "--landmarks {db}",
+        "--landmarks {db}"
     },
     "eval/fit/log_images.py": {
         "truth import": "truth import {coco} --log {log} -o {out}.json --vehicle {car}",
@@ -61,11 +61,11 @@ LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
         "fit signs": "fit signs {drive} --label stop/sign --threshold 0.5"
     },
     "eval/fit/landmarks/database.py": {
-        "landmarks add": "landmarks add {out}.db {log} --poses {truth} --vehicle {car}",
+        "landmarks add": "landmarks add {out}.db {log} --poses {truth} --vehicle {car}"
     },
     "eval/fit/landmarks/fit.py": {
         "fit landmarks": "fit landmarks {log} --database {db} --poses {truth} --vehicle {car} "
-        "--different-beyond 10 --every 1",
+        "--different-beyond 10 --every 1"
     },
     "eval/vehicle/check.py": {"check": "check {log} {car} -o {out}.html"},
     "eval/recording/camera.py": {"view": "view {run} -o {out}.rrd"},
@@ -175,10 +175,7 @@ def names(
     ids=[name for commands in LOOKS_AT_A_LOG.values() for name in commands],
 )
 def test_unusable_picture_of_log_is_dropped_row(
-    line: str,
-    names: dict[str, Path | str],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    line: str, names: dict[str, Path | str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = [part.format(**names, out=tmp_path / "out") for part in line.split()]
 
@@ -201,11 +198,7 @@ def test_picture_that_two_stages_drop_is_counted_once(
     account = json.loads(capsys.readouterr().out)["account"]
     (log,) = account["reading"]
     camera = log["topics"]["camera"]
-    assert (camera["in"], camera["used"], camera["dropped"]) == (
-        40,
-        38,
-        {"picture not decoded": 2},
-    )
+    assert (camera["in"], camera["used"], camera["dropped"]) == (40, 38, {"picture not decoded": 2})
 
 
 def test_mounting_is_estimated_from_other_pictures(names: dict[str, Path | str]) -> None:

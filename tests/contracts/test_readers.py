@@ -7,12 +7,13 @@ from typing import Final
 
 import pytest
 
+from crosscue.replay.errors import LogFormatError
 from crosscue.replay.formats import FORMATS
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.testing import check_reader
 from support.every_format import EVERY_FORMAT
-from support.mcap_files import McapFile, channel, message, schema
+from support.mcap_files import MAGIC, McapFile, channel, message, schema
 from support.one_row import ONE_ROW
 
 WITHOUT_SINGLE_ROW_DAMAGE: Final = {
@@ -38,6 +39,51 @@ def test_damaged_row_is_counted_as_one_dropped_row(name: str, tmp_path: Path) ->
     write, damage = ONE_ROW[name]
 
     check_reader(write(tmp_path), damage)
+
+
+# Contents that no reader accepts, and words of the refusal, by the name of the file.
+UNSUPPORTED: Final = {
+    "a.blf": ((b"", "empty"), (b"LOGG", "no BLF header"), (bytes(500), "no BLF header")),
+    "a.mf4": (
+        (b"", "empty file"),
+        (b"PK\x03\x04" + bytes(100), "not an MDF file"),
+        (b"MDF     3.30    " + bytes(100), "version '3.30'"),
+        (b"MDF     4.10    " + bytes(100), "header damaged"),
+    ),
+    "a.bag": (
+        (b"", "begins with b''"),
+        (b"#ROSBAG V1.2\n", "rosbag fix"),
+        (b"#ROSBAG V2.0\n", "no readable record"),
+        (b"PK\x03\x04", "format 2.0"),
+    ),
+    "a.db3": (
+        (b"", "begins with b''"),
+        (b"SQLite format 2", "SQLite format 3"),
+        (bytes(999), "SQLite"),
+    ),
+    "a.mcap": (
+        (b"", "an empty file"),
+        (MAGIC[:5], "not an MCAP file"),
+        (b"#ROSBAG V2.0\n" + bytes(100), "not an MCAP file"),
+        (MAGIC, "no readable record"),
+        (MAGIC + b"\x01\xff", "no readable record"),
+        (MAGIC + bytes(500), "no readable record"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNSUPPORTED)
+def test_unsupported_file_is_refused_in_one_line_and_closed(name: str, tmp_path: Path) -> None:
+    for content, words in UNSUPPORTED[name]:
+        (tmp_path / name).write_bytes(content)
+        before = len(list(Path("/proc/self/fd").iterdir()))
+
+        with pytest.raises(LogFormatError, match=words) as refused:
+            open_log(tmp_path / name)
+
+        assert "\n" not in str(refused.value)
+        assert str(tmp_path / name) in str(refused.value)
+        assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 
 def test_damaged_row_counted_in_statistics_is_dropped_once(tmp_path: Path) -> None:

@@ -194,10 +194,7 @@ def test_address_for_any_argument_is_not_printed(
 
 
 def test_batch_keeps_no_secret(
-    drives: dict[str, Path],
-    web: Served,
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
+    drives: dict[str, Path], web: Served, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Of four listed drives one is fine, one is missing, one damaged, one of an unknown suffix."""
     web.files["damaged.mcap"] = b"damaged"
@@ -211,12 +208,7 @@ def test_batch_keeps_no_secret(
     assert crosscue(replay) == 3
     assert crosscue(replay) == 3
     assert crosscue([*replay, "--json"]) == 3
-    for line in (
-        "status runs",
-        "merge runs -o merged",
-        "tag runs a=b",
-        "history runs",
-    ):
+    for line in ("status runs", "merge runs -o merged", "tag runs a=b", "history runs"):
         crosscue(line.split())
     assert crosscue(["query", "runs", "from runs", "--json"]) in (0, 3)
 

@@ -42,7 +42,7 @@ def test_geodetic_to_ecef_matches_epsg_guidance_note_7_2() -> None:
     np.testing.assert_allclose(xyz_m, [[3_771_793.968, 140_253.342, 5_124_304.349]], atol=2e-2)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(places)
 def test_geodetic_and_ecef_conversions_are_inverse(place: tuple[float, float, float]) -> None:
     xyz_m = geodetic_to_ecef(*place)
@@ -52,7 +52,6 @@ def test_geodetic_and_ecef_conversions_are_inverse(place: tuple[float, float, fl
     np.testing.assert_allclose(again_m, xyz_m, atol=1e-7)
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.floats(-1.57, 1.57), st.floats(-3.14, 3.14))
 def test_enu_matrix_is_rotation_with_up_along_ellipsoid_normal(
     lat_rad: float, lon_rad: float

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.datasets.adapters.kitti import TOPICS, open_kitti, write_kitti_truth
@@ -107,7 +107,6 @@ def test_truth_equals_simulated_path(make: Callable[[Path], Path], tmp_path: Pat
     assert truth["origin"]["latitude_deg"] == pytest.approx(49.0)
 
 
-@settings(max_examples=50, deadline=None)
 @given(roll=st.floats(-1.0, 1.0), pitch=st.floats(-1.0, 1.0), yaw=st.floats(-3.0, 3.0))
 def test_attitude_is_yaw_then_pitch_then_roll(roll: float, pitch: float, yaw: float) -> None:
     numbers = np.zeros((1, len(COLUMNS)))
@@ -173,9 +172,6 @@ def test_drive_with_timestamps_only_is_refused(tmp_path: Path) -> None:
         open_log(drive)
 
 
-@settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
 @given(fraction=st.floats(0.0, 1.0))
 def test_truncated_tracking_file_yields_only_complete_lines(
     tmp_path: Path, fraction: float
@@ -199,7 +195,6 @@ def test_truncated_tracking_file_yields_only_complete_lines(
         assert set(np.asarray(block.rows["gyro_z_radps"]).tolist()) <= {YAW_RATE_RADPS}
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=400))
 def test_any_bytes_parse_to_packet_or_reason(raw: bytes) -> None:
     parsed = parse_oxts(raw)
@@ -207,9 +202,7 @@ def test_any_bytes_parse_to_packet_or_reason(raw: bytes) -> None:
     assert isinstance(parsed, str) or (len(parsed) == 30 and np.isfinite(parsed).all())
 
 
-def test_real_sequence_has_known_heading_change_distance_and_frame_rate(
-    tmp_path: Path,
-) -> None:
+def test_real_sequence_has_known_heading_change_distance_and_frame_rate(tmp_path: Path) -> None:
     drive = shared("odometry", "kitti_tracking_0001")
 
     by_topic, ledger = read(drive)

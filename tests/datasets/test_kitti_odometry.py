@@ -15,12 +15,7 @@ from crosscue.replay.columns import Table
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
-from support.kitti_odometry_drive import (
-    FOCAL_PX,
-    SPEED_MPS,
-    YAW_RATE_RADPS,
-    kitti_odometry_drive,
-)
+from support.kitti_odometry_drive import FOCAL_PX, SPEED_MPS, YAW_RATE_RADPS, kitti_odometry_drive
 
 
 def test_left_turn_has_positive_yaw_rate_and_heading(tmp_path: Path) -> None:

@@ -32,13 +32,13 @@ def random_trajectory(seed: int, n: int) -> Trajectory:
 
 
 @given(t_ns=st.integers(-(10**18), 9 * 10**18))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_nanoseconds_survive_conversion_to_text(t_ns: int) -> None:
     assert nanoseconds(seconds_text(t_ns)) == t_ns
 
 
 @given(seed=st.integers(0, 10_000), n=st.integers(0, 20))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_trajectory_is_read_back_exactly(
     seed: int, n: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -103,7 +103,7 @@ def test_invalid_line_is_refused_with_its_number(tmp_path: Path, line: str, matc
 
 
 @given(heading=st.floats(-3.14, 3.14))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_planar_pose_keeps_heading(heading: float) -> None:
     one = planar(np.array([1]), np.array([2.0]), np.array([3.0]), np.array([heading]))
 

@@ -6,7 +6,7 @@ from collections import OrderedDict
 
 import numpy as np
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 from torchvision.ops import MultiScaleRoIAlign
@@ -31,7 +31,6 @@ def _tensor(boxes: list[tuple[tuple[float, float], float, float]]) -> Tensor:
     return torch.tensor(corners, dtype=torch.float32).reshape(-1, 4)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.sampled_from([(4, 8, 16, 32), (8, 16, 32)]), st.sampled_from([7, 14]), Boxes, Boxes)
 def test_pooled_features_match_torchvision(
     strides: tuple[int, ...],

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.detectors.images import Encoded
@@ -18,7 +18,6 @@ GREY = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
 
 
 @given(frames=st.integers(0, 40), max_count=st.integers(0, 9))
-@settings(max_examples=40, deadline=None)
 def test_pictures_are_evenly_spaced_over_the_drive(frames: int, max_count: int) -> None:
     _, coded = cv2.imencode(".jpg", GREY[:16, :16])
     with TemporaryDirectory() as name:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.torch import save
 from torch import Tensor, nn
@@ -171,7 +171,6 @@ def test_identity_changes_with_every_setting_that_affects_results() -> None:
     assert _detector(other).identity != base
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.floats(0.02, 0.98), st.floats(0.02, 0.98), st.floats(0.2, 4.0), st.floats(-4.0, 4.0))
 def test_calibration_is_monotonic_and_invertible(
     one: float, other: float, slope: float, offset: float
@@ -184,7 +183,6 @@ def test_calibration_is_monotonic_and_invertible(
     assert 0.0 <= calibrated(one, by) <= 1.0
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     st.integers(-20, 90),
     st.integers(-20, 60),
@@ -293,7 +291,6 @@ def test_malicious_pickle_is_refused_and_not_executed(tmp_path: Path, suffix: st
 
 
 @given(at=st.floats(0.0, 1.0), bit=st.integers(0, 7))
-@settings(max_examples=60, deadline=None)
 def test_flipped_bit_in_a_checkpoint_is_refused(at: float, bit: int) -> None:
     content = bytearray(_written())
     place = round(at * (len(content) - 1))

@@ -141,7 +141,7 @@ def test_random_weights_match_torchvision(backend: str, seed: int) -> None:
     assert found > 10
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(
     st.integers(48, 80),
     st.integers(48, 80),
@@ -164,7 +164,7 @@ def test_winograd_convolution_matches_direct_convolution(
     np.testing.assert_allclose(got.numpy(), wanted.numpy(), atol=1e-4)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(1, 9), st.integers(1, 9))
 def test_sliced_average_pooling_matches_torch(height: int, width: int) -> None:
     plain = nn.AvgPool2d(2, ceil_mode=True)

@@ -49,7 +49,7 @@ def model(*inputs: bytes, weights: tuple[bytes, ...] = ()) -> bytes:
 
 
 @given(st.binary(max_size=60), st.integers(0, 400))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_damaged_file_yields_an_error_or_a_valid_shape(noise: bytes, cut: int) -> None:
     for content in (noise, model(value_info(b"x", [1, 3, 8, 8]), weights=(b"w",))[:cut] + noise):
         try:

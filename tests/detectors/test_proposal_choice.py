@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.detectors.networks.mask_rcnn.network import build_network
@@ -14,7 +14,6 @@ from support.mask_rcnn import plan_of
 SIZE_PX = (96, 128)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.integers(0, 500), min_size=1, max_size=4),
     st.integers(1, 1000),

@@ -60,7 +60,7 @@ def test_sign_is_found_at_every_height(height_px: int) -> None:
     assert box_ious(box, found.boxes_px).max() > 0.5
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000))
 def test_ratio_test_matches_opencv(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -94,7 +94,7 @@ def test_points_match_upright_orb_at_any_limit(max_count: int) -> None:
     np.testing.assert_array_equal(points.words.view(np.uint8), descriptors)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), reach=st.integers(0, 3))
 def test_window_counts_each_template_point_once(seed: int, reach: int) -> None:
     rng = np.random.default_rng(seed)

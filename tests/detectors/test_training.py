@@ -143,7 +143,7 @@ def test_all_mask_encodings_decode_to_the_same_pixels(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 10_000))
 def test_sample_boxes_enclose_their_masks_and_objects(
     tmp_path_factory: pytest.TempPathFactory, number: int
@@ -203,9 +203,7 @@ def _perfect(labelled: LabelledSet) -> list[Detections]:
     return found
 
 
-def test_average_precision_is_100_for_ground_truth_and_0_for_no_detections(
-    tmp_path: Path,
-) -> None:
+def test_average_precision_is_100_for_ground_truth_and_0_for_no_detections(tmp_path: Path) -> None:
     labelled = _bars(tmp_path)
     perfect = _perfect(labelled)
 

@@ -405,14 +405,7 @@ def test_restart_after_gap_forgets_approach_time_and_rest_distance() -> None:
 
 @pytest.mark.parametrize(
     ("travelled_m", "var_m2"),
-    [
-        (None, 0.0),
-        (math.nan, 0.0),
-        (math.inf, 0.0),
-        (1.0, math.nan),
-        (1.0, -1.0),
-        (1.0, math.inf),
-    ],
+    [(None, 0.0), (math.nan, 0.0), (math.inf, 0.0), (1.0, math.nan), (1.0, -1.0), (1.0, math.inf)],
 )
 def test_missing_or_invalid_odometry_widens_ranges_until_they_are_dropped(
     travelled_m: float | None, var_m2: float

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.fusion.approaches import Approaches
@@ -134,7 +134,6 @@ def test_published_message_counts_new_objects_fully_and_others_by_independence()
     assert sent == pytest.approx([published, 0.5 * published, published, 0.5 * published])
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.integers(0, 3), min_size=1, max_size=30))
 def test_stationary_car_counts_cue_and_its_absence_once_each(counts: list[int]) -> None:
     still = [situation({"road_left": min(count, 1)}, moved_m=0.0) for count in counts]
@@ -244,10 +243,7 @@ def test_calibrated_model_beats_source_on_held_out_simulated_approaches() -> Non
         ("calibrated.fades = { road_lft = { way_m = 3.0 } }", r"did you mean road_left\?"),
         ("calibrated.fades = { road_left = { way_m = 3.0, time_s = 1.0 } }", "either way_m or"),
         ("calibrated.fades = { road_left = {} }", "either way_m or"),
-        (
-            "calibrated.exponents = { lft = 0.5 }",
-            "no 'lft' .did you mean left",
-        ),
+        ("calibrated.exponents = { lft = 0.5 }", "no 'lft' .did you mean left"),
         (
             "calibrated.rates = [{ cue = 'road_left', feature = 'right', near = true, "
             "if_there = 0.5, if_not = 0.5 }]",

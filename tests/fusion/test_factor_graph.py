@@ -114,8 +114,7 @@ def test_marginals_equal_gtsam_discrete_factor_graph(
 @FEW_EXAMPLES
 @given(graphs_with_counts(), st.randoms(use_true_random=False))
 def test_order_of_frames_does_not_matter(
-    case: tuple[FactorGraph, list[dict[str, int]]],
-    random: Random,
+    case: tuple[FactorGraph, list[dict[str, int]]], random: Random
 ) -> None:
     graph, frames = case
     mixed = list(frames)

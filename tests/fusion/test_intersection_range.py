@@ -17,13 +17,7 @@ from crosscue.fusion.intersection_range import (
     smooth_ranges,
     update,
 )
-from crosscue.fusion.range_track import (
-    NOTHING,
-    RangeTrack,
-    Verdict,
-    advance_range,
-    fuse_range,
-)
+from crosscue.fusion.range_track import NOTHING, RangeTrack, Verdict, advance_range, fuse_range
 from crosscue.replay.vehicle.fusion import RangeFilter
 
 METRES = st.floats(-200.0, 200.0)

@@ -13,14 +13,7 @@ from hypothesis import strategies as st
 
 from crosscue.fusion.approaches import Approaches, Step, message_models_of
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
-from crosscue.fusion.factor_graph import (
-    CueNode,
-    Edge,
-    FactorGraph,
-    Feature,
-    graph_of,
-    log_odds,
-)
+from crosscue.fusion.factor_graph import CueNode, Edge, FactorGraph, Feature, graph_of, log_odds
 from crosscue.fusion.intersection_range import Reference
 from crosscue.fusion.persistence import Confirmed, Persistence, PersistentMessageModel
 from crosscue.fusion.situation import Situation
@@ -134,11 +127,7 @@ def test_frames_count_as_fraction_of_independent_ones_and_dissent_likewise() -> 
     ]
     assert hand_messages(road(1), repeated, road(1)) == [[1.0, 0.0], [0.0, 0.0], [0.8, 0.0]]
     assert hand_messages(road(1), unseen, road(1)) == [[1.0, 0.0], [0.0, 0.0], [0.8, 0.0]]
-    assert hand_messages(road(0), road(0, False), road(0)) == [
-        [-1.0, 0.0],
-        [0.0, 0.0],
-        [-0.8, 0.0],
-    ]
+    assert hand_messages(road(0), road(0, False), road(0)) == [[-1.0, 0.0], [0.0, 0.0], [-0.8, 0.0]]
 
 
 def test_moving_objects_count_by_time() -> None:

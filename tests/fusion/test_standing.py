@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from crosscue.fusion.approaches import Approaches, Step
@@ -96,13 +96,8 @@ def believed(frames: Sequence[FrameEvidence], fusion: Fusion) -> list[Step]:
     pause=[(dict.fromkeys(STATIC, 0), None, None, True)],
     times=600,
 )
-@settings(max_examples=40, deadline=None)
 def test_pause_of_any_length_leaves_belief_unchanged(
-    kind: str,
-    moves: list[tuple[Look, float, float]],
-    at: int,
-    pause: list[Look],
-    times: int,
+    kind: str, moves: list[tuple[Look, float, float]], at: int, pause: list[Look], times: int
 ) -> None:
     """Whatever a standing car sees, and although its odometry is uncertain and its gyro drifts."""
     drive = [evidence(*move) for move in moves]

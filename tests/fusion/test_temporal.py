@@ -469,7 +469,7 @@ STEPS = st.lists(
 
 
 @given(STEPS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_left_never_exceeds_intersection_and_mass_is_conserved(
     steps: list[tuple[dict[str, int], float, float, list[tuple[float, float]]]],
 ) -> None:
@@ -621,7 +621,6 @@ SEQUENCE = st.lists(
 
 
 @given(SEQUENCE, st.floats(0.0, 0.2))
-@settings(max_examples=60, deadline=None)
 def test_steps_respect_probability_bounds_and_hysteresis(
     frames: list[tuple[dict[str, int], float, float, tuple[float, float] | None, bool]],
     lapse: float,

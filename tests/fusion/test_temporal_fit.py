@@ -302,9 +302,7 @@ def test_redundant_cue_lowers_exponent(learned: Temporal, drives: list[Annotated
     assert learned.exponent < once.exponent
 
 
-def test_filter_recovers_features_of_held_out_drives(
-    learned: Temporal,
-) -> None:
+def test_filter_recovers_features_of_held_out_drives(learned: Temporal) -> None:
     model = temporal_model(GRAPH, learned)
     for is_ahead, left in ((True, True), (True, False), (False, False)):
         ends = [

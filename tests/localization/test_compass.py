@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.localization.angles import circular_mean, interpolate_angle, wrap_all
@@ -36,10 +36,7 @@ IRON = CompassSettings(
 
 
 def readings(
-    heading_rad: Floats,
-    compass: CompassSettings,
-    sd_t: float = 0.0,
-    seed: int = 0,
+    heading_rad: Floats, compass: CompassSettings, sd_t: float = 0.0, seed: int = 0
 ) -> Floats:
     """Simulate the magnetometer of a level car with this heading."""
     north = math.pi / 2 - compass.declination_rad - heading_rad - compass.mounting_yaw_rad
@@ -72,7 +69,6 @@ def test_facing_magnetic_north_is_a_quarter_turn_from_east() -> None:
 
 
 @given(true=st.floats(-3.1, 3.1))
-@settings(max_examples=60, deadline=None)
 def test_corrections_undo_iron_and_mounting(true: float) -> None:
     found = heading(readings(np.array([true]), IRON), IRON)
 

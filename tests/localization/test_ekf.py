@@ -77,7 +77,6 @@ def test_derivatives_over_a_quarter_turn_by_hand() -> None:
 
 
 @given(heading=HEADINGS, distance=st.floats(-40.0, 40.0), turn=st.floats(0.02, 1.5))
-@settings(max_examples=60, deadline=None)
 def test_derivatives_match_complex_steps(heading: float, distance: float, turn: float) -> None:
     expected = derivatives(np.array([2.0, -1.0, heading, 3.0]), distance, turn)
     found = odometry_derivatives(heading, distance, turn, np.eye(2))
@@ -150,7 +149,6 @@ def test_reversing_along_the_same_circle_returns_to_the_start() -> None:
 
 
 @given(turn=st.floats(-3.0, 3.0), distance=st.floats(-50.0, 50.0))
-@settings(max_examples=60, deadline=None)
 def test_two_half_arcs_equal_one_arc(turn: float, distance: float) -> None:
     whole, half = arc(distance, turn), arc(distance / 2, turn / 2)
     c, s = math.cos(turn / 2), math.sin(turn / 2)
@@ -177,7 +175,7 @@ def test_arc_series_and_closed_form_agree_at_the_switch() -> None:
 
 
 @given(heading=HEADINGS, turn=st.floats(-1.0, 1.0), seed=st.integers(0, 50))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_prediction_commutes_with_rotation_of_the_map(
     heading: float, turn: float, seed: int
 ) -> None:
@@ -226,7 +224,7 @@ def test_order_of_measurements_at_one_time_does_not_matter() -> None:
 
 
 @given(seed=st.integers(0, 500), steps=st.integers(1, 30))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_covariance_stays_symmetric_and_positive(seed: int, steps: int) -> None:
     rng = np.random.default_rng(seed)
     now = belief(seed=seed)
@@ -319,7 +317,7 @@ def test_variance_that_rounding_made_negative_is_accepted() -> None:
 
 
 @given(angle=st.floats(-1e6, 1e6))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_wrapping_keeps_the_direction(angle: float) -> None:
     wrapped = wrap(angle)
 

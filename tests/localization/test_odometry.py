@@ -46,7 +46,7 @@ def on_circle(radius_m: float, speed_mps: float, n: int = 101) -> WheelSamples:
 
 
 @given(speed=st.floats(-20.0, 40.0), scale=st.floats(0.9, 1.1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_straight_distance_is_speed_times_time_times_scale(speed: float, scale: float) -> None:
     made = integrate(both_wheels(speed), replace(CAR, wheel_scale=scale)).increments
 
@@ -70,11 +70,7 @@ def test_wheels_steering_and_gyro_agree_on_a_circle() -> None:
     steering = TurnSignal(times(n), np.full(n, 15.0 * math.atan(BASE_M / 12.0) + 0.1), "steering")
     rate = TurnSignal(times(n), np.full(n, (3.0 / 12.0) / 0.98 + 0.03), "yaw rate")
     car = replace(
-        CAR,
-        steering_ratio=15.0,
-        steering_offset_rad=0.1,
-        gyro_bias_radps=0.03,
-        yaw_rate_scale=0.98,
+        CAR, steering_ratio=15.0, steering_offset_rad=0.1, gyro_bias_radps=0.03, yaw_rate_scale=0.98
     )
     by_wheels = integrate(speeds, car).increments
     by_steering = integrate(speeds, car, steering).increments
@@ -207,7 +203,6 @@ def test_steering_noise_scales_with_the_derivative_of_the_turn(angle: float) -> 
     lag=st.integers(-400, 400),
     delay=st.integers(-60, 60),
 )
-@settings(max_examples=60, deadline=None)
 def test_windowed_increments_are_bit_identical(
     cuts: list[int], turn_period: int, lag: int, delay: int
 ) -> None:

@@ -16,10 +16,7 @@ from crosscue.replay.columns import Floats
 from support.simulated_drive import BASE_M, TRACK_M, Truth, drive, gyro, wheels
 
 CAR = OdometrySettings(
-    track_width_m=TRACK_M,
-    wheelbase_m=BASE_M,
-    slip_per_sqrt_m=0.02,
-    gyro_noise_rad_per_sqrt_s=1e-3,
+    track_width_m=TRACK_M, wheelbase_m=BASE_M, slip_per_sqrt_m=0.02, gyro_noise_rad_per_sqrt_s=1e-3
 )
 TRUE = {"wheel_scale": 1.02, "gyro_bias_radps": 0.01, "yaw_rate_scale": 0.97}
 LEVER = (1.5, -0.4)
@@ -73,9 +70,7 @@ def test_turning_drive_recovers_scales_and_bias_within_four_sd(
     assert fit.fix_sd_m == pytest.approx(0.5, rel=0.5)
 
 
-def test_nees_of_held_out_positions_is_in_its_band(
-    turning: tuple[KnownDrive, OdometryFit],
-) -> None:
+def test_nees_of_held_out_positions_is_in_its_band(turning: tuple[KnownDrive, OdometryFit]) -> None:
     found, fit = turning
     path = found.reckon(fit.start, fit.car)
     apart = path.xy_m - found.fixes.xy_m

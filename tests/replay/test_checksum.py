@@ -8,13 +8,12 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.replay.files import checksum
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.binary(max_size=9000), st.binary(max_size=300))
 def test_crc32_equals_zlib_in_one_or_two_pieces(first: bytes, second: bytes) -> None:
     expected = zlib.crc32(first + second)

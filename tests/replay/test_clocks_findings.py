@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.replay.clocks.findings import findings
@@ -86,7 +86,6 @@ def test_topics_without_common_clock_are_reported() -> None:
     assert [s.split(":")[0] for s in one_apart] == ["/can"]
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     st.lists(
         st.tuples(*[st.integers(-(2**63), 2**63 - 1) | st.integers(0, 10**11)] * 3), max_size=60

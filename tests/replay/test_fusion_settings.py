@@ -22,10 +22,7 @@ def fusion_of(text: str) -> Fusion:
             r"stripes: no feature 'strait' \(did you mean straight\?\); there are: intersection",
         ),
         ("[fusion.cues]\nstripes = { precision = 0.8 }", "neither supports nor excludes"),
-        (
-            "[fusion.cues]\nroad_left = { excludes = ['left'] }",
-            "road_left: a feature occurs twice",
-        ),
+        ("[fusion.cues]\nroad_left = { excludes = ['left'] }", "road_left: a feature occurs twice"),
         ("[fusion.cues]\nroad_left = { precision = 1.0 }", "precision: .*less than 1"),
         ("[fusion.cues]\nroad_left = { precission = 0.5 }", "precission: no such key"),
         ("[fusion.cues]\nroad_left = 0.5", "road_left: "),

@@ -250,11 +250,7 @@ def test_losses_of_unknown_topics_are_attributed_once_with_place_and_reason() ->
         Detail("/t", "torn", "at 10", 10, 1, is_dropped=True),
         Detail("/t", "cut", "at 30", 30, 3, is_dropped=True),
     ]
-    assert ledger.details == [
-        *before,
-        *first,
-        Detail("", "cut", "at 60", 60, 3, is_dropped=True),
-    ]
+    assert ledger.details == [*before, *first, Detail("", "cut", "at 60", 60, 3, is_dropped=True)]
 
     assert ledger.claim("/t", 2) == 2
     assert ledger.topic("/t").dropped == {"torn": 1, "cut": 5}

@@ -116,10 +116,7 @@ def test_one_module_reads_the_complete_form() -> None:
         & {*re.findall(r"\w+", path.read_text())}
     }
 
-    assert users == {
-        "replay/remote/address.py",
-        "replay/remote/logs.py",
-    }
+    assert users == {"replay/remote/address.py", "replay/remote/logs.py"}
 
 
 def test_error_of_a_store_carries_no_secret_in_any_attribute(

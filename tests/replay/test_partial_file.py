@@ -49,9 +49,7 @@ def _begin_partial_file(folder: Path) -> str:
     )
 
 
-def test_only_partial_files_of_dead_processes_are_swept(
-    tmp_path: Path,
-) -> None:
+def test_only_partial_files_of_dead_processes_are_swept(tmp_path: Path) -> None:
     with _child_process(_begin_partial_file(tmp_path)) as process:
         sweep(tmp_path, again=True)
         write_text(tmp_path / "b.txt", "b")

@@ -110,11 +110,7 @@ def max_transfer_bytes(path: Path, start_ns: int, end_ns: int) -> int:
 
 @pytest.mark.parametrize("command", ARGUMENTS)
 def test_window_of_remote_log_transfers_only_its_chunks(
-    command: str,
-    drive: Path,
-    tmp_path: Path,
-    web: Served,
-    capsys: pytest.CaptureFixture[str],
+    command: str, drive: Path, tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
 ) -> None:
     web.files["logs/drive.mcap"] = drive.read_bytes()
     words = [word.replace("OUT", str(tmp_path / "out")) for word in ARGUMENTS[command]]
@@ -132,11 +128,7 @@ def test_window_of_remote_log_transfers_only_its_chunks(
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["info", "convert", "decode", "replay", "detect"])
 def test_remote_log_yields_same_output_as_local_log(
-    command: str,
-    drive: Path,
-    tmp_path: Path,
-    web: Served,
-    capsys: pytest.CaptureFixture[str],
+    command: str, drive: Path, tmp_path: Path, web: Served, capsys: pytest.CaptureFixture[str]
 ) -> None:
     web.files["drive.mcap"] = drive.read_bytes()
     part = ["--from", "10", "--to", "13"]

@@ -13,12 +13,7 @@ import tomlkit
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.files.tree_text import (
-    MAX_DEPTH,
-    json_tree,
-    toml_tree,
-    yaml_tree,
-)
+from crosscue.replay.files.tree_text import MAX_DEPTH, json_tree, toml_tree, yaml_tree
 from support.every_format import EVERY_FORMAT
 from support.measured import measured
 
@@ -62,7 +57,7 @@ _VALUES: Final = st.recursive(
 
 
 # There is no deadline, because generating nested values is slow on some machines.
-@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(suppress_health_check=[HealthCheck.too_slow])
 @given(_VALUES, st.integers(0, MAX_DEPTH + 5))
 def test_json_within_depth_limit_equals_json_loads(value: object, around: int) -> None:
     text = "[" * around + json.dumps(value) + "]" * around
@@ -99,7 +94,6 @@ def test_deeply_nested_toml_is_refused(text: str) -> None:
 _TEXTS: Final = st.text("[]{}.=#\"'\\\na ", max_size=90)
 
 
-@settings(deadline=None)
 @given(st.dictionaries(_TEXTS, _TEXTS | st.lists(_TEXTS, max_size=3), max_size=4), _TEXTS)
 def test_toml_with_brackets_and_dots_in_texts_equals_tomllib(
     value: dict[str, object], comment: str

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.replay.base import EVERYTHING
@@ -39,7 +39,6 @@ _TIMES = st.lists(st.integers(0, 200 * SECOND), max_size=40, unique=True).map(so
 _SIZES = st.lists(st.integers(1, 9), max_size=12)
 
 
-@settings(deadline=None, max_examples=60)
 @given(wheels=_TIMES, gyro=_TIMES, wheel_sizes=_SIZES, gyro_sizes=_SIZES, apart=st.booleans())
 def test_every_sample_is_returned_once_in_order(
     wheels: list[int], gyro: list[int], wheel_sizes: list[int], gyro_sizes: list[int], apart: bool

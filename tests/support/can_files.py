@@ -295,11 +295,7 @@ def damaged(intact: bytes, seed: int) -> bytes:
 
 
 def assert_equal_to_python_can(
-    path: Path,
-    peer: Iterable[can.Message],
-    bus: str = "{}",
-    within_ns: int = 300,
-    missing: int = 0,
+    path: Path, peer: Iterable[can.Message], bus: str = "{}", within_ns: int = 300, missing: int = 0
 ) -> None:
     """Compare our frames with python-can's, whose times are floats in seconds."""
     found, ledger = read_back(path)

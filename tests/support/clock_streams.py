@@ -55,10 +55,7 @@ class Stream:
 
 
 def table_of(
-    topic: str,
-    log_ns: Int64s,
-    header_ns: Int64s | None = None,
-    publish_ns: Int64s | None = None,
+    topic: str, log_ns: Int64s, header_ns: Int64s | None = None, publish_ns: Int64s | None = None
 ) -> Block:
     """A block with times and one column of zeros."""
     return Block(topic, log_ns, Table({"zero": np.zeros(len(log_ns))}), publish_ns, header_ns)

@@ -254,8 +254,7 @@ def _pair(size: Size) -> tuple[Array, Array]:
 def _damo_yolo(size: Size) -> Sample:
     boxes, scores = _pair(size)
     return Sample(
-        {"kind": "yolo-nas", "boxes": "1123", "scores": "output"},
-        {"output": scores, "1123": boxes},
+        {"kind": "yolo-nas", "boxes": "1123", "scores": "output"}, {"output": scores, "1123": boxes}
     )
 
 

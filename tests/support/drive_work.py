@@ -55,10 +55,7 @@ def letters(job: Job) -> Letters:
         with TableSink(run, "pose", SCHEMA) as sink:
             sink.write({"t_ns": range(len(word)), "letter": list(word)})
             _obey(word, log)
-        write_manifest(
-            run,
-            estimated(account=account([_account(log, word)])),
-        )
+        write_manifest(run, estimated(account=account([_account(log, word)])))
     status = 3 if word == "loss" else 0
     return Letters(len(word), status, os.getpid(), os.environ.get("OMP_NUM_THREADS", ""))
 

@@ -42,32 +42,11 @@ def packet_lines(count: int) -> list[str]:
     for i in range(count):
         north, east = SPEED_MPS * np.sin(yaw[i]), SPEED_MPS * np.cos(yaw[i])
         sideways = SPEED_MPS * YAW_RATE_RADPS
-        numbers = [
-            lat[i],
-            lon[i],
-            alt[i],
-            0.0,
-            0.0,
-            np.arctan2(np.sin(yaw[i]), np.cos(yaw[i])),
-            north,
-            east,
-            SPEED_MPS,
-            0.0,
-            0.0,
-            0.0,
-            sideways,
-            9.81,
-            0.0,
-            sideways,
-            9.81,
-            0.0,
-            0.0,
-            YAW_RATE_RADPS,
-            0.0,
-            0.0,
-            YAW_RATE_RADPS,
-            0.05,
-            0.02,
+        numbers = np.r_[
+            (lat[i], lon[i], alt[i], 0.0, 0.0, np.arctan2(np.sin(yaw[i]), np.cos(yaw[i]))),
+            (north, east, SPEED_MPS, 0.0, 0.0),  # velocities
+            (0.0, sideways, 9.81, 0.0, sideways, 9.81),  # accelerations in two systems
+            (0.0, 0.0, YAW_RATE_RADPS, 0.0, 0.0, YAW_RATE_RADPS, 0.05, 0.02),  # rates, accuracies
         ]
         lines.append(" ".join(repr(float(n)) for n in numbers) + " 4 9 4 4 0")
     return lines

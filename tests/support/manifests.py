@@ -93,9 +93,5 @@ def log_account(log: str, topic: str, **counts: Any) -> LogAccount:
         dropped=dropped,
     )
     return LogAccount(
-        log=log,
-        integrity="not checkable",
-        is_whole=not dropped,
-        notices=(),
-        topics={topic: one},
+        log=log, integrity="not checkable", is_whole=not dropped, notices=(), topics={topic: one}
     )

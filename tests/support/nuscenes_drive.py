@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -33,9 +33,10 @@ def turn_wxyz(yaw: float) -> list[float]:
     return [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
 
 
-def table(folder: Path, name: str, rows: Sequence[Mapping[str, object]]) -> None:
+def table(folder: Path, name: str, keys: str, rows: Iterable[Sequence[object]]) -> None:
     """Write a table as in the published files, with each key on a separate line."""
-    (folder / f"{name}.json").write_text(json.dumps(rows, indent=0))
+    content = [dict(zip(keys.split(), row, strict=True)) for row in rows]
+    (folder / f"{name}.json").write_text(json.dumps(content, indent=0))
 
 
 def nuscenes_drive(path: Path, count: int = 12, *, with_can: bool = True, scenes: int = 1) -> Path:
@@ -43,168 +44,83 @@ def nuscenes_drive(path: Path, count: int = 12, *, with_can: bool = True, scenes
     tables = path / "v1.0-mini"
     tables.mkdir(parents=True)
     names = [f"scene-{61 + i:04d}" for i in range(scenes)]
-    table(tables, "scene", [{"token": f"s{i}", "name": name} for i, name in enumerate(names)])
-    table(
-        tables,
-        "sensor",
-        [
-            {"token": "cam", "channel": "CAM_FRONT", "modality": "camera"},
-            {"token": "lid", "channel": "LIDAR_TOP", "modality": "lidar"},
-        ],
-    )
+    table(tables, "scene", "token name", [(f"s{i}", name) for i, name in enumerate(names)])
+    sensors = [("cam", "CAM_FRONT", "camera"), ("lid", "LIDAR_TOP", "lidar")]
+    table(tables, "sensor", "token channel modality", sensors)
     matrix = [[FOCAL_PX, 0.0, 816.0], [0.0, FOCAL_PX, 491.0], [0.0, 0.0, 1.0]]
     table(
         tables,
         "calibrated_sensor",
+        "token sensor_token translation rotation camera_intrinsic",
         [
-            {
-                "token": "ccam",
-                "sensor_token": "cam",
-                "translation": CAMERA_M,
-                "rotation": OF_CAMERA,
-                "camera_intrinsic": matrix,
-            },
-            {
-                "token": "clid",
-                "sensor_token": "lid",
-                "translation": [0.9, 0.0, 1.8],
-                "rotation": [1.0, 0.0, 0.0, 0.0],
-                "camera_intrinsic": [],
-            },
+            ("ccam", "cam", CAMERA_M, OF_CAMERA, matrix),
+            ("clid", "lid", [0.9, 0.0, 1.8], [1.0, 0.0, 0.0, 0.0], []),
         ],
     )
-    samples, data, poses = [], [], []
-    for i in range(count):
-        t_us = FIRST_US + 100_000 * i
-        is_key = i % 5 == 0
-        if is_key:
-            samples.append(
-                {"token": f"p{i}", "timestamp": t_us, "scene_token": "s0", "prev": "", "next": ""}
-            )
+    times_us = [FIRST_US + 100_000 * i for i in range(count)]
+    keys = range(0, count, 5)
+    samples = [(f"p{i}", times_us[i], "s0", "", "") for i in keys]
+    table(tables, "sample", "token timestamp scene_token prev next", samples)
+    data, poses = [], []
+    for i, t_us in enumerate(times_us):
         east, north, yaw = pose(0.1 * i)
-        poses.append(
-            {
-                "token": f"e{i}",
-                "timestamp": t_us,
-                "translation": [east, north, 0.0],
-                "rotation": turn_wxyz(yaw),
-            }
-        )
-        folder = "samples" if is_key else "sweeps"
-        name = f"{folder}/CAM_FRONT/{t_us}.png"
-        data.append(
-            {
-                "token": f"d{i}",
-                "sample_token": f"p{i - i % 5}",
-                "ego_pose_token": f"e{i}",
-                "calibrated_sensor_token": "ccam",
-                "timestamp": t_us,
-                "fileformat": "png",
-                "is_key_frame": is_key,
-                "height": SIZE_PX[1],
-                "width": SIZE_PX[0],
-                "filename": name,
-                "prev": "",
-                "next": "",
-            }
-        )
+        poses.append((f"e{i}", t_us, [east, north, 0.0], turn_wxyz(yaw)))
+        name = f"{'samples' if i in keys else 'sweeps'}/CAM_FRONT/{t_us}.png"
+        tokens = (f"d{i}", f"p{i - i % 5}", f"e{i}", "ccam")
+        data.append((*tokens, t_us, "png", i in keys, *SIZE_PX[::-1], name, "", ""))
         (path / name).parent.mkdir(parents=True, exist_ok=True)
         (path / name).write_bytes(picture(i))
-    table(tables, "sample", samples)
-    table(tables, "sample_data", data)
-    table(tables, "ego_pose", poses)
-    _boxes(tables, count)
+    columns = "timestamp fileformat is_key_frame height width filename prev next"
+    references = "token sample_token ego_pose_token calibrated_sensor_token"
+    table(tables, "sample_data", f"{references} {columns}", data)
+    table(tables, "ego_pose", "token timestamp translation rotation", poses)
+    _boxes(tables, keys)
     if with_can:
         _can(path, count)
     return path
 
 
-def _boxes(tables: Path, count: int) -> None:
+def _boxes(tables: Path, keys: Iterable[int]) -> None:
     """Write boxes: a parked car 20 m ahead of the first pose, a pedestrian, and a car behind."""
+    names = ("vehicle.parked", "vehicle.moving", "pedestrian.moving")
+    table(tables, "attribute", "token name", [(f"a{i}", name) for i, name in enumerate(names, 1)])
+    kinds = [("k1", "vehicle.car"), ("k2", "human.pedestrian.adult")]
+    table(tables, "category", "token name", kinds)
+    table(tables, "instance", "token category_token", [("i1", "k1"), ("i2", "k2")])
+    # Instance, visibility, attributes, place, size and yaw, by the first letter of the token.
+    boxes: dict[str, tuple[str, str, list[str], list[float], list[float], float]] = {
+        "b": ("i1", "4", ["a1"], [620.0, 1603.0, 0.8], [1.9, 4.5, 1.6], 0.0),
+        "w": ("i2", "1", ["a3"], [640.0, 1600.0, 0.9], [0.6, 0.7, 1.8], 1.0),
+        "v": ("i1", "", [], [590.0, 1600.0, 0.9], [1.9, 4.5, 1.6], 0.0),
+    }
     table(
         tables,
-        "attribute",
+        "sample_annotation",
+        "token sample_token instance_token visibility_token attribute_tokens translation size "
+        "rotation",
         [
-            {"token": "a1", "name": "vehicle.parked"},
-            {"token": "a2", "name": "vehicle.moving"},
-            {"token": "a3", "name": "pedestrian.moving"},
+            (f"{letter}{i}", f"p{i}", *box, turn_wxyz(yaw))
+            for i in keys
+            for letter, (*box, yaw) in boxes.items()
         ],
     )
-    table(
-        tables,
-        "category",
-        [
-            {"token": "k1", "name": "vehicle.car"},
-            {"token": "k2", "name": "human.pedestrian.adult"},
-        ],
-    )
-    table(
-        tables,
-        "instance",
-        [
-            {"token": "i1", "category_token": "k1"},
-            {"token": "i2", "category_token": "k2"},
-        ],
-    )
-    rows = []
-    for i in range(0, count, 5):
-        rows += [
-            {
-                "token": f"b{i}",
-                "sample_token": f"p{i}",
-                "instance_token": "i1",
-                "visibility_token": "4",
-                "attribute_tokens": ["a1"],
-                "translation": [620.0, 1603.0, 0.8],
-                "size": [1.9, 4.5, 1.6],
-                "rotation": turn_wxyz(0.0),
-            },
-            {
-                "token": f"w{i}",
-                "sample_token": f"p{i}",
-                "instance_token": "i2",
-                "visibility_token": "1",
-                "attribute_tokens": ["a3"],
-                "translation": [640.0, 1600.0, 0.9],
-                "size": [0.6, 0.7, 1.8],
-                "rotation": turn_wxyz(1.0),
-            },
-            {
-                "token": f"v{i}",
-                "sample_token": f"p{i}",
-                "instance_token": "i1",
-                "visibility_token": "",
-                "attribute_tokens": [],
-                "translation": [590.0, 1600.0, 0.9],
-                "size": [1.9, 4.5, 1.6],
-                "rotation": turn_wxyz(0.0),
-            },
-        ]
-    table(tables, "sample_annotation", rows)
 
 
 def _can(path: Path, count: int) -> None:
     """Write CAN messages; steering is positive to the right, wheel speeds are in rpm."""
     folder = path / "can_bus"
     folder.mkdir()
-    wheels, steering, imu = [], [], []
-    for i in range(10 * count):
-        utime = FIRST_US + 10_000 * i
-        rpm = {
-            f"{wheel}_wheel_speed": (SPEED_MPS + side * 0.75 * YAW_RATE_RADPS)
-            * 60
-            / (2 * math.pi * WHEEL_RADIUS_M)
-            for wheel, side in (("FL", -1), ("FR", 1), ("RL", -1), ("RR", 1))
-        }
-        wheels.append({"utime": utime, "odom_speed": 21.6, **rpm})
-        steering.append({"utime": utime, "value": -0.7})
-        imu.append(
-            {
-                "utime": utime,
-                "linear_accel": [0.0, 0.6, 9.81],
-                "q": [1.0, 0.0, 0.0, 0.0],
-                "rotation_rate": [0.0, 0.0, YAW_RATE_RADPS],
-            }
-        )
-    for name, rows in (("zoe_veh_info", wheels), ("steeranglefeedback", steering), ("ms_imu", imu)):
-        (folder / f"scene-0061_{name}.json").write_text(json.dumps(rows))
+    per_mps = 60 / (2 * math.pi * WHEEL_RADIUS_M)
+    rpm = [
+        (SPEED_MPS + side * 0.75 * YAW_RATE_RADPS) * per_mps
+        for side in (-1, 1, -1, 1)  # front left and right, rear left and right
+    ]
+    times = [FIRST_US + 10_000 * i for i in range(10 * count)]
+    wheels = "FL_wheel_speed FR_wheel_speed RL_wheel_speed RR_wheel_speed"
+    turn, still = [0.0, 0.0, YAW_RATE_RADPS], [1.0, 0.0, 0.0, 0.0]
+    for name, keys, row in (
+        ("zoe_veh_info", f"odom_speed {wheels}", (21.6, *rpm)),
+        ("steeranglefeedback", "value", (-0.7,)),
+        ("ms_imu", "linear_accel q rotation_rate", ([0.0, 0.6, 9.81], still, turn)),
+    ):
+        table(folder, f"scene-0061_{name}", f"utime {keys}", [(utime, *row) for utime in times])

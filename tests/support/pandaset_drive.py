@@ -34,10 +34,7 @@ def pandaset_drive(folder: Path, count: int = COUNT) -> Path:
     (place / "timestamps.json").write_text(json.dumps(times.tolist()))
     (place / "intrinsics.json").write_text('{"fx": 1970.0, "fy": 1972.0, "cx": 970.5, "cy": 483.0}')
     poses = [
-        {
-            "position": {"x": x, "y": y, "z": 1.8},
-            "heading": dict(zip("wxyz", turn, strict=True)),
-        }
+        {"position": {"x": x, "y": y, "z": 1.8}, "heading": dict(zip("wxyz", turn, strict=True))}
         for (x, y), turn in zip(camera.tolist(), wxyz.tolist(), strict=True)
     ]
     (place / "poses.json").write_text(json.dumps(poses))

@@ -15,21 +15,8 @@ from rosbags.typesys.store import Typestore
 from crosscue.replay.columns import Block, Messages, Topic
 from crosscue.replay.decode import Decoder, decoder_for
 
-PRIMITIVES = (
-    "bool",
-    "byte",
-    "char",
-    "int8",
-    "uint8",
-    "int16",
-    "uint16",
-    "int32",
-    "uint32",
-    "int64",
-    "uint64",
-    "float32",
-    "float64",
-)
+_INTEGERS = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")
+PRIMITIVES = ("bool", "byte", "char", *_INTEGERS, "float32", "float64")
 NUMPY = {"bool": "bool", "byte": "i1", "char": "u1", "float32": "f4", "float64": "f8"}
 
 TIME = "builtin_interfaces/msg/Time"

@@ -63,24 +63,11 @@ def detections(frames: int = FRAMES) -> pa.Table:
             ("car", 0.97, (x, 40.0, x + 40.0, 52.0), mask),
             (LABEL, 0.5, (5.0, 5.0, 15.0, 15.0), None),
         ):
-            names = zip(("x0", "y0", "x1", "y1"), box, strict=True)
             rows.append(
-                {
-                    "frame": frame,
-                    "t_ns": at(frame),
-                    "camera": TOPIC,
-                    "detector": "finder",
-                    "label": label,
-                    "score": score,
-                    **dict(names),
-                    "mask": runs,
-                    "height_px": 12.0,
-                    "lens": None,
-                    "range_m": None,
-                    "range_sd_m": None,
-                    "picture_width_px": SIZE[0],
-                    "picture_height_px": SIZE[1],
-                }
+                {"frame": frame, "t_ns": at(frame), "camera": TOPIC, "detector": "finder"}
+                | dict(zip(("x0", "y0", "x1", "y1"), box, strict=True))
+                | {"label": label, "score": score, "mask": runs, "height_px": 12.0}
+                | {"picture_width_px": SIZE[0], "picture_height_px": SIZE[1]}
             )
     return pa.Table.from_pylist(rows, schema=arrow_schema(OF_RUN["detections"]))
 
@@ -88,18 +75,11 @@ def detections(frames: int = FRAMES) -> pa.Table:
 def road(frames: int = FRAMES) -> pa.Table:
     """Road table in which the lower half of every picture is road."""
     mask = rle.encode_mask(np.ones((5, 16), np.bool_), (0, 4), (16, 9))
+    fractions = {"fraction_left": 1.0, "fraction_straight": 1.0, "fraction_right": 0.1}
     rows = [
-        {
-            "frame": frame,
-            "t_ns": at(frame),
-            "camera": TOPIC,
-            "fraction_left": 1.0,
-            "fraction_straight": 1.0,
-            "fraction_right": 0.1,
-            "mask": mask,
-            "mask_width_px": 16,
-            "mask_height_px": 9,
-        }
+        {"frame": frame, "t_ns": at(frame), "camera": TOPIC, "mask": mask}
+        | fractions
+        | {"mask_width_px": 16, "mask_height_px": 9}
         for frame in range(frames)
     ]
     return pa.Table.from_pylist(rows, schema=arrow_schema(OF_RUN["road"]))

@@ -59,9 +59,7 @@ def mirrored(of: World) -> World:
     )
     flip = np.array([1.0, -1.0, 1.0])
     light = replace(
-        of.light,
-        to_sun=of.light.to_sun * flip,
-        sky=np.ascontiguousarray(of.light.sky[:, ::-1]),
+        of.light, to_sun=of.light.to_sun * flip, sky=np.ascontiguousarray(of.light.sky[:, ::-1])
     )
     return replace(
         of,

@@ -88,19 +88,19 @@ def true_ranges(approaches: Sequence[Approach]) -> TrueRanges:
     )
 
 
+def _table(types: Mapping[str, str], rows: Sequence[Sequence[object]]) -> pa.Table:
+    """Return a table of rows, with the names and types of its columns."""
+    schema = pa.schema([(name, pa.type_for_alias(kind)) for name, kind in types.items()])
+    return pa.Table.from_pylist([dict(zip(types, row, strict=True)) for row in rows], schema)
+
+
 def cue_table(found: Mapping[str, Mapping[int, int]]) -> pa.Table:
     """Cues table from counts by cue and frame."""
     rows = [
         (at(frame), cue, count) for cue, frames in found.items() for frame, count in frames.items()
     ]
-    return pa.table(
-        {
-            "t_ns": pa.array([row[0] for row in rows], pa.int64()),
-            "approach": pa.nulls(len(rows), pa.int64()),
-            "cue": pa.array([row[1] for row in rows], pa.string()),
-            "count": pa.array([row[2] for row in rows], pa.int64()),
-        }
-    )
+    types = {"t_ns": "int64", "approach": "int64", "cue": "string", "count": "int64"}
+    return _table(types, [(t_ns, None, cue, count) for t_ns, cue, count in rows])
 
 
 def frame_table(frames: int) -> pa.Table:
@@ -142,18 +142,13 @@ def range_table(
     """Range table of one row per frame with a constant error."""
     frames = range(first, last)
     offset = 0.0 if reference == "start" else 10.0
-    return pa.table(
-        {
-            "t_ns": pa.array([at(frame) for frame in frames], pa.int64()),
-            "approach": pa.array([number] * len(frames), pa.int64()),
-            "reference": pa.array([reference] * len(frames), pa.string()),
-            "range_m": pa.array(
-                [ENTER - frame + offset + error_m for frame in frames], pa.float64()
-            ),
-            "var_m2": pa.array([var_m2] * len(frames), pa.float64()),
-            "measured_m": pa.nulls(len(frames), pa.float64()),
-        }
-    )
+    types = {"t_ns": "int64", "approach": "int64", "reference": "string"}
+    types |= dict.fromkeys(("range_m", "var_m2", "measured_m"), "float64")
+    rows = [
+        (at(frame), number, reference, ENTER - frame + offset + error_m, var_m2, None)
+        for frame in frames
+    ]
+    return _table(types, rows)
 
 
 def tables(

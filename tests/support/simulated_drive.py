@@ -80,11 +80,7 @@ def gyro(
 
 
 def compass(
-    truth: Truth,
-    sd_rad: float,
-    rng: np.random.Generator,
-    every: int = 2,
-    persists_s: float = 0.0,
+    truth: Truth, sd_rad: float, rng: np.random.Generator, every: int = 2, persists_s: float = 0.0
 ) -> Headings:
     """Headings at every ``every``-th sample, with white or AR(1) errors (``persists_s``)."""
     t_ns = truth.t_ns[1::every]

@@ -5,11 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from crosscue.datasets.scenes.layout import (
-    CURVE_SLOPE,
-    KINDS,
-    mixed_layout,
-)
+from crosscue.datasets.scenes.layout import CURVE_SLOPE, KINDS, mixed_layout
 from crosscue.datasets.scenes.motion import conditions_of, lane_y_m
 from crosscue.datasets.scenes.world import build_world
 

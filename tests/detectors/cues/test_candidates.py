@@ -1,7 +1,7 @@
 """Tests of the tally of candidates: each is counted as used, or as skipped with a reason."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.detectors.base import Detections
@@ -102,7 +102,6 @@ UNPLACED = ("cars_past", "leg_traffic")
 
 
 @given(FRAMES, FRAMES, st.sampled_from([VEHICLE, TRACKED]))
-@settings(max_examples=60, deadline=None)
 def test_used_and_skipped_candidates_add_up_for_every_cue(
     objects: list[list[tuple[str, float, float]]],
     signs: list[list[tuple[str, float, float]]],

@@ -150,7 +150,7 @@ AT_THE_LIMIT: Final = (
 
 
 # The same examples each time, since such cases are known to exist.
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=200, derandomize=True)
 @given(steps=ego_motions, car=standing)
 @example(steps=AT_THE_LIMIT[0], car=AT_THE_LIMIT[1])
 def test_stationary_car_never_crosses_clearly_for_any_ego_motion(
@@ -161,7 +161,6 @@ def test_stationary_car_never_crosses_clearly_for_any_ego_motion(
         assert max(speeds_mps, default=0.0) < 1.1 * RULES.crossing_mps
 
 
-@settings(max_examples=60, deadline=None)
 @given(steps=ego_motions, car=standing, seed=st.integers(0, 99))
 def test_stationary_car_with_jittering_box_never_crosses(
     steps: list[CarStep], car: Car, seed: int
@@ -343,7 +342,7 @@ def test_outgoing_car_counts_within_the_resolved_distance(
     assert cars_past(tracks.longer(), camera, rules, Place(5.0, 15.0, 1.0)) == Ways(0, outgoing)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(steps=ego_motions, car=standing)
 def test_stationary_car_is_neither_oncoming_nor_outgoing(steps: list[CarStep], car: Car) -> None:
     assert not sum(past(car, steps, Place(1.0, 2.0, 0.1)) or ())

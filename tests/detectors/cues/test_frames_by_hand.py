@@ -246,10 +246,7 @@ def test_same_object_overlaps_by_more_than_half(left: float, is_same: bool) -> N
 
     assert [
         a.tolist() for a in same_objects((one, two), label_meanings(VEHICLE), (False, False))
-    ] == [
-        [KEPT],
-        [0 if is_same else KEPT],
-    ]
+    ] == [[KEPT], [0 if is_same else KEPT]]
 
 
 def test_overlap_of_exactly_half_is_another_object() -> None:
@@ -407,11 +404,7 @@ def test_own_tracker_pairs_the_cars() -> None:
             "no odometry, so the camera's own motion is unknown",
         ),
         (TRACKED, CarStep(0.5, 0.0, 0.0, 0.51), "frames further than 0.5 s apart"),
-        (
-            TRACKED.model_copy(update={"camera": Camera()}),
-            EGO,
-            "camera.focal_px is not set",
-        ),
+        (TRACKED.model_copy(update={"camera": Camera()}), EGO, "camera.focal_px is not set"),
     ],
 )
 def test_frames_without_tracked_cars_are_counted_by_reason(

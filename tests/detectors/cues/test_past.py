@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.detectors.cues.far_side import (
@@ -102,7 +102,6 @@ rows = st.lists(
 
 
 @given(found=rows, near=st.floats(1, 90), further=st.floats(0, 40))
-@settings(max_examples=60, deadline=None)
 def test_vehicles_past_decrease_with_range_and_are_symmetric(
     found: list[list[float]], near: float, further: float
 ) -> None:
@@ -124,7 +123,6 @@ def simulated_bursts(n: int, rng: np.random.Generator) -> Samples:
 
 
 @given(seed=st.integers(0, 999), t_ns=st.integers(0, 3 * S))
-@settings(max_examples=60, deadline=None)
 def test_state_depends_only_on_earlier_bursts(seed: int, t_ns: int) -> None:
     whole = simulated_bursts(30, np.random.default_rng(seed))
     known = whole.take(whole.t_ns <= t_ns)

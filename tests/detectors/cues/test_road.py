@@ -32,7 +32,7 @@ def test_fractions_are_plain_floats() -> None:
     assert [type(one) for one in (found.left, found.straight, found.right)] == [float] * 3
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 999))
 def test_mirrored_mask_swaps_left_and_right_fractions(seed: int) -> None:
     road = np.random.default_rng(seed).random((90, 160)) < 0.3

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.detectors import rle
@@ -23,12 +23,7 @@ from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Regions, Vehi
 SIZE = (1280, 720)
 MASK = (640, 360)
 CAMERA = Camera(
-    x_m=1.7,
-    z_m=1.5,
-    focal_px=900.0,
-    center_px=(640.0, 340.0),
-    pitch_rad=0.01,
-    pitch_sd_rad=0.005,
+    x_m=1.7, z_m=1.5, focal_px=900.0, center_px=(640.0, 340.0), pitch_rad=0.01, pitch_sd_rad=0.005
 )
 GROUND = Regions(kind="ground")
 DEPTH_M = 16.0
@@ -87,7 +82,6 @@ def test_rotated_camera_keeps_its_regions_on_the_ground() -> None:
     np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     start_m=st.floats(3.0, 60.0),
     right_m=st.floats(1.5, 11.0),

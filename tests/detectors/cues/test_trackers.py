@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.detectors import rle
@@ -68,7 +68,6 @@ def test_parked_car_counts_on_the_side_of_its_nose(nose: int, expected: Sides) -
     assert _sides(before, now) == (Sides(0, 0), expected)
 
 
-@settings(deadline=None, max_examples=40)
 @given(
     x=st.integers(60, 220),
     dx=st.integers(-25, 25),
@@ -124,7 +123,6 @@ def test_rectangular_profile_has_no_nose() -> None:
     assert nose_of(np.full(40, 12.0)) == 0
 
 
-@settings(deadline=None, max_examples=60)
 @given(
     h=st.integers(1, 12),
     w=st.integers(1, 12),

@@ -20,12 +20,7 @@ from crosscue.detectors.cues.tracked.judge import (
     is_past,
     parked,
 )
-from crosscue.detectors.cues.tracked.motion import (
-    CarMotion,
-    Observation,
-    motion_of,
-    place_of_end,
-)
+from crosscue.detectors.cues.tracked.motion import CarMotion, Observation, motion_of, place_of_end
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
 RULES = Cars(

@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 
 from crosscue.detectors.ranging.object_tracks import SAME_MAKE, shared_size
-from crosscue.detectors.ranging.standard_sizes import (
-    SizePrior,
-    light_size,
-)
+from crosscue.detectors.ranging.standard_sizes import SizePrior, light_size
 
 
 @pytest.mark.parametrize("aspect", [0.3, 1.0, 2.16, 3.05, 8.0])

@@ -88,10 +88,7 @@ BOX = np.array([900.0, 300.0, 914.0, 330.0])
 
 @pytest.mark.parametrize(
     ("text", "range_m", "sd_m"),
-    [
-        (FOCAL + CURVE, 60.0, 4.0),
-        (FOCAL, 1500.0 * 1.26 / 30.0 + 1.5, 0.15 * 63.0),
-    ],
+    [(FOCAL + CURVE, 60.0, 4.0), (FOCAL, 1500.0 * 1.26 / 30.0 + 1.5, 0.15 * 63.0)],
 )
 def test_default_range_is_used_without_a_fitted_curve(
     text: str, range_m: float, sd_m: float

@@ -1,6 +1,5 @@
 """A metric over versions, on the page and in the command's output."""
 
-import math
 import os
 import re
 from html.parser import HTMLParser
@@ -10,7 +9,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-import crosscue
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import create, write_manifest
 from crosscue.eval.runs.tags import write_tags
@@ -101,20 +99,3 @@ def test_history_without_matching_runs_or_metrics_is_refused(
     fleet: Path, words: list[str], status: int, message: str
 ) -> None:
     assert message in refusal(status, "history", fleet, *words)
-
-
-def test_names_are_escaped_in_the_page(fleet: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "hostile"
-    run = create(folder / "a", overwrite=False)
-    write_manifest(run, estimated())
-    write_tags(run.path, {"model": "<script>alert(1)</script>"})
-    (run.path / "score").mkdir()
-    part = DriveMetric("d", "cues.<b>.recall", "mean", 1.0, 2)
-    pq.write_table(by_drive_table(iter([part])), run.path / "score" / "by_drive.parquet")
-
-    found = crosscue.history(folder, tmp_path / "page.html", "model")
-
-    text = (tmp_path / "page.html").read_text()
-    assert "<script" not in text
-    assert "<b>" not in text
-    assert math.isnan(found.metrics[0].points[0].low)

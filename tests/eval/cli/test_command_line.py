@@ -173,11 +173,7 @@ def test_only_settings_that_determine_a_result_are_compared() -> None:
 
 @pytest.mark.parametrize(
     ("words", "printed"),
-    [
-        ("a --csv", "red,2.5\n"),
-        ("a --csv -q", ""),
-        ("a", "box files  a\nwidth m    2.5\n"),
-    ],
+    [("a --csv", "red,2.5\n"), ("a --csv -q", ""), ("a", "box files  a\nwidth m    2.5\n")],
 )
 def test_result_is_printed_in_the_chosen_format(
     words: str, printed: str, capsys: pytest.CaptureFixture[str]

@@ -136,11 +136,11 @@ def test_hostile_names_are_escaped_in_text_and_json() -> None:
     assert "\\\\x1b[31m" in text
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.text(max_size=90), st.text(max_size=60)), max_size=4),
     st.integers(40, 120),
 )
+@settings(max_examples=60)
 def test_tables_and_sentences_fit_the_terminal_width(
     rows: list[tuple[str, str]], width: int
 ) -> None:
@@ -190,11 +190,7 @@ def test_info_of_two_logs_as_json_combines_them(capsys: pytest.CaptureFixture[st
     ],
 )
 def test_time_segments_are_listed_and_several_exit_3(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    clock: Clock,
-    car: bool,
-    causes: list[str],
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], clock: Clock, car: bool, causes: list[str]
 ) -> None:
     words = ["info", str(write_drive(tmp_path, clock))]
     words += ["--vehicle", str(tmp_path / "car.toml")] if car else []

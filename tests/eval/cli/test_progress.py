@@ -38,9 +38,7 @@ def shown_text(line: ProgressLine, terminal: Terminal) -> str:
     return terminal.getvalue()
 
 
-def test_line_shows_amount_rate_and_time_left(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_line_shows_amount_rate_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = replaced_stderr(monkeypatch)
     with ProgressLine(is_shown=True) as line:
         line.at(Progress("converting", 1500, 6000, "rows"))

@@ -47,9 +47,7 @@ def failure(severity: float = 1.0, **changes: object) -> Failure:
     return Failure(**(usual | {"severity": severity} | changes))  # type: ignore[arg-type]
 
 
-def test_visible_sign_is_missed_until_its_first_detection(
-    drive: tuple[Path, Path],
-) -> None:
+def test_visible_sign_is_missed_until_its_first_detection(drive: tuple[Path, Path]) -> None:
     found = crosscue.failures(drive[0], truth=drive[1])
 
     (sign,) = [one for one in found.failures if one.what == "stop_sign"]
@@ -79,17 +77,11 @@ def test_overconfident_range_is_a_failure(tmp_path: Path) -> None:
     pq.write_table(table.set_column(column, "var_m2", pa.array(var)), path)
 
     (wrong,) = [f for f in crosscue.failures(folder, truth=truth).failures if f.kind == "range"]
-    assert (wrong.what, wrong.cause, wrong.frames) == (
-        "range to start",
-        "interval too narrow",
-        3,
-    )
+    assert (wrong.what, wrong.cause, wrong.frames) == ("range to start", "interval too narrow", 3)
     assert wrong.severity == pytest.approx(25.0 / (2.0 * math.log(2.0)))
 
 
-def test_run_without_truth_reports_only_flipped_beliefs(
-    drive: tuple[Path, Path],
-) -> None:
+def test_run_without_truth_reports_only_flipped_beliefs(drive: tuple[Path, Path]) -> None:
     found = crosscue.failures(drive[0])
 
     assert found.without_truth == (drive[0],)
@@ -114,12 +106,7 @@ def _flips(belief: BeliefRows, cues: Mapping[str, list[int]] | None = None) -> l
 def test_decided_belief_is_flipped_where_it_crosses_one_half() -> None:
     (flip,) = _flips(_belief(straight=[0.5, 0.95, 0.95, 0.6, 0.4, 0.05]))
 
-    assert (flip.kind, flip.what, flip.t_ns, flip.start_ns) == (
-        "flipped",
-        "straight",
-        at(4),
-        at(2),
-    )
+    assert (flip.kind, flip.what, flip.t_ns, flip.start_ns) == ("flipped", "straight", at(4), at(2))
     assert flip.severity == pytest.approx(-math.log2(0.05))
     assert flip.cause == "no cue speaks against it"
 

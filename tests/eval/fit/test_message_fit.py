@@ -15,12 +15,7 @@ from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.scoring.truth import read_scored_truth
 from crosscue.fusion.fit.annotated_approach import AnnotatedApproach
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
-from support.fusion_runs import (
-    made_up_drive,
-    write_empty_truth,
-    write_run,
-    write_truth,
-)
+from support.fusion_runs import made_up_drive, write_empty_truth, write_run, write_truth
 
 DRIVES = 16
 

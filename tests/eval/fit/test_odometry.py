@@ -49,9 +49,7 @@ def test_simulated_gyro_bias_is_estimated(fitted: FittedOdometry) -> None:
     assert abs(bias.value - BIAS) < 4.0 * bias.sd
 
 
-def test_fit_reduces_held_out_error_and_nees_is_within_band(
-    fitted: FittedOdometry,
-) -> None:
+def test_fit_reduces_held_out_error_and_nees_is_within_band(fitted: FittedOdometry) -> None:
     one = fitted.fitted.sources[0]
 
     assert one.after.held_out_m < one.before.held_out_m

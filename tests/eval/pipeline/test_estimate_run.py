@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from crosscue.datasets.scenes.drive import write_scene
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval.cli import run
-from support.oracle import Oracle
 
 pytestmark = pytest.mark.slow
 
@@ -62,10 +60,6 @@ def _replay(folder: Path, out: Path, *more: str) -> None:
     assert run(arguments) == 0
 
 
-def _tables(run_path: Path) -> dict[str, bytes]:
-    return {file.name: file.read_bytes() for file in sorted(run_path.glob("*.parquet"))}
-
-
 def _manifest(run_path: Path) -> dict[str, Any]:
     found: dict[str, Any] = json.loads((run_path / "manifest.json").read_text())
     return found
@@ -95,35 +89,6 @@ def test_rejected_candidates_are_explained_in_manifest_and_summary(
     assert f"range: {signs:,} stop signs measured, no curve" in printed
 
 
-def _fail_if_called(self: Oracle, frames: Sequence[object]) -> Sequence[object]:
-    raise AssertionError("a detector ran")
-
-
-def test_estimate_applies_new_settings_without_decoding_pictures(
-    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shutil.copytree(drive / "run", tmp_path / "run")
-    before = _tables(tmp_path / "run")
-    settings = (drive / "vehicle.toml").read_text() + "\n[fusion]\nestablished = 0.99\n"
-    (tmp_path / "v.toml").write_text(settings)
-    shutil.copy(drive / "simulated_car.dbc", tmp_path)
-    monkeypatch.setattr("crosscue.detectors.runner.decode", _fail_if_called)
-    monkeypatch.setattr("crosscue.detectors.images.decode", _fail_if_called)
-    monkeypatch.setattr(Oracle, "__call__", _fail_if_called)
-
-    assert run(["estimate", str(tmp_path / "run"), "--logs", str(drive), "-q"]) == 0
-    assert _tables(tmp_path / "run") == before
-    vehicle = str(tmp_path / "v.toml")
-    assert (
-        run(["estimate", str(tmp_path / "run"), "--logs", str(drive), "--vehicle", vehicle, "-q"])
-        == 0
-    )
-
-    after = _tables(tmp_path / "run")
-    assert after["belief.parquet"] != before["belief.parquet"]
-    assert after["detections.parquet"] == before["detections.parquet"]
-
-
 def test_only_detector_with_changed_settings_runs_again(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -140,23 +105,3 @@ def test_only_detector_with_changed_settings_runs_again(
 
     reported = json.loads(capsys.readouterr().out)["detected"]
     assert reported["ran"] == {"oracle": 0, "signs": reported["frames"]}
-
-
-def test_resumed_run_writes_same_bytes_as_uninterrupted_run(
-    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def killed(*_args: object, **_more: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("crosscue.eval.pipeline.whole_run.estimate", killed)
-        arguments = (
-            f"replay {drive / 'drive.mcap'} -o {tmp_path / 'run'} -q --vehicle "
-            f"{drive / 'vehicle.toml'} --no-cache"
-        ).split()
-        assert run(arguments) == 130
-    monkeypatch.setattr("crosscue.eval.pipeline.whole_run.detect", killed)
-
-    _replay(drive, tmp_path / "run", "--resume")
-
-    assert _tables(tmp_path / "run") == _tables(drive / "run")

@@ -9,10 +9,7 @@ from crosscue.detectors.base import Detections
 from crosscue.detectors.ranging.control_tracks import ControlTracks
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.detectors.ranging.usable import CUT
-from crosscue.eval.pipeline.scene.motion_ranges import (
-    UNCONFIRMED,
-    MotionRanges,
-)
+from crosscue.eval.pipeline.scene.motion_ranges import UNCONFIRMED, MotionRanges
 from crosscue.eval.pipeline.scene.sign_ranges import SignRanges
 from crosscue.fusion.evidence import RangePosterior
 from crosscue.fusion.intersection_range import Reference
@@ -40,10 +37,7 @@ class Drive:
         self.ranges = MotionRanges(car)
 
     def __call__(
-        self,
-        seen: Detections,
-        motion: CarStep = AHEAD,
-        without: frozenset[str] = frozenset(),
+        self, seen: Detections, motion: CarStep = AHEAD, without: frozenset[str] = frozenset()
     ) -> tuple[RangePosterior, ...]:
         """Process the next frame."""
         self.tracks([seen], motion)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval.pipeline.outcome import Outcome
@@ -62,12 +62,7 @@ def _replay(path: Path, blocks: Sequence[Block], vehicle: Vehicle | None = None)
 
 
 @pytest.mark.slow
-@settings(
-    max_examples=10,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-    phases=[Phase.explicit, Phase.reuse, Phase.generate],
-)
+@settings(max_examples=10, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(
     cut=st.integers(25, 175),
     offset_ns=st.integers(0, ROW - 1),

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, example, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
@@ -49,12 +49,7 @@ def _assert_equal(one: dict[str, list[object]], other: dict[str, list[object]]) 
 
 
 @pytest.mark.slow
-@settings(
-    max_examples=4,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-    phases=[Phase.explicit, Phase.reuse, Phase.generate],
-)
+@settings(max_examples=4, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(
     cut=st.integers(40, 95),
     by_ms=st.one_of(st.integers(-4_000_000, -350), st.integers(1_100, 4_000_000)),

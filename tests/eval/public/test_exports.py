@@ -11,9 +11,7 @@ from crosscue.eval import cli
 from crosscue.replay import errors as replay_errors
 
 
-def test_version_equals_output_of_the_command(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_version_equals_output_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["--version"]) == 0
 
     assert capsys.readouterr().out == f"crosscue {crosscue.__version__}\n"

@@ -40,9 +40,7 @@ def test_seal_check_finds_changed_log(drive: Path, tmp_path: Path) -> None:
     )
 
 
-def test_vehicle_draft_has_published_intrinsics_and_commented_sections(
-    tmp_path: Path,
-) -> None:
+def test_vehicle_draft_has_published_intrinsics_and_commented_sections(tmp_path: Path) -> None:
     text = crosscue.draft_vehicle(pandaset_drive(tmp_path / "002", 4)).text
 
     assert "focal_px = 1970  # published with the data set\ncenter_px = [970.5, 483]" in text

@@ -53,9 +53,7 @@ def _saved_recording(tmp_path: Path, **more: Any) -> Path:
     return path
 
 
-def test_each_frame_has_picture_marks_and_belief_on_the_timeline(
-    tmp_path: Path,
-) -> None:
+def test_each_frame_has_picture_marks_and_belief_on_the_timeline(tmp_path: Path) -> None:
     rows = _rows(_saved_recording(tmp_path))
 
     marks = (
@@ -127,7 +125,7 @@ def test_unsupported_picture_encodings_become_jpeg() -> None:
         shown(Encoded("raw", memoryview(b"too short"), layout))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 30), st.integers(0, 20), st.integers(3, 30), st.integers(3, 20))
 def test_outline_follows_the_border_of_the_mask(x: int, y: int, width: int, height: int) -> None:
     mask = rle.encode_mask(np.ones((height, width), np.bool_), (x, y), (64, 48))

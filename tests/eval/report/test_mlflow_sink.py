@@ -58,10 +58,7 @@ def test_scores_tags_and_report_are_stored_in_mlflow(
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize(
     ("uri", "status", "message"),
-    [
-        ("folder", 1, "unless MLFLOW_ALLOW_FILE_STORE=true is set"),
-        ("ftp://nowhere", 1, "ftp"),
-    ],
+    [("folder", 1, "unless MLFLOW_ALLOW_FILE_STORE=true is set"), ("ftp://nowhere", 1, "ftp")],
 )
 def test_unusable_mlflow_store_is_refused_before_scoring(
     tmp_path: Path, uri: str, status: int, message: str, monkeypatch: pytest.MonkeyPatch

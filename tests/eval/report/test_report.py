@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
@@ -20,9 +20,7 @@ from crosscue.eval.drives.score import mistakes_of
 from crosscue.eval.report.frame_pictures import draw_pictures
 from crosscue.eval.report.opening import opening_of
 from crosscue.eval.report.page import write_report, write_report_without_truth
-from crosscue.eval.report.scene_figures import (
-    draw_belief,
-)
+from crosscue.eval.report.scene_figures import draw_belief
 from crosscue.eval.report.svg_plot import ticks
 from crosscue.eval.runs.moments import moment_ns
 from crosscue.eval.scoring.runs import RunScored, judge_run, metrics_of, pooled_scores
@@ -176,7 +174,6 @@ def test_belief_without_true_distances_is_drawn_over_time(tmp_path: Path) -> Non
     assert chart.count("<polyline") + chart.count("<path") >= len(curve.features)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6), st.integers(2, 9))
 def test_ticks_are_few_round_and_inside_the_range(low: float, width: float, max_count: int) -> None:
     found = ticks(low, low + width, max_count)

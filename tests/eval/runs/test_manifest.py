@@ -11,12 +11,7 @@ from crosscue.eval import cli
 from crosscue.eval.batch.merge import merge_runs
 from crosscue.eval.runs.account import account
 from crosscue.eval.runs.folder import RunFolder, create, open_run, write_manifest
-from crosscue.eval.runs.manifest import (
-    FORMAT_VERSION,
-    EstimateManifest,
-    Manifest,
-    TimeSegments,
-)
+from crosscue.eval.runs.manifest import FORMAT_VERSION, EstimateManifest, Manifest, TimeSegments
 from crosscue.replay.errors import RunError
 from crosscue.replay.time.segments import Cause, Epoch, EpochMarks, LogClock, TimeSegment
 from support.manifests import detected, estimated, log_account

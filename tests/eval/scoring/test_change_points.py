@@ -47,9 +47,7 @@ def test_steps_are_found_at_their_versions() -> None:
     assert right >= 15
 
 
-def test_false_alarm_rate_is_as_stated(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_false_alarm_rate_is_as_stated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "SHUFFLES", 100)
     rng = np.random.default_rng(2)
     times = 300

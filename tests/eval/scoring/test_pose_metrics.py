@@ -77,7 +77,7 @@ def evo_errors(metric: Any, truth: Any, estimate: Any) -> tuple[Floats, dict[str
 
 
 @given(seed=SEEDS)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_ape_equals_evo(seed: int) -> None:
     truth = random_walk(seed)
     estimate = with_errors(truth, seed + 1)
@@ -94,7 +94,7 @@ def test_ape_equals_evo(seed: int) -> None:
 
 
 @given(seed=SEEDS, size_m=st.floats(0.5, 30.0), is_stationary=st.booleans())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_rpe_equals_evo(seed: int, size_m: float, is_stationary: bool) -> None:
     truth = random_walk(seed)
     if is_stationary:
@@ -114,7 +114,7 @@ def test_rpe_equals_evo(seed: int, size_m: float, is_stationary: bool) -> None:
 
 
 @given(seed=SEEDS)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_alignment_equals_evo(seed: int) -> None:
     truth = random_walk(seed)
     estimate = with_errors(truth, seed + 1)
@@ -141,7 +141,7 @@ def test_trajectory_compared_with_itself_has_no_error(how: Alignment) -> None:
 
 
 @given(seed=SEEDS, yaw=st.floats(-3.1, 3.1), x=st.floats(-50, 50), z=st.floats(-5, 5))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_yaw_alignment_recovers_rotation_about_vertical(
     seed: int, yaw: float, x: float, z: float
 ) -> None:
@@ -156,7 +156,7 @@ def test_yaw_alignment_recovers_rotation_about_vertical(
 
 
 @given(seed=SEEDS, turn_seed=SEEDS)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_rpe_is_invariant_under_rigid_transform(seed: int, turn_seed: int) -> None:
     truth = random_walk(seed)
     estimate = with_errors(truth, seed + 1)
@@ -240,44 +240,26 @@ def straight_track() -> Trajectory:
     return planar(np.arange(5, dtype=np.int64), np.arange(5.0), np.zeros(5), np.zeros(5))
 
 
+NO_COVERAGE = Coverage(0, 0, 0, 0, 0)
+TRACK = random_walk(1)
+
+
 @pytest.mark.parametrize(
-    ("call", "error", "message"),
+    ("call", "message"),
     [
-        (
-            lambda: align(stationary_track(), stationary_track(), "yaw"),
-            UsageError,
-            "do not determine yaw",
-        ),
-        (lambda: rpe(straight_track(), straight_track(), 9.0), UsageError, "no two of 5"),
-        (lambda: rpe(straight_track(), straight_track(), 0.0), ValueError, "expected > 0"),
-        (
-            lambda: pair_poses(later_track(), stationary_track(), 1),
-            UsageError,
-            "no true pose has an estimate",
-        ),
-        (
-            lambda: pair_poses(random_walk(1, 0), stationary_track(), 1),
-            UsageError,
-            "0 true and 5 estimated",
-        ),
-        (
-            lambda: pair_poses(random_walk(1), random_walk(2), 1, np.zeros((3, 6))),
-            ValueError,
-            r"expected \(60, 6\)",
-        ),
-        (
-            lambda: squared_errors(
-                Paired(random_walk(1), random_walk(1), None, Coverage(0, 0, 0, 0, 0)), 2
-            ),
-            ValueError,
-            "cov_xyh: needed for NEES",
-        ),
+        (lambda: align(stationary_track(), stationary_track(), "yaw"), "do not determine yaw"),
+        (lambda: rpe(straight_track(), straight_track(), 9.0), "no two of 5"),
+        (lambda: rpe(straight_track(), straight_track(), 0.0), "expected > 0"),
+        (lambda: pair_poses(later_track(), stationary_track(), 1), "no true pose has an estimate"),
+        (lambda: pair_poses(random_walk(1, 0), stationary_track(), 1), "0 true and 5 estimated"),
+        (lambda: pair_poses(TRACK, TRACK, 1, np.zeros((3, 6))), r"expected \(60, 6\)"),
+        (lambda: squared_errors(Paired(TRACK, TRACK, None, NO_COVERAGE), 2), "needed for NEES"),
     ],
 )
 def test_trajectories_that_cannot_be_scored_are_refused(
-    call: Callable[[], object], error: type[Exception], message: str
+    call: Callable[[], object], message: str
 ) -> None:
-    with pytest.raises(error, match=message):
+    with pytest.raises((UsageError, ValueError), match=message):
         call()
 
 

@@ -99,7 +99,7 @@ CHANGES = st.dictionaries(st.integers(0, 44), st.sampled_from([0.05, 0.6, 0.95])
 
 
 @given(st.fixed_dictionaries(dict.fromkeys(BELIEF, CHANGES)), st.integers(0, 44))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_full_detection_never_precedes_detection(
     changes: dict[str, dict[int, float]], ranged_from: int
 ) -> None:

@@ -20,8 +20,8 @@ from support.scoring import (
 )
 
 
-@settings(max_examples=50, deadline=None)
 @given(st.integers(0, 400), st.integers(1, 400), st.sampled_from([0.8, 0.95, 0.99]))
+@settings(max_examples=50)
 def test_wilson_interval_equals_scipy(right: int, more: int, confidence: float) -> None:
     from scipy.stats import binomtest
 
@@ -96,7 +96,7 @@ def test_hidden_objects_do_not_count_in_visible_recall() -> None:
     assert (score.recall.value, score.recall_seen.value) == (0.5, 1.0)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.dictionaries(st.integers(0, 55), st.integers(0, 3), min_size=1))
 def test_order_of_rows_does_not_matter(frames: dict[int, int]) -> None:
     from crosscue.eval.scoring.run_tables import run_tables
@@ -115,8 +115,8 @@ SPANS = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
 @given(SPANS, st.dictionaries(st.integers(0, 59), st.integers(0, 2), min_size=1))
+@settings(max_examples=60)
 def test_cue_scores_equal_count_frame_by_frame(
     spans: list[tuple[int, int, bool]], found: dict[int, int]
 ) -> None:

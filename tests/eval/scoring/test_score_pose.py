@@ -180,11 +180,7 @@ def test_score_reports_compared_body_and_assumed_mounting(tmp_path: Path) -> Non
     track = _turned(_circle(np.arange(0.5, 29.0, 0.05), 2.0), 0.016)
     mounting = {"x_m": None, "y_m": 0.0, "yaw_rad": 0.016}
     path = _truth(
-        tmp_path / "truth",
-        track,
-        pose_point="camera",
-        mounting=mounting,
-        mounting_source="by hand",
+        tmp_path / "truth", track, pose_point="camera", mounting=mounting, mounting_source="by hand"
     )
     vehicle = Vehicle(version=1, start=Start(heading_rad=0.0), camera=Camera(x_m=2.0))
 

@@ -7,7 +7,7 @@ from xml.etree import ElementTree as ET
 
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
@@ -129,7 +129,6 @@ def test_gate_fails_for_metric_that_was_not_scored(tmp_path: Path) -> None:
     assert "based on 30 rows" in messages[2]
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.text(min_size=1), st.text())
 def test_arbitrary_names_yield_valid_junit(metric: str, suite: str) -> None:
     gate = Gate.model_construct(metric=metric, min=0.5, max=None, use="value", min_count=1)

@@ -24,19 +24,10 @@ from crosscue.eval.studies.intervals import (
 from crosscue.eval.studies.town import work
 from crosscue.eval.studies.town.field_study import drive_field, finish_field
 from crosscue.eval.studies.town.landmark_study import summarise_landmarks
-from crosscue.eval.studies.town.range_study import (
-    calibrate,
-    drive_choices,
-    summarise_ranges,
-)
+from crosscue.eval.studies.town.range_study import calibrate, drive_choices, summarise_ranges
 from crosscue.eval.studies.town.replayed import through_log
 from crosscue.eval.studies.town.run import drive_study, finish_landmarks, finish_range
-from crosscue.eval.studies.town.settings import (
-    FieldStudy,
-    LandmarkStudy,
-    RangeStudy,
-    load_study,
-)
+from crosscue.eval.studies.town.settings import FieldStudy, LandmarkStudy, RangeStudy, load_study
 from crosscue.eval.studies.town.work import assemble, chunks_of, run, split
 from crosscue.localization.town.drive import DriveResult, Keys, drive_many
 from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
@@ -166,27 +157,21 @@ def test_distance_until_loss_decreases_with_compass_interval() -> None:
         assert one.lost_after_m[None].value < 1000.0
 
 
+RANGE = 'version = 1\nkind = "range"\n'
+
+
 @pytest.mark.parametrize(
     ("text", "reported"),
     [
-        ('version = 1\nkind = "range"\n[drive.car]\ncruize_mps = 9.0\n', r":4: .*cruise_mps"),
-        (
-            'version = 1\nkind = "range"\ndrivs = 3\n',
-            r":3: drivs: no such key; did you mean drives",
-        ),
+        (f"{RANGE}[drive.car]\ncruize_mps = 9.0\n", r":4: .*cruise_mps"),
+        (f"{RANGE}drivs = 3\n", r":3: drivs: no such key; did you mean drives"),
         ('version = 1\nkind = "landmarks"\n', "expected \"range\" here, got 'landmarks'"),
         ('kind = "range"\n', "version: missing"),
         ('version = 2\nkind = "range"\n', "version"),
-        ('version = 1\nkind = "range"\ndrives = 0\n', ":3: drives"),
-        ('version = 1\nkind = "range"\ncompass_2sigma_deg = [500.0]\n', ":3: compass_2sigma_deg"),
-        (
-            'version = 1\nkind = "range"\n[drive]\ngoals = 3\n',
-            r":4: drive\.goals: set by the study",
-        ),
-        (
-            'version = 1\nkind = "range"\ncompass_2sigma_deg = []\nwithout_compass = false\n',
-            ":4: without_compass: .*expected a compass",
-        ),
+        (f"{RANGE}drives = 0\n", ":3: drives"),
+        (f"{RANGE}compass_2sigma_deg = [500.0]\n", ":3: compass_2sigma_deg"),
+        (f"{RANGE}[drive]\ngoals = 3\n", r":4: drive\.goals: set by the study"),
+        (f"{RANGE}compass_2sigma_deg = []\nwithout_compass = false\n", ":4: .*expected a compass"),
         ("version = 1\nkind = \n", "not TOML"),
     ],
 )

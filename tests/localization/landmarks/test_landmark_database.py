@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from crosscue.localization.landmarks.database import (
@@ -82,7 +82,6 @@ def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
     correlation=st.floats(-1.0, 1.0),
     sigmas=st.floats(0.1, 4.0),
 )
-@settings(max_examples=60, deadline=None)
 def test_ellipse_query_matches_an_exhaustive_search(
     grid: Path, x: float, y: float, sd: tuple[float, float], correlation: float, sigmas: float
 ) -> None:
@@ -150,7 +149,6 @@ def test_changed_coordinates_and_covariance_are_found(tmp_path: Path) -> None:
 
 @given(st.integers(0, 10_000), st.integers(1, 255))
 @example(where=3379, flip=128)
-@settings(max_examples=60, deadline=None)
 def test_damaged_byte_is_refused_or_harmless(
     tmp_path_factory: pytest.TempPathFactory, where: int, flip: int
 ) -> None:

@@ -41,7 +41,7 @@ def test_matching_is_deterministic(name: str) -> None:
 
 
 @given(st.integers(0, 1000), st.integers(0, 60), st.integers(0, 60))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_random_features_of_any_count_can_be_matched(seed: int, one: int, other: int) -> None:
     match = ORB.match(some_features(seed, one), some_features(seed + 1, other))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.eval.scoring.consistency import mean_band
@@ -47,7 +47,6 @@ def some_belief(seed: int, heading: float = 0.3) -> PoseBelief:
 
 
 @given(st.integers(0, 1000), st.floats(-20.0, 20.0), st.floats(-20.0, 20.0))
-@settings(max_examples=40, deadline=None)
 def test_update_of_the_axle_is_the_joseph_form(seed: int, x: float, y: float) -> None:
     belief, measured = some_belief(seed), np.array([x, y])
 
@@ -68,7 +67,6 @@ def test_update_of_the_axle_is_the_joseph_form(seed: int, x: float, y: float) ->
     left=st.floats(-2.0, 2.0),
     heading=st.floats(-3.14, 3.14),
 )
-@settings(max_examples=40, deadline=None)
 def test_update_with_a_lever_keeps_covariance_symmetric_and_positive(
     seed: int, ahead: float, left: float, heading: float
 ) -> None:

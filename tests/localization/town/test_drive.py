@@ -95,9 +95,7 @@ def test_traced_drive_matches_python_step_by_step() -> None:
     np.testing.assert_allclose(traced.events, log.events, rtol=1e-9, atol=1e-9)
 
 
-def test_compiled_code_fingerprint_changes_with_a_called_module(
-    tmp_path: Path,
-) -> None:
+def test_compiled_code_fingerprint_changes_with_a_called_module(tmp_path: Path) -> None:
     def named() -> str:
         place = importlib.util.spec_from_file_location("crosscue.below", tmp_path / "below.py")
         assert place is not None

@@ -11,12 +11,7 @@ import pytest
 
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import wrap_all
-from crosscue.localization.town.drive import (
-    DriveResult,
-    Traced,
-    drive_many,
-    drive_traced,
-)
+from crosscue.localization.town.drive import DriveResult, Traced, drive_many, drive_traced
 from crosscue.localization.town.settings import Sensors, TownDrive
 from crosscue.replay.columns import Floats
 from support.arc_consistency import nees_along_the_arc

@@ -8,9 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.can.database import CanDatabase
-from crosscue.replay.can.decode import (
-    BusDecoder,
-)
+from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.can.layout import CanMessage, CanSignal
 from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, CanFrames
 from crosscue.replay.ledger import Ledger
@@ -42,9 +40,7 @@ def decoder(
     return BusDecoder(DATABASE, "can0", ledger, selected, allow_longer=allow_longer), ledger
 
 
-def test_number_of_counted_unknown_ids_is_bounded(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_number_of_counted_unknown_ids_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("crosscue.replay.can.decode.COUNTS_KEPT", 10)
     decode, ledger = decoder()
     ids = np.arange(1000, 1100, dtype=np.uint32)
@@ -72,7 +68,7 @@ IDS = st.sampled_from([0x100, 0x101, 0x200, 0x300, 0x400, 0x500])
     ),
     allow_longer=st.booleans(),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_every_frame_is_decoded_or_counted(
     rows: list[tuple[int, bool, int, int, int, bool]], allow_longer: bool
 ) -> None:

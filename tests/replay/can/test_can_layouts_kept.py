@@ -62,7 +62,7 @@ def _reprs(messages: list[CanMessage]) -> list[str]:
 
 @pytest.mark.slow
 @given(message=st.one_of(messages(), messages(multiplexed=True)))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_random_layouts_equal_cantools(message: CanMessage) -> None:
     source = DatabaseText(Path("x.dbc"), dbc_text([message]))
 

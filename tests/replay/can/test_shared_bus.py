@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.replay.can.database import CanDatabase
@@ -27,7 +27,6 @@ FRAME = st.tuples(
 )
 
 
-@settings(deadline=None)
 @given(frames=st.lists(FRAME, min_size=1, max_size=30))
 def test_each_frame_is_accounted_for_by_exactly_one_decoder(
     frames: list[tuple[int, int, bool, bool, int]],
@@ -43,12 +42,7 @@ def test_each_frame_is_accounted_for_by_exactly_one_decoder(
     )
     log_ns = np.arange(len(frames), dtype=np.int64)
     ledger = Ledger("made up")
-    car = BusDecoder(
-        CanDatabase.of([SPEED, TWIN]),
-        "can0",
-        ledger,
-        elsewhere=all_ids(TEN_SLOTS),
-    )
+    car = BusDecoder(CanDatabase.of([SPEED, TWIN]), "can0", ledger, elsewhere=all_ids(TEN_SLOTS))
 
     decoded = sum(len(block) for block in car(Block("can0", log_ns, rows)))
     admitted = len(Admission("can0", ledger, TEN_SLOTS)(rows, log_ns))

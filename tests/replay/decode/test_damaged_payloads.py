@@ -89,7 +89,7 @@ KINDS: Final[dict[str, tuple[Callable[[np.random.Generator, str], tuple[Topic, b
 
 @pytest.mark.parametrize("kind", KINDS)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 9))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_only_the_damaged_message_is_dropped(kind: str, seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     make, name = KINDS[kind]

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.replay.columns import Int64s
-from crosscue.replay.mobileye.clock import (
-    SET_ANEW,
-    WENT_BACK,
-    unwrap,
-)
+from crosscue.replay.mobileye.clock import SET_ANEW, WENT_BACK, unwrap
 
 MS = 1_000_000
 
@@ -30,7 +26,6 @@ def error_without_offset(image_ns: Int64s, truth_ns: Int64s) -> Int64s:
 
 
 @given(seed=st.integers(0, 1000), period_ms=st.integers(50, 110), jitter_ms=st.integers(0, 90))
-@settings(max_examples=40, deadline=None)
 def test_arrival_jitter_is_removed(seed: int, period_ms: int, jitter_ms: int) -> None:
     rng = np.random.default_rng(seed)
     image_ns, counter_ms = camera(400, period_ms)
@@ -48,7 +43,6 @@ def test_arrival_jitter_is_removed(seed: int, period_ms: int, jitter_ms: int) ->
     counters=st.lists(st.integers(0, 255), min_size=1, max_size=60),
     steps=st.lists(st.integers(0, 3 * 10**11), min_size=60, max_size=60),
 )
-@settings(max_examples=60, deadline=None)
 def test_image_times_are_ordered_and_precede_their_frames(
     counters: list[int], steps: list[int]
 ) -> None:

@@ -88,7 +88,7 @@ def cubic(lanes: Table, x_m: float) -> float:
 
 @pytest.mark.slow
 @given(seed=st.integers(0, 10_000), cuts=st.lists(st.integers(0, 400), max_size=6))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_tables_do_not_depend_on_block_division(seed: int, cuts: list[int]) -> None:
     """This also holds for a damaged log, in which frames are missing or repeated."""
     rng = np.random.default_rng(seed)
@@ -110,7 +110,7 @@ def test_tables_do_not_depend_on_block_division(seed: int, cuts: list[int]) -> N
 
 @pytest.mark.slow
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_lost_frames_never_add_a_row(seed: int) -> None:
     rng = np.random.default_rng(seed)
     drive = random_drive(10, rng)
@@ -125,7 +125,6 @@ def test_lost_frames_never_add_a_row(seed: int) -> None:
 
 
 @given(seed=st.integers(0, 100_000))
-@settings(max_examples=40, deadline=None)
 def test_arbitrary_frames_are_accounted_for(seed: int) -> None:
     """Random payloads, lengths, kinds and times with ids of the table and others."""
     rng = np.random.default_rng(seed)

@@ -18,11 +18,7 @@ from support.mobileye_frames import MS, block_of, random_drive, random_words, va
 
 
 def encode_burst(
-    image_ns: int,
-    objects: Table,
-    settings: MobileyeSettings,
-    *,
-    latency_ns: int = LATENCY_NS,
+    image_ns: int, objects: Table, settings: MobileyeSettings, *, latency_ns: int = LATENCY_NS
 ) -> Block:
     """Return the frames of one image: a status frame, then A, B and C of each sent obstacle."""
     times = np.array([image_ns], dtype=np.int64)
@@ -61,7 +57,7 @@ def assert_same_frames(actual: Block, expected: Block) -> None:
 @pytest.mark.parametrize("revision", ["classic", "2.32"])
 @pytest.mark.parametrize("how", [ROTATED, UNROTATED])
 @given(seed=st.integers(0, 100_000))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 def test_encoding_decoded_tables_restores_frames(
     revision: str, how: MobileyeSettings, seed: int
 ) -> None:
@@ -148,7 +144,7 @@ MAX_ERROR = {
 
 
 @given(seed=st.integers(0, 100_000), n=st.integers(1, 60))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_decoded_obstacles_are_within_half_a_step(seed: int, n: int) -> None:
     columns, image_ns = scene(seed, n)
     blocks = bursts_of(np.array(image_ns, dtype=np.int64), Table(columns), UNROTATED)

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.replay.errors import SchemaError
@@ -80,7 +80,6 @@ def test_invalid_layout_is_refused(text: str, message: str) -> None:
 @given(
     start=st.integers(0, 63), bits=st.integers(1, 32), signed=st.booleans(), seed=st.integers(0, 99)
 )
-@settings(max_examples=60, deadline=None)
 def test_extract_inverts_place(start: int, bits: int, signed: bool, seed: int) -> None:
     bits = min(bits, 64 - start)
     low = -(1 << (bits - 1)) if signed else 0

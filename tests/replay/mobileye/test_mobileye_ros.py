@@ -67,7 +67,7 @@ def sorted_by_time(table: Table) -> Table:
 
 @pytest.mark.slow
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_messages_decode_to_same_columns_as_frames(seed: int) -> None:
     drive = random_drive(6, np.random.default_rng(seed))
     can = tables_from_can(drive)
@@ -113,7 +113,7 @@ def test_standalone_messages_decode_to_same_columns_as_frames(name: str, variant
 
 @pytest.mark.slow
 @given(seed=st.integers(0, 10_000), cut=st.integers(0, 60), order=st.permutations(range(5)))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_tables_do_not_depend_on_topic_interleaving(seed: int, cut: int, order: list[int]) -> None:
     """A reader may yield a block of one topic long before the others."""
     messages = messages_of(random_drive(12, np.random.default_rng(seed)))

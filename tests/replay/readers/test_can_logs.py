@@ -22,7 +22,7 @@ def _file(folder: Path, kind: Kind, content: bytes) -> Path:
 
 @EVERY_KIND
 @given(seed=st.integers(0, 2**31))
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 def test_frames_survive_write_and_read(
     tmp_path_factory: pytest.TempPathFactory, kind: Kind, seed: int
 ) -> None:

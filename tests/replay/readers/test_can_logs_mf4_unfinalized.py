@@ -132,12 +132,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "list with its last blocks missing": {"virtual": False, "stretch": 999, "flags": 0x35},
     "deflated": {"virtual": False, "stretch": 999, "coding": 0, "flags": 0x21},
     "transposed": {"virtual": True, "stretch": 999, "coding": 1, "flags": 0x21},
-    "deflated, last blocks missing": {
-        "virtual": True,
-        "stretch": 999,
-        "coding": 0,
-        "flags": 0x31,
-    },
+    "deflated, last blocks missing": {"virtual": True, "stretch": 999, "coding": 0, "flags": 0x31},
     "finalized": {"virtual": True, "is_finalized": True},
     "finalized, one group": {"virtual": False, "is_finalized": True},
 }

@@ -334,7 +334,7 @@ def trc_without(version: str, count: int, deleted: set[int]) -> LogWithGaps:
 
 @pytest.mark.parametrize("version", ["1.0", "1.1", "1.2", "1.3", "2.1"])
 @given(deleted=st.sets(st.integers(0, 59)))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_every_deleted_row_of_trc_log_is_reported_as_dropped(
     tmp_path_factory: pytest.TempPathFactory, version: str, deleted: set[int]
 ) -> None:

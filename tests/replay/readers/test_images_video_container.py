@@ -7,7 +7,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.base import Selection
@@ -109,9 +109,7 @@ def test_selection_limits_pictures_and_counts_the_rest(tmp_path: Path) -> None:
     assert not_asked.topic("a").skipped == {NOT_ASKED_TOPIC: N}
 
 
-@settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=25)
 @given(fraction=st.floats(0.0, 0.98))
 @pytest.mark.parametrize(
     ("name", "codec", "container", "tail"),
@@ -143,10 +141,8 @@ def test_truncated_video_is_refused_or_reported(
     assert all(number == t_ns // 50_000_000 for t_ns, number in shown.items())
 
 
-@settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
 @given(at=st.integers(0, 10**6), junk=st.binary(min_size=1, max_size=16))
+@settings(max_examples=60)
 def test_damaged_video_is_read_or_refused_in_one_line(tmp_path: Path, at: int, junk: bytes) -> None:
     whole = tmp_path / "a.mp4"
     if not whole.exists():

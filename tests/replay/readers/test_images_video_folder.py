@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.columns import Block, Images
@@ -44,9 +44,7 @@ def test_pictures_are_read_in_natural_order_with_their_times(tmp_path: Path, suf
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
-@settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=25)
 @given(fraction=st.floats(0.0, 0.999))
 def test_truncated_picture_is_reported(tmp_path: Path, suffix: str, fraction: float) -> None:
     folder = picture_folder(tmp_path / "front", 2, "0.5\n1.5", suffix)

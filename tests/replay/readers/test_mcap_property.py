@@ -24,7 +24,6 @@ MESSAGES = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     messages=MESSAGES,
     compression=st.sampled_from(list(CompressionType)),
@@ -35,6 +34,7 @@ MESSAGES = st.lists(
     statistics=st.booleans(),
     data_crc=st.booleans(),
 )
+@settings(max_examples=60)
 def test_messages_match_mcap_package(
     messages: list[tuple[int, int, int, bytes]],
     compression: CompressionType,

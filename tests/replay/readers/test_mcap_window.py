@@ -58,7 +58,7 @@ def files(draw: st.DrawFn) -> McapFile:
 
 
 @pytest.mark.slow
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=120)
 @given(
     file=files(),
     topics=st.none() | st.frozensets(st.sampled_from(["/t0", "/t1", "/t2", "/t3", "/none"])),

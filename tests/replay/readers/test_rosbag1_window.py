@@ -31,7 +31,6 @@ def read_by_complete_pass(path: Path, selection: Selection) -> Reading:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 1000),
     mixed=st.sampled_from([0, 3, 300]),
@@ -40,6 +39,7 @@ def read_by_complete_pass(path: Path, selection: Selection) -> Reading:
     start_ns=BOUND,
     end_ns=BOUND,
 )
+@settings(max_examples=60)
 def test_time_range_yields_same_rows_as_complete_pass(
     seed: int,
     mixed: int,

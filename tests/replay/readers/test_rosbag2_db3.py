@@ -11,17 +11,8 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag2 import Reader
 
-from crosscue.replay.errors import LogFormatError
-from crosscue.replay.logs.opening import open_log
 from support.data import shared
-from support.rosbag_files import (
-    Row,
-    damaged_copies,
-    judge,
-    read_rows,
-    rows_of,
-    write_folder,
-)
+from support.rosbag_files import Row, damaged_copies, judge, read_rows, rows_of, write_folder
 
 TABLES = """
 CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
@@ -171,21 +162,6 @@ def test_two_types_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
 
     assert [row.payload for row in reading.rows] == [b"text", b"more text"]
     assert reading.ledger.topic("/a").skipped == {"another message type on the same topic": 1}
-
-
-@pytest.mark.parametrize(
-    ("content", "match"),
-    [(b"", "begins with b''"), (b"SQLite format 2", "SQLite format 3"), (b"\0" * 999, "SQLite")],
-)
-def test_unsupported_file_is_refused_in_one_line(
-    tmp_path: Path, content: bytes, match: str
-) -> None:
-    path = tmp_path / "a.db3"
-    path.write_bytes(content)
-
-    with pytest.raises(LogFormatError, match=match) as refused:
-        open_log(path)
-    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.slow

@@ -66,7 +66,7 @@ def test_every_kind_of_folder_is_read_completely(
 
 
 @pytest.mark.slow
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(cuts=st.lists(st.integers(0, 300), min_size=2, max_size=4), seed=st.integers(0, 99))
 def test_rows_split_over_files_are_read_in_order(
     tmp_path_factory: pytest.TempPathFactory, cuts: list[int], seed: int

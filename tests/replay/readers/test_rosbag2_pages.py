@@ -92,7 +92,6 @@ def fill(db: sqlite3.Connection, seed: int, count: int, largest: int, has_index:
 
 
 @pytest.mark.slow
-@settings(max_examples=40, deadline=None)
 @given(
     page_bytes=st.sampled_from([512, 1024, 2048, 4096, 8192, 16384, 32768, 65536]),
     reserved=st.integers(0, 32),
@@ -102,6 +101,7 @@ def fill(db: sqlite3.Connection, seed: int, count: int, largest: int, has_index:
     largest=st.sampled_from([10, 5000, 200_000]),
     seed=st.integers(0, 1 << 30),
 )
+@settings(max_examples=40)
 def test_rows_read_from_pages_equal_sqlite_rows(
     tmp_path_factory: pytest.TempPathFactory,
     page_bytes: int,

@@ -27,12 +27,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import BAD_SCHEMA, NO_TYPE, TOO_EARLY, LogWriter
 from crosscue.replay.write.mcap import ChannelMessages, Compression, McapWriter
 from support.data import shared
-from support.ros_messages import (
-    messages_of,
-    random_message,
-    ros2_store,
-    ros2_topic,
-)
+from support.ros_messages import messages_of, random_message, ros2_store, ros2_topic
 
 SCHEMA = b"float64 data\n"
 
@@ -61,7 +56,7 @@ def messages_by_index(path: Path) -> list[tuple[str, int, bytes]]:
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_each_message_is_stored_once_in_topic_order(
     seed: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

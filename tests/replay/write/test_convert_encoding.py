@@ -10,15 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from crosscue.replay.columns import (
-    Block,
-    CanFrames,
-    Images,
-    Messages,
-    Rows,
-    Table,
-    Topic,
-)
+from crosscue.replay.columns import Block, CanFrames, Images, Messages, Rows, Table, Topic
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.refuse import MISFIT
 from crosscue.replay.encode.outgoing import TIME_MISFIT, Outgoing

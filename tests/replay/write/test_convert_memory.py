@@ -40,9 +40,7 @@ def _unchunked_log() -> bytes:
 
 
 @pytest.mark.slow
-def test_unchunked_log_is_converted_within_memory_limit(
-    tmp_path: Path,
-) -> None:
+def test_unchunked_log_is_converted_within_memory_limit(tmp_path: Path) -> None:
     log = tmp_path / "log.mcap"
     log.write_bytes(_unchunked_log())
 
