@@ -61,18 +61,6 @@ def test_drive_past_one_intersection_is_one_approach() -> None:
     }
 
 
-def test_approaches_are_numbered_and_start_from_fresh_belief() -> None:
-    loop, taken = approaches(), list[Step]()
-    for i, side in enumerate(("road_left", "road_right", "road_left")):
-        seen = {"stop_sign": (60.0, 1), side: (25.0, 1)}
-        taken += run_steps(drive(70.0, -30.0, seen, begin_ns=i * 1000 * SECOND_NS), loop)
-
-    last = {one.approach: one.probabilities for one in taken if one.approach is not None}
-    assert list(last) == [1, 2, 3]
-    assert [last[i]["left"] > 0.9 for i in (1, 2, 3)] == [True, False, True]
-    assert [last[i]["right"] > 0.9 for i in (1, 2, 3)] == [False, True, False]
-
-
 def test_stationary_car_keeps_approach_and_belief() -> None:
     loop = approaches()
     before = run_steps(drive(60.0, 2.0, {"stop_sign": (60.0, 1), "road_left": (25.0, 1)}), loop)[-1]
@@ -131,13 +119,6 @@ def test_approach_closes_at_published_or_configured_limits(
     closed = {} if why is None else {f"approaches closed: {why}": 1}
     assert loop.counts == {"approaches opened": 1, "approaches established": 1, **closed}
     assert step.approach == (1 if why is None else None)
-
-
-def test_ranged_approach_has_no_maximum_length() -> None:
-    """50 + 55 m exceed 100 m, but the sign is seen again in between."""
-    seen = replace(frame(1, 50.0, stop_sign=1), signs=(sign(90.0),))
-
-    assert run_steps([established(sign(140.0)), seen, frame(2, 55.0)])[-1].approach == 1
 
 
 @pytest.mark.parametrize(("turned_rad", "is_kept"), [(0.449, True), (0.451, False)])
@@ -501,21 +482,6 @@ def test_gate_stays_closed_until_presence_is_established() -> None:
     )
 
 
-def test_open_gate_stays_open_for_rest_of_approach() -> None:
-    one_sign = [
-        frame(0, 1.0, stop_sign=1),
-        frame(1, 1.0, parked_left=2),
-        frame(2, 1.0, parked_left=1),
-    ]
-
-    first, second, third = run_steps(one_sign)
-
-    assert first.established
-    assert first.probabilities["left"] == 0.5
-    assert second.probabilities["left"] == pytest.approx(0.83**2 / (0.83**2 + 0.17**2))
-    assert third.probabilities["left"] > second.probabilities["left"]
-
-
 def test_dissent_begins_within_20_m_of_intersection() -> None:
     taken = run_steps(drive(40.0, 10.0, {"stop_sign": (40.0, 1)}))
     by_range = {round(one.ranges[0].range_m): one.probabilities["left"] for one in taken}
@@ -523,12 +489,6 @@ def test_dissent_begins_within_20_m_of_intersection() -> None:
     assert by_range[21] == 0.5
     assert by_range[20] == pytest.approx(0.49**3 / (0.49**3 + 0.51**3))
     assert by_range[10] < by_range[15] < by_range[20]
-
-
-def test_absent_cues_do_not_dissent_without_range() -> None:
-    taken = run_steps([frame(i, 1.0, road_left=1) for i in range(20)])
-
-    assert taken[-1].probabilities["right"] == 0.5
 
 
 def test_past_cues_receive_start_range_and_are_counted() -> None:

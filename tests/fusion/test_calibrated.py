@@ -150,16 +150,6 @@ def test_repeated_picture_sends_no_message() -> None:
     assert left_messages(road(1), same, same)[1:] == [0.0, 0.0]
 
 
-def test_only_new_objects_send_messages() -> None:
-    def parked(*ids: int) -> Situation:
-        return situation({"parked_left": len(ids)}, objects={"parked_left": ids}, moved_m=0.0)
-
-    first, again, other, first_again = left_messages(parked(1), parked(1), parked(1, 2), parked(1))
-
-    assert first == other == pytest.approx(math.log(P / Q))
-    assert again == first_again == 0.0
-
-
 def test_without_identities_only_highest_count_adds_new_objects() -> None:
     one, two, one_again, two_again = left_messages(
         *(situation({"parked_left": n}, moved_m=0.0) for n in (1, 2, 1, 2))

@@ -29,7 +29,7 @@ from crosscue.fusion.factor_graph import (
     probability,
 )
 from crosscue.replay.vehicle.cue_table import CUES
-from crosscue.replay.vehicle.fusion import Fade, Fusion, usual_cues
+from crosscue.replay.vehicle.fusion import Fade, Fusion
 from support.fusion import graphs, graphs_with_counts, other_side, situation
 
 FEW_EXAMPLES = settings(max_examples=60, deadline=None)
@@ -272,10 +272,6 @@ def test_presence_is_established_by_intersection_left_or_right(
     assert after == Belief(odds, expected)
 
 
-def test_messages_add_to_log_odds_and_leave_presence() -> None:
-    assert multiply(Belief((1.0, -2.0), True), (0.5, 0.25)) == Belief((1.5, -1.75), True)
-
-
 def test_default_graph_has_three_components_as_published() -> None:
     parts = [{name} for name in DEFAULT_GRAPH.feature_names]
     for cue in DEFAULT_GRAPH.cues:
@@ -309,10 +305,6 @@ def test_graph_is_that_of_the_vehicle_file_without_unused_entries() -> None:
         Edge("zebra", "up"),
         Edge("zebra", "right", False),
     ]
-
-
-def test_default_graph_has_every_cue_of_cue_table() -> None:
-    assert [*usual_cues()] == [*CUES]
 
 
 def test_graph_without_cue_drops_only_that_cue() -> None:

@@ -17,7 +17,7 @@ from crosscue.fusion.intersection_range import (
     smooth_ranges,
     update,
 )
-from crosscue.fusion.range_track import NOTHING, RangeTrack, Verdict, advance_range, fuse_range
+from crosscue.fusion.range_track import NOTHING, advance_range, fuse_range
 from crosscue.replay.vehicle.fusion import RangeFilter
 
 METRES = st.floats(-200.0, 200.0)
@@ -114,24 +114,6 @@ def test_non_positive_sensor_variance_is_refused(bad: float) -> None:
 def test_negative_odometry_variance_is_refused(bad: float) -> None:
     with pytest.raises(ValueError, match=rf"^odometry_var_m2: expected >= 0, got {bad}$"):
         predict(RangeBelief(30.0, 4.0), 1.0, bad)
-
-
-def test_contradictory_measurements_start_no_range() -> None:
-    track = NOTHING
-    for measured_m in (60.0, 20.0, 110.0, 45.0, 80.0):
-        track, verdict = fuse_range(track, measured_m, 2.9, RangeFilter(), 20.0)
-        assert verdict is Verdict.WAITS
-
-    assert track.belief is None
-
-
-def test_contradictory_implausible_measurements_never_replace_belief() -> None:
-    track = RangeTrack(RangeBelief(50.0, 2.0))
-    for measured_m in (100.0, 20.0, 130.0, 10.0, 90.0, 140.0, 70.0):
-        track, verdict = fuse_range(track, measured_m, 2.9, RangeFilter(restart_after=2), 20.0)
-        assert verdict is Verdict.REFUSED
-
-    assert track.belief == RangeBelief(50.0, 2.0)
 
 
 def test_filter_errors_match_variance_with_distance_correlated_noise() -> None:

@@ -28,14 +28,6 @@ def belief(track: RangeTrack) -> RangeBelief:
     return track.belief
 
 
-def test_advance_subtracts_distance_and_adds_its_length_to_unseen_distance() -> None:
-    """In reverse, 50 + 3, 80 + 3, and |-3| + 1; both variances grow by 0.5."""
-    after = RangeTrack(RangeBelief(53.0, 4.5), RangeBelief(83.0, 9.5), 2, 4.0)
-
-    assert advance_range(RIVALLED, -3.0, 0.5, SETTINGS) == after
-    assert advance_range(NOTHING, -3.0, 0.5, SETTINGS) == NOTHING
-
-
 def test_belief_is_dropped_above_maximum_sd() -> None:
     """The maximum is 20 m: 399 + 1 = 20^2 is kept, 399 + 1.001 is not."""
     track = RangeTrack(RangeBelief(50.0, 399.0))
@@ -162,29 +154,6 @@ def test_rival_counts_fully_at_standstill_unlike_first_measurements() -> None:
 
     assert track.rival == RangeBelief(82.0, 1.0)
     assert first.belief == pytest.approx(rival)
-
-
-@pytest.mark.parametrize(
-    ("way_m", "before_var_m2", "var_m2", "mean_m", "after_m2"),
-    [
-        # Gain 1/2: 9/4 + 4/4 + 2 / 4 * 4.
-        (10.0 * math.log(2.0), 9.0, 4.0, 47.0, 5.25),
-        # Gain 3/4: 4 / 16 + 9 * 9/16 + 2 * 3/16 * 4; the covariance is the smaller variance.
-        (10.0 * math.log(4.0), 4.0, 9.0, 45.5, 6.8125),
-        (0.0, 9.0, 4.0, 50.0, 9.0),
-    ],
-)
-def test_correction_by_tracker_depends_on_distance(
-    way_m: float, before_var_m2: float, var_m2: float, mean_m: float, after_m2: float
-) -> None:
-    """The gain is 1 - exp(-way / 10); with gain g, 50 + g (44 - 50)."""
-    track = RangeTrack(RangeBelief(50.0, before_var_m2), unseen_m=3.0)
-
-    after, verdict = follow(track, 44.0, var_m2, way_m, SETTINGS)
-
-    assert verdict is Verdict.TAKEN
-    assert after == RangeTrack(after.belief)
-    assert after.belief == pytest.approx((mean_m, after_m2))
 
 
 def test_tracker_range_begins_or_is_adopted_at_once_without_take_up_distance() -> None:

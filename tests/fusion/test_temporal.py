@@ -190,30 +190,6 @@ def test_prior_is_uniform_over_cells_ahead_of_the_axle() -> None:
     assert belief.distance_m() == pytest.approx(5.0)
 
 
-@pytest.mark.parametrize(("edge_m", "cells"), [(0.5, 2), (2.0, 2), (3.0, 2), (3.1, 3)])
-def test_cells_cover_the_visible_distance_and_number_at_least_two(
-    edge_m: float, cells: int
-) -> None:
-    about = learned(edges_m=(0.0, edge_m), behind_m=1.0, chains=())
-
-    assert temporal_model(GRAPH, about).cells == cells
-
-
-def test_forward_cell_passes_nearest_and_brings_new_intersections() -> None:
-    """A tenth (2 m of 20 m) of 0.2 comes within reach, 70 % of it with a left road.
-
-    The 0.3 passed are spread over five cells; the rest moves one cell nearer.
-    """
-    belief = hand_filter()
-
-    belief.update({}, moved_m=2.0)
-
-    assert belief.nowhere == pytest.approx([0.06, 0.06, 0.06, 0.15, 0.15])
-    assert belief.ahead[:, 0] == pytest.approx([0.1, 0.0, 0.0, 0.3, 0.014])
-    assert belief.ahead[:, 1] == pytest.approx([0.0, 0.1, 0.0, 0.0, 0.006])
-    assert belief.centers_m()[0] == -1.0
-
-
 def test_all_mass_comes_within_reach_where_intersections_are_dense() -> None:
     belief = hand_filter(spacing_m=1.0)
 
@@ -264,18 +240,6 @@ def test_variance_of_distance_spreads_mass_over_neighbours() -> None:
         step.update({}, moved_var_m2=var_m2)
     assert wide.ahead == pytest.approx(step.ahead)
     assert wide.nowhere == pytest.approx([0.0625, 0.03125, 0.0125, 0.03125, 0.0625])
-
-
-def test_repeated_small_variances_add_up() -> None:
-    """The remainder of 4 m2 after a quarter, 2 m2, is added to the next 1 m2 and 1 m2."""
-    once, twice = hand_filter(), hand_filter()
-
-    once.update({}, moved_var_m2=4.0)
-    once.update({}, moved_var_m2=0.0)
-    twice.update({}, moved_var_m2=3.0)
-    twice.update({}, moved_var_m2=1.0)
-
-    assert once.ahead == pytest.approx(twice.ahead)
 
 
 def test_range_weighs_cells_by_gaussian_of_range_and_cell_or_uniform_strays() -> None:
