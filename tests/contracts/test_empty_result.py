@@ -1,6 +1,9 @@
-"""An empty result is an error with exit status 1, and leaves no finished result."""
+"""Valid input without a result: one line and no files, and what was there stays."""
+
+from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -9,7 +12,9 @@ from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import MANIFEST
+from support.empty_inputs import COMMANDS, empty_inputs
 from support.pictures import picture_folder
+from support.refusals import refusal
 
 
 @pytest.fixture(scope="module")
@@ -71,3 +76,21 @@ def test_overwritten_run_contains_only_new_files(
     timed = {MANIFEST, "timings.json"}
     kept = {name: data for name, data in _content(out).items() if name not in timed}
     assert kept == {name: data for name, data in _content(fresh).items() if name not in timed}
+
+
+@pytest.fixture(scope="module")
+def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A drive and its run, and valid empty inputs of every kind."""
+    return empty_inputs(tmp_path_factory.mktemp("inputs"))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_empty_result_is_reported_in_one_line_without_files(
+    command: str, names: dict[str, Path], tmp_path: Path
+) -> None:
+    shutil.rmtree(names["run"] / "score", ignore_errors=True)
+    argv = COMMANDS[command].format(**names, out=tmp_path / "out").split()
+
+    refusal(1, *command.split(), *argv)
+    assert not list(tmp_path.iterdir())
+    assert not (names["run"] / "score").exists()

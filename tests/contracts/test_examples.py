@@ -31,7 +31,7 @@ NOTEBOOKS: Final = code_of_notebooks()
 # Pages and languages of blocks that a test runs, and that test.
 EXECUTED: Final = {
     ("CONTRIBUTING.md", "python"): "tests/contracts/test_contributing.py",
-    ("docs/howto/query.md", "sql"): "tests/eval/catalog/test_query_page.py",
+    ("docs/howto/query.md", "sql"): "tests/eval/catalog/test_remote_catalog.py",
 }
 # Options of other programs that occur in inline code and messages, and those programs.
 OTHERS: Final = {

@@ -90,7 +90,7 @@ ELSEWHERE: Final[dict[str, str]] = {
     "study layouts": "simulates and replays for minutes",
     "study range": "simulates for half a minute, and prints what study landmarks does",
     "study field": "simulates for minutes",
-    "fit temporal": "needs many drives; tests/eval/fit/test_temporal_runs.py parses it",
+    "fit temporal": "needs many drives; tests/eval/fit/test_message_fit.py parses it",
     "fit messages": "needs many approaches; tests/eval/fit/test_message_fit.py parses it",
     "model fetch": "needs a network's weights",
 }

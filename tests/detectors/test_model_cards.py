@@ -1,20 +1,31 @@
-"""Tests of model cards end to end, mostly with generated networks."""
+"""Networks with model cards: boxes, inputs, damaged files and implausible results."""
 
 from __future__ import annotations
 
 import hashlib
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from onnx import TensorProto, helper
 
+import crosscue
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.catalog.card import Input
+from crosscue.detectors.catalog.cards import check_card
+from crosscue.detectors.catalog.recognise import guesses, read_interface
+from crosscue.detectors.networks.backends import load_network
 from crosscue.detectors.networks.model_detector import build
+from crosscue.detectors.networks.onnx_input import input_shape
 from crosscue.detectors.networks.picture_input import prepared
-from crosscue.replay.errors import VehicleError
+from crosscue.detectors.networks.weights import Weights
+from crosscue.replay.errors import UsageError, VehicleError
 from support.data import shared
 from support.detecting import yolox_card
 from support.onnx_models import bright_box_model, constant_model
@@ -190,3 +201,176 @@ def test_fully_convolutional_network_runs_at_the_size_of_the_card(
 
     assert large.labels.count("traffic light") > small.labels.count("traffic light")
     assert large.labels.count("car") > small.labels.count("car")
+
+
+def varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*out, value])
+
+
+def part(number: int, content: bytes) -> bytes:
+    return varint(number << 3 | 2) + varint(len(content)) + content
+
+
+def number(field: int, value: int) -> bytes:
+    return varint(field << 3) + varint(value)
+
+
+def value_info(name: bytes, sizes: list[int | None]) -> bytes:
+    dimensions = [part(1, part(2, b"n") if size is None else number(1, size)) for size in sizes]
+    tensor = number(1, 1) + part(2, b"".join(dimensions))
+    return part(1, name) + part(2, part(1, tensor))
+
+
+def model(*inputs: bytes, weights: tuple[bytes, ...] = ()) -> bytes:
+    tensors = [part(5, part(8, name) + part(9, b"\0" * 300)) for name in weights]
+    graph = b"".join([*tensors, *(part(11, one) for one in inputs)])
+    return number(1, 8) + part(2, b"maker") + part(7, graph)
+
+
+@given(st.binary(max_size=60), st.integers(0, 400))
+@settings(max_examples=100)
+def test_damaged_file_yields_an_error_or_a_valid_shape(noise: bytes, cut: int) -> None:
+    for content in (noise, model(value_info(b"x", [1, 3, 8, 8]), weights=(b"w",))[:cut] + noise):
+        try:
+            found = input_shape(content)
+        except ValueError:
+            continue
+        assert found is None or all(size is None or size > 0 for size in found)
+
+
+@pytest.mark.parametrize("backend", ["opencv", "onnxruntime"])
+def test_card_of_another_size_than_its_network_is_refused(backend: str, tmp_path: Path) -> None:
+    card = yolox_card(tmp_path, width_px="640")
+
+    with pytest.raises(VehicleError, match="the network does not run on input 640 x 416"):
+        build(card=str(card), backend=backend)
+
+
+# Cells of strides 8, 16 and 32 at 256 x 128.
+CELLS = 32 * 16 + 16 * 8 + 8 * 4
+SHAPE = (1, 3, 128, 256)
+END_TO_END = 'kind = "end-to-end"\nclasses = ["dog", "cat"]\nscore = 0.3\noverlap = 1.0'
+Table = NDArray[np.float32]
+
+
+def rows(count: int = 200) -> Table:
+    """Sensible boxes with scores from 0.31 to 0.9."""
+    left = np.linspace(0.0, 200.0, count)
+    table = np.column_stack([left, left / 4, left + 40.0, left / 4 + 30.0, left, 0 * left])
+    table[:, 4] = np.linspace(0.31, 0.9, count)
+    return table[None].astype(np.float32)
+
+
+def changed(**columns: float) -> Table:
+    """The sensible boxes with other values in columns named x0, y0, x1, y1 and score."""
+    table = rows()
+    for name, value in columns.items():
+        table[0, :, ("x0", "y0", "x1", "y1", "score").index(name)] = value
+    return table
+
+
+# What is seen, with the output in which it is seen.
+GARBAGE = {
+    "200 boxes cover the whole picture": changed(x0=-5.0, y0=-5.0, x1=900.0, y1=300.0),
+    "200 detections have the score 0.7": changed(score=0.7),
+    "200 of 200 boxes are outside the picture": changed(x0=300.0, x1=400.0),
+    "200 of 200 boxes have a negative size": changed(x0=300.0, x1=10.0),
+    "200 of 200 boxes are more than four times as large": changed(x0=0.0, x1=90_000.0),
+    "within 2 pixels of the corner": changed(x0=0.2, y0=0.3, x1=0.5, y1=0.9),
+    "scores from -4 to -4": changed(score=-4.0),
+}
+
+
+def card_of_boxes(folder: Path, model: bytes, output: str) -> Path:
+    """Write ``net.onnx`` and a card for it, and return the card."""
+    (folder / "net.onnx").write_bytes(model)
+    text = f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(model).hexdigest()}"\n'
+    text += f"[input]\nwidth_px = 256\nheight_px = 128\n[output]\n{output}\n"
+    path = folder / "net.toml"
+    path.write_text(text)
+    return path
+
+
+def names(folder: Path) -> Path:
+    """Write a file of two class names."""
+    path = folder / "names.txt"
+    path.write_text("dog\ncat\n")
+    return path
+
+
+@pytest.mark.parametrize("seen", GARBAGE)
+def test_card_is_refused_with_what_was_seen(tmp_path: Path, seen: str) -> None:
+    net = tmp_path / "net.onnx"
+    net.write_bytes(constant_model(SHAPE, {"rows": GARBAGE[seen]}))
+
+    with pytest.raises(VehicleError, match=f"net.toml: not written: on noise, .*{seen}"):
+        crosscue.draft_card(net, kind="end-to-end", class_names=names(tmp_path))
+
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["names.txt", "net.onnx"]
+
+
+@pytest.mark.parametrize("seen", GARBAGE)
+def test_check_refuses_the_card(tmp_path: Path, seen: str) -> None:
+    model = constant_model(SHAPE, {"rows": GARBAGE[seen]})
+
+    with pytest.raises(VehicleError, match=f"net.toml: on noise, .*{seen}"):
+        check_card(card_of_boxes(tmp_path, model, END_TO_END))
+
+
+def test_sensible_boxes_pass(tmp_path: Path) -> None:
+    model = constant_model(SHAPE, {"rows": rows()})
+
+    found = check_card(card_of_boxes(tmp_path, model, END_TO_END))
+
+    assert str(found) == f"{tmp_path / 'net.toml'}: fits its network"
+
+
+def pixel_boxes_and_scores() -> dict[str, Table]:
+    """Outputs in YOLO-NAS's layout: corners in pixels, and final scores of three classes."""
+    boxes = np.tile(rows()[:, :1, :4], (1, CELLS, 1))
+    return {"904": boxes, "913": np.full((1, CELLS, 3), 0.01, np.float32)}
+
+
+def test_boxes_in_pixels_are_not_taken_for_queries_in_fractions(tmp_path: Path) -> None:
+    net = tmp_path / "nas.onnx"
+    net.write_bytes(constant_model(SHAPE, pixel_boxes_and_scores()))
+
+    kinds = [guess.settings["kind"] for guess in guesses(read_interface(net))]
+
+    assert "detr" not in kinds
+
+
+def test_pixel_boxes_read_as_fractions_are_refused(tmp_path: Path) -> None:
+    output = 'kind = "detr"\nboxes = "904"\nlogits = "913"\nclasses = ["a", "b", "c"]'
+    model = constant_model(SHAPE, pixel_boxes_and_scores())
+
+    with pytest.raises(VehicleError, match=r"on noise, .* boxes are more than four times as large"):
+        check_card(card_of_boxes(tmp_path, model, output))
+
+
+def test_without_onnx_network_of_its_own_size_only_runs_in_onnxruntime(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 3, 8, 8])
+    end = helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, 3, 8, 8])
+    graph = helper.make_graph([helper.make_node("Relu", ["x"], ["y"])], "relu", [place], [end])
+    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    weights = Weights(name="net.onnx", content=made.SerializeToString())
+    assert load_network(weights, size_px=(16, 12)).backend.startswith("onnxruntime")
+
+    monkeypatch.setitem(sys.modules, "onnx", None)
+
+    assert load_network(weights).backend.startswith("onnxruntime")
+    wide = load_network(weights, size_px=(16, 12))
+    assert wide.backend.startswith("opencv")
+    picture = np.ones((1, 3, 12, 16), np.float32)
+    assert np.array_equal(wide(picture)["y"], picture)
+    with pytest.raises(VehicleError, match=r"onnx is not installed: pip install onnx$"):
+        load_network(weights, "onnxruntime", size_px=(16, 12))
+    (tmp_path / "net.onnx").write_bytes(weights.content)
+    with pytest.raises(UsageError, match="needs the package onnx: pip install onnx"):
+        read_interface(tmp_path / "net.onnx")

@@ -1,8 +1,11 @@
-"""Tests of training on COCO annotations: reading, samples, resumption, and commands."""
+"""Training of the detector: data, resumption, measures, box-only data and equal bytes."""
 
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import crosscue
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
 from crosscue.detectors.networks.mask_rcnn.checkpoint import load_checkpoint
@@ -24,8 +28,10 @@ from crosscue.detectors.training.measure import average_precisions, fitted
 from crosscue.detectors.training.operating_point import Verdicts
 from crosscue.detectors.training.samples import Sampler, SampleSettings
 from crosscue.eval.cli import run
+from crosscue.eval.training.mask_rcnn import MaskRcnnTrainingSettings
 from crosscue.replay.errors import CrosscueError, SchemaError
 from support.mask_rcnn import CPU, plan_of, write_bars
+from support.pictures import picture
 from support.refusals import refusal
 
 WINDOW = SampleSettings(96, 64)
@@ -191,15 +197,15 @@ def test_resumed_training_equals_uninterrupted_training(tmp_path: Path) -> None:
 
 def _perfect(labelled: LabelledSet) -> list[Detections]:
     found = []
-    for number, picture in enumerate(labelled.pictures):
-        boxes = np.array([one.box_px for one in picture.objects], np.float64).reshape(-1, 4)
+    for number, labels in enumerate(labelled.pictures):
+        boxes = np.array([one.box_px for one in labels.objects], np.float64).reshape(-1, 4)
         masks = tuple(
-            rle.encode_mask(mask_of(one, picture.size_px), (0, 0), picture.size_px)
-            for one in picture.objects
+            rle.encode_mask(mask_of(one, labels.size_px), (0, 0), labels.size_px)
+            for one in labels.objects
         )
-        labels = tuple(labelled.classes[one.label] for one in picture.objects)
+        labels = tuple(labelled.classes[one.label] for one in labels.objects)
         scores = np.linspace(0.9, 0.5, len(labels))
-        found.append(Detections(number, picture.size_px, boxes, scores, labels, masks))
+        found.append(Detections(number, labels.size_px, boxes, scores, labels, masks))
     return found
 
 
@@ -350,3 +356,105 @@ def test_picture_of_another_size_than_annotated_is_refused(tmp_path: Path) -> No
 
     with pytest.raises(SchemaError, match=r"0\.png: expected a picture of 130 x 97"):
         [sampler(number) for number in range(20)]
+
+
+MASK_HEAD = ("roi_heads.mask_head.", "roi_heads.mask_predictor.")
+
+
+def _without_masks(path: Path, every: int = 1) -> None:
+    """Remove the mask of each annotation, or of every ``every``-th."""
+    tree = json.loads(path.read_text())
+    for row in tree["annotations"][::every]:
+        row.pop("segmentation", None)
+    path.write_text(json.dumps(tree))
+
+
+def _mask_head(network: Any) -> dict[str, torch.Tensor]:
+    return {
+        name: value.clone()
+        for name, value in network.state_dict().items()
+        if name.startswith(MASK_HEAD)
+    }
+
+
+@pytest.mark.slow
+def test_previously_trained_mask_head_keeps_its_masks(tmp_path: Path) -> None:
+    masked = MaskRcnnTrainingSettings(
+        data=write_bars(tmp_path / "a", 2),
+        images=tmp_path / "a" / "images",
+        classes=["car"],
+        steps=1,
+        batch=1,
+        width_px=128,
+        window_px=(96, 64),
+        device="cpu",
+    )
+    first = crosscue.train_mask_rcnn(masked, tmp_path / "first.safetensors")
+    bare = write_bars(tmp_path / "b", 2)
+    _without_masks(bare)
+    later = MaskRcnnTrainingSettings(
+        data=bare,
+        images=tmp_path / "b" / "images",
+        init=first.path,
+        classes=["car"],
+        steps=1,
+        batch=1,
+        width_px=128,
+        window_px=(96, 64),
+        device="cpu",
+    )
+
+    second = crosscue.train_mask_rcnn(later, tmp_path / "second.safetensors")
+
+    heads = [_mask_head(load_checkpoint(one.path).network) for one in (first, second)]
+    assert second.facts.has_masks
+    assert all(torch.equal(value, heads[1][name]) for name, value in heads[0].items())
+    assert "no masks" in repr(second)
+
+
+ROAD = "road --data set --steps 2 --batch 2 --width 128"
+MASKS = (
+    "mask-rcnn --data bars/coco.json --images bars/images --classes car --steps 2 --batch 2 "
+    "--width 128 --window 96 64"
+)
+RUN = f"""
+from crosscue.eval.cli import run
+for line in ({ROAD!r}, {MASKS!r}):
+    words = line.split()
+    output = f"{{words[0]}}.safetensors"
+    assert run(["train", *words, "--device", "cpu", "--threads", "2", "-o", output, "-q"]) == 0
+"""
+
+
+def _road_set(folder: Path, numbers: list[int]) -> None:
+    """Write pictures and masks in this order, which is often that of the folder's entries."""
+    for name in ("images", "masks"):
+        (folder / "set" / name).mkdir(parents=True)
+    for number in numbers:
+        shade = picture(number, ".png", 160, 96)
+        (folder / "set" / "images" / f"{number}.png").write_bytes(shade)
+        mask = picture(29 * (number % 2), ".png", 160, 96)
+        (folder / "set" / "masks" / f"{number}.png").write_bytes(mask)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Folders of two processes that each train both networks."""
+    made = []
+    for hash_seed, numbers in ((1, [0, 1, 2, 3]), (2, [3, 1, 0, 2])):
+        folder = tmp_path_factory.mktemp("trained")
+        _road_set(folder, numbers)
+        write_bars(folder / "bars", 4)
+        env = os.environ | {"PYTHONHASHSEED": str(hash_seed)}
+        command = [sys.executable, "-c", RUN]
+        subprocess.run(command, cwd=folder, env=env, check=True, timeout=300)
+        made.append(folder)
+    return made
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("network", ["road", "mask-rcnn"])
+def test_two_trainings_write_identical_files(folders: list[Path], network: str) -> None:
+    one, other = (folder.joinpath(f"{network}.safetensors").read_bytes() for folder in folders)
+
+    assert one == other

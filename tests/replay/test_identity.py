@@ -1,13 +1,22 @@
-"""The identity of a log: unique, independent of its path, and fast for a large log."""
+"""Identity of logs, checksums and versions."""
 
 from __future__ import annotations
 
+import importlib
 import shutil
+import subprocess
+import sys
+import zlib
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from crosscue.replay.files import checksum
 from crosscue.replay.files.identity import SHARE_BYTES, log_identity
+from crosscue.replay.versions import commit
 
 LARGE: int = 3 * SHARE_BYTES
 # Position between the last sample and the tail, where only an index is hashed.
@@ -85,3 +94,52 @@ def test_folder_identity_covers_all_files_except_our_own(tmp_path: Path) -> None
         change()
         changed.append(log_identity(folder).digest)
     assert len({before.digest, *changed}) == 5
+
+
+@given(st.binary(max_size=9000), st.binary(max_size=300))
+def test_crc32_equals_zlib_in_one_or_two_pieces(first: bytes, second: bytes) -> None:
+    expected = zlib.crc32(first + second)
+    assert checksum.crc32(first + second) == expected
+    assert checksum.crc32(memoryview(second), checksum.crc32(first)) == expected
+    assert checksum.crc32(np.frombuffer(first, np.uint8)) == zlib.crc32(first)
+
+
+def test_zlib_is_used_without_isal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "isal.isal_zlib", None)
+    try:
+        importlib.reload(checksum)
+        assert checksum._crc32 is zlib.crc32
+        assert checksum.crc32(b"123456789") == 0xCBF43926
+    finally:
+        monkeypatch.undo()
+        importlib.reload(checksum)
+
+
+def _git(folder: Path, *words: str) -> str:
+    """Run git without user settings, and return its output."""
+    identity = ["-c", "user.name=a", "-c", "user.email=a@b", "-c", "init.defaultBranch=main"]
+    command = ["git", *identity, *words]
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Create a repository with one commit."""
+    folder = tmp_path_factory.mktemp("checkout")
+    _git(folder, "init")
+    _git(folder, "commit", "--allow-empty", "-m", "first")
+    return folder
+
+
+def test_commit_equals_git_head(checkout: Path) -> None:
+    head = _git(checkout, "rev-parse", "HEAD").strip()
+
+    assert commit(checkout) == head
+    _git(checkout, "pack-refs", "--all")
+    commit.cache_clear()
+    assert commit(checkout) == head
+    _git(checkout, "worktree", "add", "-b", "other", "../worktree")
+    assert commit(checkout.parent / "worktree") == head
+    _git(checkout, "checkout", "--detach")
+    commit.cache_clear()
+    assert commit(checkout) == head

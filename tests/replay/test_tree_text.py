@@ -1,7 +1,8 @@
-"""Deeply nested JSON, TOML and YAML: every command that reads them fails with one clear line."""
+"""Bounded reading of text and files."""
 
 import ast
 import json
+import tempfile
 import time
 import tomllib
 from collections.abc import Callable
@@ -13,7 +14,14 @@ import tomlkit
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from crosscue.datasets.truth import truth
+from crosscue.detectors.catalog.card import read_card
+from crosscue.eval.fit.ranges.fit import range_pairs
+from crosscue.eval.scoring.gates import load_gates
+from crosscue.replay.errors import CrosscueError
+from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import MAX_DEPTH, json_tree, toml_tree, yaml_tree
+from crosscue.replay.vehicle import vehicle
 from support.every_format import EVERY_FORMAT
 from support.measured import measured
 
@@ -198,3 +206,26 @@ def test_product_parses_json_toml_and_yaml_only_in_tree_text() -> None:
                 name = f"{node.value.id}.{node.attr}"
                 assert name not in PARSERS, path
                 assert node.attr != "load_string" or path.name == "database.py", path
+
+
+ENDLESS = Path("/dev/zero")
+
+
+@given(content=st.binary(max_size=40), max_count=st.integers(0, 40))
+def test_file_over_limit_is_not_read(content: bytes, max_count: int) -> None:
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(content)
+        file.flush()
+
+        assert read_at_most(Path(file.name), max_count) == (
+            content if len(content) <= max_count else None
+        )
+
+
+@pytest.mark.skipif(not ENDLESS.exists(), reason="no /dev/zero here")
+@pytest.mark.parametrize(
+    "read", [vehicle.load, read_card, load_gates, truth.read_truth, range_pairs]
+)
+def test_endless_file_is_refused(read: Callable[[Path], object]) -> None:
+    with pytest.raises(CrosscueError, match=r"/dev/zero: over \d+ MiB"):
+        read(ENDLESS)

@@ -1,10 +1,11 @@
-"""A catalog of runs on an object store: its content, and the bytes that it fetches."""
+"""A catalog on an object store, runs named on the command line, and the queries of the page."""
 
 import io
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import fsspec
 import numpy as np
@@ -14,8 +15,26 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 import crosscue
-from crosscue.replay.errors import UnreadableRunError
+from crosscue.eval import cli
+from crosscue.eval.batch.merge import merge_runs
+from crosscue.eval.catalog.find_runs import runs_of
+from crosscue.eval.catalog.query.catalog import Catalog
+from crosscue.eval.runs.account import Account, Line
+from crosscue.eval.runs.folder import create, write_manifest
+from crosscue.replay.errors import CrosscueError, UnreadableRunError
 from support.catalog_runs import add_run, runs_below
+from support.manifests import detected, estimated
+from support.scoring import (
+    CUES,
+    approach,
+    belief_table,
+    cue_table,
+    frame_table,
+    range_table,
+    span,
+    truth,
+    truth_folder,
+)
 
 ROWS = 200_000
 
@@ -124,3 +143,102 @@ def test_queries_fetch_only_required_columns_and_row_groups(url: str) -> None:
 def test_unreadable_store_is_reported(url: str, place: str, message: str) -> None:
     with pytest.raises(UnreadableRunError, match=message):
         crosscue.catalog(place)
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    for name, stage in (
+        ("a", "estimate"),
+        ("b", "estimate"),
+        ("deep/c", "estimate"),
+        ("merged", "merged"),
+    ):
+        run = create(tmp_path / "runs" / name, overwrite=False)
+        if stage == "merged":
+            merge_runs({}, run, {})
+        else:
+            write_manifest(run, estimated())
+    (tmp_path / "runs" / "empty").mkdir()
+    (tmp_path / "runs" / ".drives").mkdir()
+    return tmp_path / "runs"
+
+
+def test_folder_names_its_runs_but_not_their_merged_run(runs: Path) -> None:
+    assert runs_of([str(runs)]) == (runs / "a", runs / "b", runs / "deep" / "c")
+
+
+def test_patterns_and_list_files_are_expanded(runs: Path) -> None:
+    runs.parent.joinpath("runs.txt").write_text("# two\nruns/b\n\nruns/a\n")
+
+    assert runs_of([f"{runs}/[ab]"]) == (runs / "a", runs / "b")
+    assert runs_of([f"@{runs.parent}/runs.txt"]) == (runs / "b", runs / "a")
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("{}/empty", "neither a run folder nor a folder of runs"),
+        ("{}/z*", "nothing matches"),
+        ("@{}/gone", "No such file"),
+        ("@{}/a/manifest.json", "neither|names no run|no run folder"),
+    ],
+)
+def test_invalid_run_arguments_are_refused_in_one_line(
+    runs: Path, argument: str, message: str
+) -> None:
+    if "manifest" in argument:
+        (runs / "a" / "manifest.json").write_text("# nothing\n")
+
+    with pytest.raises(CrosscueError, match=message) as caught:
+        runs_of([argument.format(runs)])
+
+    assert "\n" not in str(caught.value)
+
+
+PAGE: Final = Path(__file__).parents[3] / "docs" / "howto" / "query.md"
+PAGE_QUERIES: Final = re.findall(r"```sql\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def catalog(tmp_path_factory: pytest.TempPathFactory) -> Catalog:
+    """Small runs with data for all queries: one approach each, in rain, within 30 m."""
+    folder = tmp_path_factory.mktemp("fleet")
+    runs = runs_below(folder / "runs")
+    signs = detected("front", {"signs": "objects"})
+    late = {
+        "frames": frame_table(50),
+        "cues": cue_table(CUES),
+        "belief": belief_table({"intersection": {20: 0.95}, "left": {30: 0.97}}),
+        "range": range_table(8, 45, 0.5),
+    }
+    lost = Line(entered=5, used=2, skipped={}, dropped={"cut": 3})
+    account = Account(reading=(), detecting={"front": lost}, estimating={}, is_whole=False)
+    add_run(runs / "c/wednesday", "wednesday", found=late, detect=signs, account=account)
+    crosscue.tag_runs([runs / "a"], {"route": "north"})
+    signs_there = [span("stop_sign", 0, 40, count=1, visible=1.0)]
+    drive = truth(signs_there, [approach(conditions=("rain", "dusk"))])
+    reported = truth_folder(folder / "truth", drive)
+    for path in runs.rglob("manifest.json"):
+        argv = ["score", str(path.parent), "--truth", str(reported), "--without-figures", "-q"]
+        assert cli.run(argv) in (0, 3)
+    return crosscue.catalog(runs)
+
+
+def test_queries_of_the_page_return_expected_rows(catalog: Catalog) -> None:
+    def rows(number: int) -> list[dict[str, Any]]:
+        return list(catalog.query(PAGE_QUERIES[number - 1]).to_pylist())
+
+    assert all(map(rows, range(1, len(PAGE_QUERIES) + 1)))
+    assert rows(1) == [{"vehicle": "car", "crosscue": "0", "runs": 5, "with_losses": 1}]
+    assert [row["run"] for row in rows(2)] == ["c/wednesday"]
+    assert rows(3)[0]["detected_m"] == 20.0
+    assert {row["first_m"] for row in rows(4)} == {30.0}
+    assert rows(5)[0] | {"condition": ""} == rows(5)[1] | {"condition": ""}
+    assert rows(5)[0]["mean_m"] == pytest.approx((4 * 30.0 + 20.0) / 5)
+    assert rows(8) == [
+        {"log": f"{day}.mcap", "before_m": 30.0, "after_m": 30.0} for day in ("monday", "tuesday")
+    ]
+    assert rows(9) == [
+        {"stage": "detecting", "stream": "front", "reason": "cut", "rows": 3, "runs": 1}
+    ]
+    assert [(row["route"], row["approaches"]) for row in rows(10)] == [("north", 2)]

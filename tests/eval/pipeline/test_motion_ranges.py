@@ -1,19 +1,30 @@
-"""Ranges from motion: which light or sign yields the range, and frames without a range."""
+"""Ranges of a run: from motion, from fitted curves, and on a recorded drive."""
 
+import json
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
+from crosscue.datasets.truth.truth import Truth, save
 from crosscue.detectors.base import Detections
 from crosscue.detectors.ranging.control_tracks import ControlTracks
+from crosscue.detectors.ranging.height_to_range import FAMILIES, fit_range, range_of
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.detectors.ranging.usable import CUT
+from crosscue.eval.cli import run
+from crosscue.eval.fit.ranges.fit import pairs_of_run, pairs_of_truth
 from crosscue.eval.pipeline.scene.motion_ranges import UNCONFIRMED, MotionRanges
 from crosscue.eval.pipeline.scene.sign_ranges import SignRanges
+from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.fusion.evidence import RangePosterior
 from crosscue.fusion.intersection_range import Reference
-from crosscue.replay.vehicle.vehicle import Ranges, Vehicle, parse
+from crosscue.replay.columns import Floats
+from crosscue.replay.vehicle.vehicle import RangeCurve, Ranges, Vehicle, parse
+from support.data import shared
 
 SIZE = (1920, 1080)
 AHEAD = CarStep(1.0, 0.0, 0.0, 0.1)
@@ -142,3 +153,170 @@ def test_boxes_cut_by_image_edge_yield_no_range_and_are_counted() -> None:
 
     assert drive(Drive(car), [aside], 3)[0] == ()
     assert counted.by_cue["traffic_light"].skipped == {CUT: 1}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_fit_recovers_curve_and_residual_of_generated_pairs(family: str) -> None:
+    parameters = {"pinhole": (750.0,), "pinhole-offset": (700.0, 2.5), "power": (600.0, -0.9)}
+    curve = RangeCurve(
+        family=family,  # type: ignore[arg-type]
+        parameters=parameters[family],
+        residual_sd_m=1.0,
+    )
+    height = np.linspace(9.0, 90.0, 80)
+    noise = np.random.default_rng(3).normal(0.0, 1.7, 80)
+
+    fitted = fit_range(height, range_of(height, curve) + noise, curve.family)
+
+    truth = range_of(height, curve)
+    assert np.abs(range_of(height, fitted.curve) - truth).max() < 2.0
+    assert fitted.curve.residual_sd_m == pytest.approx(1.7, rel=0.2)
+    assert sum(b.pairs for b in fitted.bins) == 80
+
+
+HEIGHTS = {"stop_sign": 750.0, "traffic_light": 1000.0}
+
+
+def annotated_drive(folder: Path, noise_m: float = 0.0) -> Path:
+    """Write the truth of an approach with a stop sign at the start and a light at the end."""
+    folder.mkdir()
+    rng = np.random.default_rng(2)
+    images, objects, ranges = [], [], ["t_ns,approach,start_m,end_m"]
+    for k in range(60):
+        t_ns, start = 1_700_000_000_000_000_000 + k * 100_000_000, 70.0 - k
+        ranges.append(f"{t_ns},0,{start},{start + 15.0}")
+        images.append({"id": k, "t_ns": t_ns})
+        for number, (cue, size) in enumerate(HEIGHTS.items()):
+            true_m = start if cue == "stop_sign" else start + 15.0
+            height = size / (true_m + rng.normal(0.0, noise_m))
+            objects.append(
+                {"image_id": k, "category_id": number, "visible": 1.0, "bbox": [5, 5, 9, height]}
+            )
+            objects.append(
+                {"image_id": k, "category_id": number, "visible": 0.5, "bbox": [5, 5, 9, 3.0]}
+            )
+    names = [cue.replace("_", " ") for cue in HEIGHTS]
+    tree = {
+        "images": images,
+        "annotations": objects,
+        "categories": [{"id": i, "name": name} for i, name in enumerate(names)],
+    }
+    (folder / "objects.json").write_text(json.dumps(tree))
+    (folder / "ranges.csv").write_text("\n".join(ranges))
+    save(
+        Truth(
+            version=1,
+            start_ns=1_700_000_000_000_000_000,
+            end_ns=1_700_000_007_000_000_000,
+            objects="objects.json",
+            ranges="ranges.csv",
+        ),
+        folder,
+    )
+    return folder
+
+
+@pytest.mark.parametrize("cue", HEIGHTS)
+def test_signs_pair_with_start_and_lights_with_end(cue: str, tmp_path: Path) -> None:
+    pairs = pairs_of_truth(annotated_drive(tmp_path / "a"), cue)
+
+    assert len(pairs.range_m) == 60
+    np.testing.assert_allclose(pairs.height_px * pairs.range_m, HEIGHTS[cue])
+
+
+def test_fitted_curve_is_evaluated_on_other_drives(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fitted, other = annotated_drive(tmp_path / "a"), annotated_drive(tmp_path / "b", noise_m=1.0)
+    figure = tmp_path / "f.png"
+    argv = (
+        f"fit ranges --cue stop_sign --truth {fitted} --test {other} --figure {figure} "
+        "--family pinhole"
+    ).split()
+
+    assert run([*argv, "--json"]) == 0
+
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["fits"][0]["residual_sd_m"] < 0.01
+    assert reported["tested"]["residual_sd_m"] == pytest.approx(1.0, rel=0.3)
+    assert reported["tested"]["pairs"] == 60
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    assert run(argv) == 1  # the figure already exists
+    assert run([*argv, "--overwrite"]) == 0
+    assert "on other drives, 60 pairs" in capsys.readouterr().out
+
+
+def test_confident_detections_of_run_are_paired_with_truth_ranges(tmp_path: Path) -> None:
+    truth = annotated_drive(tmp_path / "a")
+    t_ns = [1_700_000_000_000_000_000 + k * 100_000_000 for k in (3, 4, 5)] + [9]
+    table = pa.table(
+        {
+            "t_ns": t_ns,
+            "label": ["stop sign", "stop sign", "car", "stop sign"],
+            "score": [0.95, 0.5, 0.99, 0.99],
+            "height_px": [20.0] * 4,
+        }
+    )
+    pq.write_table(table, tmp_path / "detections.parquet")
+
+    pairs = pairs_of_run(tmp_path, truth, "stop_sign", 0.9)
+
+    assert pairs.range_m.tolist() == [67.0]
+
+
+CAR = """
+version = 1
+[camera]
+x_m = 1.8
+z_m = 1.8
+focal_px = 1970.0
+center_px = [970.0, 483.3]
+"""
+CAMERA_M = 1.8
+# Distance from the first frame's camera to the far kerb and the crosswalk, each within 2.5 m.
+TRUTH_M = {"end": 79.0, "start": 59.0}
+
+
+@pytest.fixture(scope="module")
+def real_drive(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    log, weights = shared("sequences", "pandaset_002"), shared("weights", "yolox_nano")
+    folder = tmp_path_factory.mktemp("real")
+    (folder / "car.toml").write_text(CAR)
+    argv = ["replay", str(log), "--vehicle", str(folder / "car.toml"), "-o", str(folder / "run")]
+    cache = ["--cache", str(folder / "cache.sqlite")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CROSSCUE_DATA", str(weights.parents[1]))
+        patch.setenv("CROSSCUE_MODELS", str(folder / "models"))
+        assert run(["model", "fetch", "yolox-nano"]) == 0
+        assert run([*argv, "--detectors", "yolox-nano", *cache]) == 0
+    return open_run(folder / "run")
+
+
+def columns(real_drive: RunFolder, reference: str) -> tuple[Floats, Floats, Floats]:
+    """Ranges, their standard deviations and the distance travelled, by row."""
+    table = real_drive.table("range")
+    pose = real_drive.table("pose", ["t_ns", "travelled_m"])
+    gone = dict(zip(pose["t_ns"].to_pylist(), pose["travelled_m"].to_pylist(), strict=True))
+    rows = [row for row in table.to_pylist() if row["reference"] == reference]
+    return (
+        np.array([row["range_m"] for row in rows]),
+        np.sqrt([row["var_m2"] for row in rows]),
+        np.array([gone.get(row["t_ns"], 0.0) for row in rows]),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reference", ["end", "start"])
+def test_range_decreases_and_interval_contains_truth(real_drive: RunFolder, reference: str) -> None:
+    range_m, sd_m, gone_m = columns(real_drive, reference)
+    true_m = TRUTH_M[reference] + CAMERA_M - gone_m
+
+    # The car stands in its first 23 of 80 frames, in which no approach opens. One light marks the
+    # start, and its assumed size is no range until growth confirms it.
+    assert len(range_m) >= {"end": 55, "start": 15}[reference]
+    steps_m, moved_m = np.diff(range_m), np.diff(gone_m)
+    # While the vehicle stands, wheels and poses move back by millimetres.
+    assert (steps_m <= np.maximum(-moved_m, 0.0) + 0.01).all()
+    assert (np.abs(range_m - true_m) < 1.96 * sd_m).all()
+    assert (np.abs(range_m / true_m - 1.0) < 0.1).all()
+    assert sd_m[-1] < 0.8 * sd_m[0]

@@ -1,4 +1,6 @@
-"""The recording of a run, read back from the file; it has no active content."""
+"""The recording of a run: what each frame shows, its parts and its marks."""
+
+from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
@@ -6,20 +8,31 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import rerun as rr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
+import crosscue
 from crosscue.detectors import rle
+from crosscue.detectors.cues.observed import Place
+from crosscue.detectors.cues.road_ground import outlines
+from crosscue.detectors.cues.tracked.motion import CarMotion
 from crosscue.detectors.images import Encoded
 from crosscue.eval.recording import save_rrd
+from crosscue.eval.recording.anchored import way_px
 from crosscue.eval.recording.camera import shown
 from crosscue.eval.recording.notes import inert
 from crosscue.eval.recording.plan import log_landmarks
+from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.moments import run_between
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
-from crosscue.replay.errors import LogError
+from crosscue.replay.errors import LogError, UsageError
+from crosscue.replay.vehicle.vehicle import Camera, Regions
+from support.refusals import refusal
 from support.scene_run import FRAMES, LABEL, scene_run
 from support.scoring import at, good_truth
 
@@ -172,3 +185,101 @@ def test_states_have_no_text_and_small_or_unsure_boxes_no_label(tmp_path: Path) 
     # The viewer would cut text off in short bars, and labels of arrows would cover each other.
     assert found["/cues/stop_sign"] == [[[" "]]]
     assert found["/camera/cars"] == [[[False]]]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    return scene_run(tmp_path_factory.mktemp("part"))
+
+
+def test_tables_of_a_part_have_only_its_rows_and_selected_columns(run: RunFolder) -> None:
+    part = run_between(run, at(10), at(19))
+
+    assert part.table("frames")["t_ns"].to_pylist() == [at(frame) for frame in range(10, 20)]
+    assert part.table("frames", ["frame"]).column_names == ["frame"]
+    assert sum(len(batch) for batch in part.batches("detections", ["label"])) == 2 * 10
+
+
+def test_moment_in_nanoseconds_yields_the_same_recording(run: RunFolder, tmp_path: Path) -> None:
+    rows = [
+        sum(
+            chunk.num_rows
+            for chunk in RrdReader(
+                crosscue.save_recording(run.path, tmp_path / name, at=moment)
+            ).stream()
+        )
+        for name, moment in (("a.rrd", 3.0), ("b.rrd", f"{at(30)}ns"))
+    ]
+
+    assert rows[0] == rows[1]
+
+
+def test_approach_is_recorded_from_its_first_step_to_its_last(tmp_path: Path) -> None:
+    run = scene_run(tmp_path / "drive")
+    belief = run.table("belief")
+    column = belief.schema.get_field_index("approach")
+    numbers = [7 if 10 <= frame < 30 else None for frame in range(len(belief))]
+    numbers = pa.array(numbers, belief.schema.field("approach").type)
+    pq.write_table(belief.set_column(column, "approach", numbers), run.file("belief.parquet"))
+
+    path = crosscue.save_recording(run.path, tmp_path / "a.rrd", approach=7, only=("belief",))
+
+    times: set[int] = set()
+    for chunk in RrdReader(path).stream():
+        if not chunk.is_static:
+            times.update(chunk.to_record_batch().column("drive").cast("int64").to_pylist())
+    assert times == {at(frame) for frame in range(10, 30)}
+    with pytest.raises(UsageError, match="it has: 7"):
+        crosscue.save_recording(run.path, tmp_path / "none.rrd", approach=8)
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        ("--at 99", "lasts from 0 to 4.9"),
+        ("--at noon", "expected seconds"),
+        ("--at nan", "expected seconds"),
+        ("--at 1 --approach 7", "not allowed"),
+        ("--only sky", "expected some of cameras"),
+    ],
+)
+def test_invalid_part_options_are_refused_in_one_line(
+    run: RunFolder, tmp_path: Path, flags: str, named: str
+) -> None:
+    output = tmp_path / "x.rrd"
+
+    assert named in refusal(2, "view", run.path, "-o", output, *flags.split())
+    assert not output.exists()
+
+
+SIZE = (1280, 720)
+CAMERA = Camera(x_m=1.7, z_m=1.4, focal_px=700.0, center_px=(640.0, 360.0))
+BOX = (700.0, 380.0, 740.0, 400.0)
+
+
+def car(right_mps: float, ahead_mps: float) -> CarMotion:
+    """A car below and to the right of the optical axis, 40 m away."""
+    seen = CarMotion(1, 10, 40.0, 0.1, right_mps, 0.1, ahead_mps, 0.1, True, 2.0, 0.0)
+    return seen._replace(box_px=BOX)
+
+
+def test_oncoming_car_moves_from_the_optical_axis_and_outgoing_towards_it() -> None:
+    assert (way_px(car(0.0, -10.0), CAMERA, SIZE) > 0.0).all()
+    assert (way_px(car(0.0, 10.0), CAMERA, SIZE) < 0.0).all()
+
+
+def test_arrow_of_crossing_car_equals_pinhole_projection() -> None:
+    np.testing.assert_allclose(way_px(car(8.0, 0.0), CAMERA, SIZE), [700.0 * 8.0 / 40.0, 0.0])
+
+
+def test_regions_are_below_the_horizon_and_symmetric() -> None:
+    left, straight, right = outlines(CAMERA, Regions(kind="ground"), Place(20.0, 36.0, 0.5), SIZE)
+
+    assert left is not None
+    assert straight is not None
+    assert right is not None
+    for corners in (left, straight, right):
+        assert (corners[:, 1] > 360.0).all()
+    mirrored = np.sort(1280.0 - right[:, 0])
+    np.testing.assert_allclose(np.sort(left[:, 0]), mirrored)
+    assert left[:, 0].max() < straight[:, 0].min() < straight[:, 0].max() < right[:, 0].min()

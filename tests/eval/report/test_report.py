@@ -1,11 +1,14 @@
-"""The report page: it has no active content, says first what happened, and shows mistakes."""
+"""The report of a run."""
+
+from __future__ import annotations
 
 import base64
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -14,16 +17,22 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rerun.chunk import RrdReader
 
 from crosscue.eval import cli
 from crosscue.eval.drives.score import mistakes_of
+from crosscue.eval.recording import save_rrd
+from crosscue.eval.report import page
 from crosscue.eval.report.frame_pictures import draw_pictures
 from crosscue.eval.report.opening import opening_of
 from crosscue.eval.report.page import write_report, write_report_without_truth
 from crosscue.eval.report.scene_figures import draw_belief
 from crosscue.eval.report.svg_plot import ticks
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.moments import moment_ns
+from crosscue.eval.runs.tables.log_time import ClockGap, gaps_of
 from crosscue.eval.scoring.runs import RunScored, judge_run, metrics_of, pooled_scores
+from support.gap_drive import Clock, replayed, write_drive
 from support.scene_run import SIZE, scene_run
 from support.scoring import approach, at, good_truth, span, truth, truth_folder
 
@@ -213,3 +222,113 @@ def test_pictures_of_a_report_leave_out_unlikely_detections(tmp_path: Path) -> N
 
     assert drawn[True].keys() == drawn[False].keys() == {at(21)}
     assert drawn[True] != drawn[False]
+
+
+PAUSE = Clock(pause_s=(5.0, 7.1))
+
+
+@pytest.fixture(scope="module")
+def paused(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    folder = tmp_path_factory.mktemp("paused")
+    return replayed(folder, write_drive(folder, PAUSE))
+
+
+def _rows(path: Path, entity: str, component: str) -> list[tuple[int, Any]]:
+    """Return time and value of each row of an entity of a recording."""
+    found: list[tuple[int, Any]] = []
+    for chunk in RrdReader(path).stream():
+        if chunk.entity_path == entity and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            name = next(n for n in batch.schema.names if n.endswith(component))
+            times = batch["drive"].cast("int64").to_pylist()
+            found += zip(times, batch[name].to_pylist(), strict=True)
+    return sorted(found, key=lambda row: row[0])
+
+
+def _crosses(rows: Sequence[tuple[int, Any]], gap: ClockGap) -> bool:
+    """Return True if a line crosses the gap."""
+    before = [value for t_ns, value in rows if t_ns < gap.middle_ns]
+    return bool(np.isfinite(before[-1][0]))
+
+
+def test_lines_of_a_recording_break_at_gaps(paused: RunFolder, tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    save_rrd(paused, path)
+
+    (gap,) = gaps_of(paused.drive_manifest().timeline)
+    lines = [
+        "/plots/belief/intersection",
+        "/plots/range/start",
+        "/plots/speed/speed_mps",
+        "/plots/heading/heading_deg",
+        "/plots/ellipse/major_axis_m",
+    ]
+    for entity in lines:
+        rows = _rows(path, entity, "scalars")
+        assert len(rows) > 50, entity
+        assert not _crosses(rows, gap), entity
+    states = _rows(path, "/cues/stop_sign", "state")
+    assert [bool(value) for t_ns, value in states if t_ns < gap.middle_ns][-1] is False
+    strips = [
+        chunk.to_record_batch()
+        for chunk in RrdReader(path).stream()
+        if chunk.entity_path == "/plan/estimate"
+    ]
+    name = next(n for n in strips[0].schema.names if n.endswith("strips"))
+    assert len(strips[0][name].to_pylist()[0]) == 2
+
+
+def test_moments_of_a_drive_whose_clock_was_set_have_pictures_and_open(tmp_path: Path) -> None:
+    run = replayed(tmp_path, write_drive(tmp_path, Clock(set_at_s=3.0, by_s=-3600.0)))
+
+    opening = opening_of(run, 0.9)
+
+    assert opening.moments
+    assert all(one.picture for one in opening.moments), opening.missing
+    frames = set(run.table("frames")["t_ns"].to_pylist())
+    for one in opening.moments:
+        assert one.t_ns in frames
+        assert moment_ns(run, f"{one.at_s:.3f}") == pytest.approx(one.t_ns, abs=1e6)
+
+
+class Run:
+    """A run with a table of visual odometry."""
+
+    def __init__(self, folder: Path, step_rad: float) -> None:
+        rng = np.random.default_rng(1)
+        t_s = np.arange(0.0, 40.0, 0.1)
+        pitch = 0.02 + step_rad * (t_s > 20.0) + 5e-4 * rng.normal(size=len(t_s))
+        self._columns = {
+            "t_ns": np.round(t_s * 1e9).astype(np.int64),
+            "pitch_rad": pitch,
+            "is_standing": np.zeros(len(t_s), np.bool_),
+        }
+        self._file = folder / "visual_odometry.parquet"
+        self._file.touch()
+
+    def file(self, name: str) -> Path:
+        """Path of the table."""
+        return self._file
+
+    def table(self, name: str, columns: Any) -> pa.Table:
+        """The table."""
+        return pa.table(self._columns)
+
+
+@pytest.mark.parametrize("step_deg", [0.0, 0.5])
+def test_report_names_a_step_of_the_pitch_and_lists_ten_seconds_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step_deg: float
+) -> None:
+    monkeypatch.setattr(page, "span_ns", lambda run: (0, 40_000_000_000))
+    run = cast("RunFolder", Run(tmp_path, np.radians(step_deg)))
+
+    windows, steps = page._pitch(run)
+
+    assert [one.partition(":")[0] for one in windows] == [
+        "0 to 10 s",
+        "10 to 20 s",
+        "20 to 30 s",
+        "30 to 40 s",
+    ]
+    assert "+1.15 +-" in windows[0]
+    assert [one.rpartition(" at ")[2] for one in steps] == (["20 s"] if step_deg else [])

@@ -1,5 +1,6 @@
-"""The manifest is a typed record that is read back unchanged and refuses other keys."""
+"""Files of a run folder: manifest, tags and what replaces them."""
 
+import errno
 import json
 import re
 from pathlib import Path
@@ -7,14 +8,19 @@ from typing import Any
 
 import pytest
 
+import crosscue
 from crosscue.eval import cli
-from crosscue.eval.batch.merge import merge_runs
+from crosscue.eval.batch.merge import gathered, merge_runs
 from crosscue.eval.runs.account import account
 from crosscue.eval.runs.folder import RunFolder, create, open_run, write_manifest
 from crosscue.eval.runs.manifest import FORMAT_VERSION, EstimateManifest, Manifest, TimeSegments
-from crosscue.replay.errors import RunError
+from crosscue.replay.errors import OutputError, RunError, UnreadableRunError, UsageError
+from crosscue.replay.files.whole_file import write_text, write_whole
 from crosscue.replay.time.segments import Cause, Epoch, EpochMarks, LogClock, TimeSegment
+from support.catalog_runs import add_run, runs_below
 from support.manifests import detected, estimated, log_account
+from support.refusals import refusal
+from support.trees import tree
 
 SET_BACK = TimeSegments(
     segments=(
@@ -101,3 +107,107 @@ def test_run_schema_covers_all_stages(tmp_path: Path, capsys: pytest.CaptureFixt
 
     assert cli.run(["truth", "schema", "-o", str(tmp_path / "t.json")]) == 0
     assert json.loads((tmp_path / "t.json").read_text())["title"] == "Truth"
+
+
+def test_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "old")
+
+    def fail(partial: Path) -> None:
+        partial.write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OutputError, match="disk is full"):
+        write_whole(tmp_path / "a.txt", fail)
+
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text() == "old"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "unreadable"),
+        (json.dumps({"format_version": 99}), "format 99"),
+        (json.dumps([1]), "format None"),
+    ],
+)
+def test_damaged_or_unsupported_manifest_is_refused(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    (tmp_path / "manifest.json").write_text(text)
+
+    with pytest.raises(RunError, match=message):
+        open_run(tmp_path)
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """Two drives, each with two settings."""
+    return runs_below(tmp_path / "fleet")
+
+
+def test_tags_are_set_listed_and_removed(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    monday, tuesday = str(runs / "a/monday"), str(runs / "a/tuesday")
+
+    assert cli.run(["tag", monday, tuesday, "weather=rain", "route=5 = north", "--json"]) == 0
+    both = {"weather": "rain", "route": "5 = north"}
+    assert json.loads(capsys.readouterr().out) == {monday: both, tuesday: both}
+
+    assert cli.run(["tag", monday, "weather=dry", "--remove", "route", "-q"]) == 0
+    capsys.readouterr()
+    assert cli.run(["tag", str(runs / "a")]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"{monday}  weather=dry",
+        f"{tuesday}  route=5 = north weather=rain",
+    ]
+
+
+def test_copies_of_a_run_with_different_tags_are_not_merged(runs: Path) -> None:
+    add_run(runs / "copy/monday", "monday")
+    gathered([runs / "a", runs / "copy"])
+    crosscue.tag_runs([runs / "copy/monday"], {"weather": "rain"})
+
+    with pytest.raises(UsageError, match="one run with different tags"):
+        gathered([runs / "a", runs / "copy"])
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["weather="], "weather=: expected KEY=VALUE"),
+        (["1weather=rain"], "expected KEY=VALUE"),
+        (["weather=a\nb"], "expected KEY=VALUE"),
+        (["weather=rain", "weather=dry"], "weather: set twice"),
+        (["weather=rain", "--remove", "weather"], "set twice, or set and removed"),
+        (["--remove", "a b"], "a b: not a valid key of a tag"),
+    ],
+)
+def test_invalid_tags_are_refused_without_changes(
+    runs: Path, argv: list[str], message: str
+) -> None:
+    before = tree(runs)
+
+    assert message in refusal(2, "tag", runs / "a", *argv)
+    assert tree(runs) == before
+
+
+def test_damaged_tags_are_reported_and_not_overwritten(runs: Path) -> None:
+    path = runs / "a/monday/tags.json"
+    path.write_text('{"format_version": 1, "tags": {"weather": 3}}')
+
+    with pytest.raises(UnreadableRunError, match=r"tags\.json: unreadable"):
+        crosscue.tag_runs([runs / "a"], {"weather": "rain"})
+
+    assert "3" in path.read_text()
+    assert not (runs / "a/tuesday/tags.json").exists()
+    assert "tags.json: unreadable" in crosscue.catalog(runs).left_out["a/monday"]
+
+
+def test_removing_the_last_tag_restores_the_run_folder(runs: Path) -> None:
+    before = tree(runs / "a/monday")
+
+    crosscue.tag_runs([runs / "a/monday"], {"weather": "rain"})
+    assert tree(runs / "a/monday") != before
+    crosscue.tag_runs([runs / "a/monday"], remove=["weather", "never_set"])
+
+    assert tree(runs / "a/monday") == before

@@ -1,12 +1,31 @@
-"""Intervals over clusters: coverage in simulations, and limits."""
+"""Intervals over drives and places, and changes over versions."""
+
+import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from crosscue.eval.scoring.intervals import fraction_by_cluster, mean_by_cluster
+from crosscue.datasets.truth.truth import Origin, Truth
+from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.eval.scoring import change_points as module
+from crosscue.eval.scoring.change_points import FALSE_ALARMS, MIN_PLACES, Results, change_points
+from crosscue.eval.scoring.columns import NONE
+from crosscue.eval.scoring.drives import pool_scores, score_drive
+from crosscue.eval.scoring.intervals import (
+    MIN_CLUSTERS,
+    fraction,
+    fraction_by_cluster,
+    mean,
+    mean_by_cluster,
+)
+from crosscue.eval.scoring.places import group_drives, group_places, places_of
+from crosscue.eval.scoring.truth import DriveTruth, read_scored_truth
 from crosscue.eval.studies.intervals import mean_of, range_at, ratio_of, ratio_of_means
 from crosscue.replay.columns import Int64s
+from support.scoring import approach, good_tables, good_truth, truth_folder
 
 TIMES = 800
 # Three standard deviations of a coverage of 95 % in ``TIMES`` trials.
@@ -123,3 +142,167 @@ def test_ratio_interval_covers_and_equals_ratio_of_means_over_all_drives() -> No
         assert ratio_of_means(top, every, bottom, every) == pytest.approx(found, rel=1e-9)
 
     assert covered / TIMES > 0.92
+
+
+TIMES_PLACES = 400
+
+
+def test_place_of_the_truth_comes_before_names_of_intersections(tmp_path: Path) -> None:
+    named = read_scored_truth(truth_folder(tmp_path / "a"), "a")
+    placed = read_scored_truth(truth_folder(tmp_path / "b", place="Elm Street"), "b")
+
+    intersection = named.truth.approaches[0].intersection
+    assert named.places == {NONE: intersection, 0: intersection}
+    assert set(placed.places.values()) == {"Elm Street"}
+
+
+def test_positions_within_50_m_are_one_place(tmp_path: Path) -> None:
+    def truth_at(east_m: float) -> Truth:
+        name = f"{east_m:g}.tum"
+        t_ns = np.arange(5) * 10**9
+        x_m = east_m + np.linspace(-30.0, 0.0, 5)
+        write_tum(tmp_path / name, planar(t_ns, x_m, np.zeros(5), np.zeros(5)), "made up")
+        one = approach().model_copy(update={"start_ns": 0, "enter_ns": 4 * 10**9})
+        origin = Origin(latitude_deg=52.5, longitude_deg=13.4, altitude_m=40.0)
+        return Truth(
+            version=1, start_ns=0, end_ns=5 * 10**9, pose=name, origin=origin, approaches=(one,)
+        )
+
+    found = [places_of(truth_at(east_m), tmp_path) for east_m in (0.0, 45.0, 90.0, 200.0)]
+    first = found[0][0]
+    assert first == found[0][NONE]
+    assert first == "geo:52.500000,13.400000"
+    # The second connects the first and the third, which are 90 m apart.
+    assert group_places([one[0] for one in found]).tolist() == [0, 0, 0, 1]
+    assert group_places([found[0][0], found[2][0]]).tolist() == [0, 1]
+
+
+def test_drives_that_share_a_place_are_one_group() -> None:
+    drives = [["a"], ["b"], ["b", "c"], ["d"], ["c"]]
+
+    assert group_drives(drives).tolist() == [0, 1, 1, 2, 1]
+    assert group_drives([]).tolist() == []
+
+
+def test_drives_to_one_intersection_have_no_interval_of_scores() -> None:
+    def scored(names: list[str]) -> float:
+        drives = []
+        for number, name in enumerate(names):
+            truth = good_truth()
+            placed = DriveTruth(f"drive {number}", truth.truth, truth.ranges, {0: name, NONE: name})
+            drives.append(score_drive(good_tables(), placed))
+        found = pool_scores(drives)
+        assert found.approaches is not None
+        precision = found.cues["stop_sign"].precision
+        brier = found.belief["left"].brier
+        clusters = {precision.clusters, brier.clusters, found.approaches.detected_m.clusters}
+        assert clusters == {len(set(names))}
+        return brier.low
+
+    assert math.isnan(scored(["A"] * 8))
+    assert math.isfinite(scored([f"{i % MIN_CLUSTERS}" for i in range(8)]))
+
+
+@pytest.mark.parametrize("places", [4, 5, 8])
+def test_intervals_over_places_cover_what_intervals_over_drives_miss(places: int) -> None:
+    """Four drives per place; as drives, 20 of 5 places covered 81 to 83 %."""
+    rng = np.random.default_rng(places)
+    at = np.repeat(np.arange(places), 4)
+    right = {"places": 0, "drives": 0, "fraction": 0}
+    for _ in range(TIMES_PLACES):
+        values = rng.normal(0.0, 1.0, places)[at] + rng.normal(0.0, 0.7, len(at))
+        for name, clusters in (("places", at), ("drives", np.arange(len(at)))):
+            found = mean(values, clusters)
+            right[name] += found.low <= 0.0 <= found.high
+        level = rng.beta(8.0, 2.0, places)[at]
+        rows = np.repeat(np.arange(len(at)), 10)
+        found_fraction = fraction(rng.random(len(rows)) < level[rows], at[rows])
+        low, high = found_fraction.clusters_low, found_fraction.clusters_high
+        right["fraction"] += low <= 0.8 <= high
+
+    assert right["drives"] / TIMES_PLACES < 0.85
+    assert right["places"] / TIMES_PLACES > 0.95 - 3.0 * math.sqrt(0.95 * 0.05 / TIMES_PLACES)
+    assert right["fraction"] / TIMES_PLACES > 0.93 - 2.0 * math.sqrt(0.95 * 0.05 / TIMES_PLACES)
+
+
+DRIVES, VERSIONS = 8, 6
+
+
+def history(
+    rng: np.random.Generator, steps: dict[int, float], drives: int = DRIVES
+) -> NDArray[np.float64]:
+    """Generate values of drives with different levels, noise, and steps at some versions."""
+    level = rng.normal(0.0, 1.0, (drives, 1))
+    values = level + rng.normal(0.0, 0.1, (drives, VERSIONS))
+    for at, step in steps.items():
+        values[:, at:] += step
+    return values
+
+
+def results(*values: NDArray[np.float64]) -> dict[str, Results]:
+    return {
+        str(i): Results(one, np.ones(len(one)), np.arange(len(one))) for i, one in enumerate(values)
+    }
+
+
+def places(found: dict[str, Results]) -> list[list[int]]:
+    return [[point.at for point in points] for points in change_points(found).values()]
+
+
+def test_steps_are_found_at_their_versions() -> None:
+    right = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        steps: tuple[dict[int, float], ...] = ({3: 0.5}, {1: 0.5, 4: -0.5}, {})
+        found = places(results(*(history(rng, one) for one in steps)))
+        assert {*found[0]} >= {3}
+        assert {*found[1]} >= {1, 4}
+        right += found == [[3], [1, 4], []]
+
+    # Each of two further rounds finds a false change in 5 % of cases: 18 are right on average.
+    assert right >= 15
+
+
+def test_false_alarm_rate_is_as_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "SHUFFLES", 100)
+    rng = np.random.default_rng(2)
+    times = 300
+    alarms = sum(any(places(results(*(history(rng, {}) for _ in range(3))))) for _ in range(times))
+
+    assert alarms / times <= FALSE_ALARMS + 2.0 * math.sqrt(FALSE_ALARMS / times)
+
+
+def test_change_points_do_not_depend_on_order_of_drives_or_scale() -> None:
+    values = history(np.random.default_rng(3), {2: 0.3})
+    points = change_points(results(values))["0"]
+
+    assert points[0].by == pytest.approx(0.3, abs=0.15)
+    # Another unit is another scale; the mirrored history has the mirrored change.
+    (scaled,) = change_points(results(1000.0 * values + 5.0))["0"]
+    assert (scaled.at, scaled.p) == (points[0].at, points[0].p)
+    assert scaled.by == pytest.approx(1000.0 * points[0].by)
+    assert places(results(values[::-1])) == [[2]]
+    assert places(results(values[:, ::-1])) == [[VERSIONS - 2]]
+
+
+def test_constant_missing_and_single_version_results_have_no_change() -> None:
+    assert places(results(np.ones((DRIVES, VERSIONS)))) == [[]]
+    assert places(results(np.ones((DRIVES, 1)))) == [[]]
+    assert places(results(np.full((DRIVES, VERSIONS), np.nan))) == [[]]
+    assert change_points({}) == {}
+
+
+def test_drives_of_one_place_count_once_and_are_shuffled_alike() -> None:
+    rng = np.random.default_rng(6)
+    values = history(rng, {3: 1.0}, drives=12)
+
+    def at(places: int) -> list[int]:
+        where = np.arange(12) % places
+        (found,) = change_points({"a": Results(values, np.ones(12), where)}).values()
+        return [point.at for point in found]
+
+    assert at(12) == at(MIN_PLACES) == [3]
+    assert at(MIN_PLACES - 1) == []
+    alike = module._shuffled(values, np.ones(values.shape, np.bool_), np.zeros(12, np.int64))
+    first = np.array([[np.flatnonzero(values[d] == one)[0] for one in alike[7, d]] for d in (0, 5)])
+    assert (first[0] == first[1]).all()

@@ -1,5 +1,9 @@
-"""``crosscue score`` on run folders: files, gates, exit status, and refused input."""
+"""Scores of a run: files, gates, tables and the remembered truth."""
 
+from __future__ import annotations
+
+import builtins
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -10,13 +14,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crosscue.eval import cli
+import crosscue
+from crosscue.eval import cli, recording
+from crosscue.eval.recording import view
 from crosscue.eval.report.junit import junit_text
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import LogRow
+from crosscue.eval.scoring.by_drive import DriveMetric, no_longer_scored
+from crosscue.eval.scoring.drives import ScoreSettings, as_metrics
 from crosscue.eval.scoring.gates import Gate, check_gates
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
+from crosscue.eval.scoring.truth import read_scored_truth
+from crosscue.replay.errors import SchemaError
+from crosscue.replay.files.tree_text import strict_json
 from support.refusals import refusal
+from support.scene_run import scene_run
 from support.scoring import (
     BELIEF,
     CUES,
@@ -25,6 +37,7 @@ from support.scoring import (
     belief_table,
     cue_table,
     frame_table,
+    good_truth,
     log_row,
     range_table,
     run_folder,
@@ -283,3 +296,116 @@ def test_score_of_one_run_is_also_written_to_output_folder(
     for name in ("metrics.json", "curves.parquet", "cue_frames.parquet"):
         assert (out / name).read_bytes() == (run / "score" / name).read_bytes()
     assert (out / "report.html").exists()
+
+
+SECTIONS = ("cues", "approaches", "belief", "range")
+
+
+def _metrics(scores: object) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(strict_json(as_metrics(scores)))  # type: ignore[arg-type]
+    return found
+
+
+def test_scores_of_tables_are_those_of_their_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "one"
+    truth_folder(folder)
+    run_folder(folder / "run")
+    crosscue.score_run(folder / "run", has_figures=False)
+    of_run = json.loads((folder / "run" / "score" / "metrics.json").read_text())
+    names = ("frames", "cues", "range", "belief")
+    tables = {name: pq.read_table(folder / "run" / f"{name}.parquet") for name in names}
+    truth = read_scored_truth(folder / "truth.json", str(folder / "run"))
+
+    def closed(*_: object, **__: object) -> None:
+        raise AssertionError("a file was opened")
+
+    monkeypatch.setattr(builtins, "open", closed)
+    monkeypatch.setattr(io, "open", closed)
+    scores = crosscue.score(tables, truth)
+
+    found = _metrics(scores)
+    assert {name: found[name] for name in SECTIONS} == {name: of_run[name] for name in SECTIONS}
+
+
+def test_what_is_missing_is_not_scored(tmp_path: Path) -> None:
+    run_folder(tmp_path / "run")
+    cues = pq.read_table(tmp_path / "run" / "cues.parquet")
+
+    scores = crosscue.score({"cues": cues}, good_truth().truth, ScoreSettings(threshold=0.8))
+
+    assert scores.cues["stop_sign"].precision.value == 1.0
+    assert scores.not_scored() == {
+        "approaches": "the run has no belief",
+        "belief": "the run has no belief",
+        "range": "the run has no range",
+    }
+    assert scores.settings.threshold == 0.8
+
+
+def test_metrics_of_unpaired_drives_are_not_reported_as_lost() -> None:
+    """A fleet with one more drive has conditions that the other lacks."""
+
+    def of(log: str, metric: str) -> DriveMetric:
+        return DriveMetric(log, metric, "mean", 1.0, 1)
+
+    dusk, recall = "cues.stop_sign.by_condition.dusk.recall", "cues.stop_sign.recall"
+    before = [of("monday", recall), of("tuesday", recall), of("tuesday", dusk)]
+
+    assert no_longer_scored(before, [of("monday", recall)]) == ()
+    assert no_longer_scored(before, [of("monday", recall), of("tuesday", recall)]) == (dusk,)
+
+
+@pytest.fixture
+def scored(tmp_path: Path) -> tuple[Path, Path]:
+    """Score a run with a truth that is not next to its log; return both."""
+    run, truth = scene_run(tmp_path / "drive").path, truth_folder(tmp_path / "elsewhere")
+    crosscue.score_run(run, truth)
+    return run, truth
+
+
+def test_failures_and_score_use_the_truth_of_the_last_score(scored: tuple[Path, Path]) -> None:
+    run, truth = scored
+    told = crosscue.failures(run, truth=truth).failures
+
+    assert told
+    assert crosscue.failures(run).failures == told
+    assert crosscue.score_run(run).one.truth_path.samefile(truth)
+
+
+def test_changed_truth_is_refused_until_the_run_is_scored_again(
+    scored: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, truth = scored
+    truth.write_text(truth.read_text().replace('"A"', '"B"'))
+
+    assert cli.run(["failures", str(run)]) != 0
+    printed = capsys.readouterr()
+    assert "changed since" in printed.out + printed.err
+    with pytest.raises(SchemaError, match="changed since"):
+        view.save_recording(run, run / "drive.rrd")
+    assert cli.run(["score", str(run), "-q"]) == 3
+    assert crosscue.failures(run).failures
+
+
+def test_truth_that_is_gone_counts_as_none(scored: tuple[Path, Path]) -> None:
+    run, truth = scored
+    truth.rename(truth.with_name("moved.json"))
+
+    assert crosscue.failures(run).without_truth
+
+
+def test_recording_draws_the_truth_of_the_last_score(
+    scored: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[object] = []
+    monkeypatch.setattr(recording, "save_rrd", lambda *given: drawn.append(given[3]))
+    run, truth = scored
+
+    view.save_recording(run, run / "told.rrd", truth)
+    view.save_recording(run, run / "drive.rrd")
+    truth.unlink()
+    view.save_recording(run, run / "drive.rrd")
+
+    assert [ranges is None for ranges in drawn] == [False, False, True]

@@ -1,14 +1,27 @@
-"""The range smoother and the range filter on simulated approaches."""
+"""Smoothed ranges, and the noise of simulated drives."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
+from crosscue.datasets.simulated.drive import DriveSettings
+from crosscue.datasets.simulated.log_files import write_drive
+from crosscue.eval.pipeline.whole_run import replay_drive
+from crosscue.eval.report.summary import poses_summary
+from crosscue.eval.runs.drive import Drive
+from crosscue.eval.runs.folder import create
 from crosscue.eval.runs.tables.travelled import Odometer
 from crosscue.eval.scoring.columns import RangeRows
+from crosscue.eval.scoring.consistency import mean_band
+from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.scene.ranges import smoothed_rows
+from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.fusion.intersection_range import RangeBelief, initialise, predict, update
 from crosscue.replay.columns import Floats
+from crosscue.replay.logs.opening import open_log
+from crosscue.replay.vehicle.vehicle import load
 
 SENSOR_M2, WAY_M2, STEP_M, STEP_NS = 4.0, 0.01, 1.0, 100_000_000
 
@@ -46,3 +59,24 @@ def test_range_smoother_is_more_accurate_than_filter() -> None:
         assert (after.var_m2 <= before.var_m2 + 1e-12).all()
 
     assert np.mean(smoother_m2) < 0.8 * np.mean(filter_m2)
+
+
+DRIVES = 4
+
+
+def test_nees_of_simulated_drives_is_in_band(tmp_path: Path) -> None:
+    poses = []
+    for seed in range(DRIVES):
+        files = write_drive(tmp_path / str(seed), DriveSettings(seed=seed, blocks=1, block_m=70.0))
+        with open_log(files.log) as log:
+            run = create(tmp_path / f"run {seed}", overwrite=False)
+            found = replay_drive(Drive([log], load(files.vehicle)), run).run
+        poses.append(score_pose(found, files.truth))
+
+    low, high = mean_band(3, DRIVES)
+    assert low < np.mean([one.nees_xyh.mean for one in poses]) < high
+    text = poses_summary(poses, np.arange(DRIVES))
+    assert "4 drives, 0 lost" in text
+    assert "NEES of x, y, heading" in text
+    assert TOO_FEW not in text
+    assert TOO_FEW in poses_summary(poses, np.arange(DRIVES) // 4)

@@ -1,15 +1,22 @@
-"""Tests of simulated drives: compilation, consistency, and the distance until the car is lost."""
+"""Simulated cities, drives through them, and the drives' errors."""
+
+from __future__ import annotations
 
 import importlib.util
 import math
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import settings as checked
+from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from crosscue.eval.scoring.consistency import mean_band
+from crosscue.localization.angles import wrap_all
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import (
@@ -17,13 +24,28 @@ from crosscue.localization.town.drive import (
     STEP_FIELDS,
     DriveRecord,
     DriveResult,
+    Traced,
     drive_many,
     drive_traced,
     simulate_town_drive,
+    streets_of,
 )
-from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
+from crosscue.localization.town.random_stream import RandomStream, stream_of
+from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive, parameters_of
+from crosscue.localization.town.streets import (
+    Streets,
+    draw_goal,
+    draw_landmarks,
+    draw_place,
+    has_intersection,
+    has_way,
+    make_streets,
+    node_position,
+    step_of,
+)
 from crosscue.replay.columns import Floats
-from crosscue.replay.compiled import fingerprint
+from crosscue.replay.compiled import compile_function, fingerprint
+from support.arc_consistency import nees_along_the_arc
 from support.beliefs import driven, with_heading
 
 FIELD = {name: i for i, name in enumerate(DriveResult._fields)}
@@ -176,3 +198,137 @@ def test_settings_out_of_range_are_refused(
 ) -> None:
     with pytest.raises(ValidationError, match=field):
         section.model_validate({field: value})
+
+
+SMALL = TownDrive(city=City(largest_km2=3.0, one_way_fraction=0.5, dead_end_fraction=0.1))
+
+
+def stream(seed: int, purpose: int = 7) -> RandomStream:
+    with np.errstate(over="ignore"):
+        return stream_of(np.uint64(seed), np.uint64(purpose))
+
+
+def reachable(streets: Streets, start: int, *, backward: bool = False) -> set[int]:
+    """Intersections reachable from ``start``, or with ``backward`` those that lead to it."""
+    seen, queue = {start}, deque([start])
+    while queue:
+        node = queue.popleft()
+        for way in range(4):
+            there = node + step_of(way, len(streets.xs_m))
+            if not 0 <= there < len(streets.ways) or there in seen:
+                continue
+            if has_way(streets.ways, *((there, (way + 2) % 4) if backward else (node, way))):
+                seen.add(there)
+                queue.append(there)
+    return seen
+
+
+@pytest.mark.slow
+@given(seed=st.integers(0, 2**63))
+@checked(deadline=None, max_examples=25)
+def test_goal_is_reachable_from_every_reachable_intersection(seed: int) -> None:
+    streets = streets_of(SMALL, seed)
+    with np.errstate(over="ignore"):
+        start, after = draw_place(stream(seed), streets.inside)
+        goal, _ = draw_goal(after, streets, start, SMALL.city.goal_at_least_m)
+
+    assert reachable(streets, start) <= reachable(streets, goal, backward=True)
+    assert goal in reachable(streets, start)
+
+
+@given(seed=st.integers(0, 2**63))
+@checked(deadline=None, max_examples=25)
+def test_every_street_leads_to_an_intersection_with_an_exit(seed: int) -> None:
+    streets = streets_of(SMALL, seed)
+    for node in range(len(streets.ways)):
+        x, y = node_position(streets, node)
+        for way, (dx, dy) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
+            if has_way(streets.ways, node, way):
+                there = node + step_of(way, len(streets.xs_m))
+                there_x, there_y = node_position(streets, there)
+                assert (np.sign(there_x - x), np.sign(there_y - y)) == (dx, dy)
+                assert streets.ways[there] != 0
+
+
+def test_compiled_city_matches_python_and_is_reproducible() -> None:
+    with np.errstate(over="ignore"):
+        plain = make_streets(stream(5, 1), parameters_of(SMALL))
+
+    for one in (streets_of(SMALL, 5), streets_of(SMALL, 5)):
+        for mine, other in zip(one, plain, strict=True):
+            np.testing.assert_array_equal(mine, other)
+
+
+def test_landmarks_are_distinct_and_of_the_requested_density() -> None:
+    streets = streets_of(TownDrive(city=drive_settings.City(smallest_km2=50.0)), 2)
+    draw = compile_function(draw_landmarks)
+    drawn = [draw(stream(i), streets, 2.0)[0] for i in range(40)]
+
+    assert np.mean([len(one) for one in drawn]) == pytest.approx(2.0 * streets.area_km2, rel=0.1)
+    assert all(len(set(one.tolist())) == len(one) for one in drawn)
+
+
+def test_single_street_has_no_intersection() -> None:
+    ways = np.array([1, 5, 4], np.uint8)
+    street = Streets(np.arange(3.0), np.zeros(1), ways, np.ones(3, np.bool_), 1.0)
+
+    assert not has_intersection(street)
+
+
+NEES = DriveResult._fields.index("nees")
+FINE_M = 1e-4
+
+
+def fine_encoders(compass_2sigma_deg: float | None, *, goals: int = 1) -> TownDrive:
+    sensors = Sensors(compass_2sigma_deg=compass_2sigma_deg, encoder_step_m=FINE_M)
+    return TownDrive(sensors=sensors, goals=goals)
+
+
+def compass_innovations(settings: TownDrive, traced: Traced) -> tuple[Floats, Floats]:
+    """Innovations of the compass, and their variances according to the filter."""
+    sensors, track_m = settings.sensors, settings.car.track_width_m
+    assert sensors.compass_2sigma_deg is not None
+    left, right, compass = traced.steps[1:, 4:7].T
+    before, var = traced.steps[:-1, 9], traced.steps[:-1, 15]
+    slip = sensors.slip_per_sqrt_m**2 * np.abs(0.5 * (left + right))
+    expected = before + (right - left) / track_m
+    spread = var + 2.0 * slip / track_m**2 + (math.radians(sensors.compass_2sigma_deg) / 2.0) ** 2
+    is_read = ~np.isnan(compass)
+    return wrap_all(compass - expected)[is_read], spread[is_read]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("goals", [1, 1_000_000], ids=["to the goal", "as far as allowed"])
+def test_nees_with_a_ten_degree_compass_is_in_its_band(goals: int) -> None:
+    count = 1000 if goals == 1 else 150
+    settings = fine_encoders(10.0, goals=goals).model_copy(update={"longest_m": 20_000.0})
+    rows = drive_many(settings, np.arange(count, dtype=np.uint64))
+    low, high = mean_band(3, count)
+
+    assert low < rows[:, NEES].mean() < high
+
+
+@pytest.mark.parametrize("compass_deg", [10.0, 20.0, 30.0])
+def test_compass_innovations_are_white_and_consistent(compass_deg: float) -> None:
+    settings = fine_encoders(compass_deg)
+    parts = [compass_innovations(settings, drive_traced(settings, seed)) for seed in range(12)]
+    nis = np.concatenate([off**2 / spread for off, spread in parts])
+    following = np.concatenate(
+        [(off[1:] * off[:-1]) / np.sqrt(spread[1:] * spread[:-1]) for off, spread in parts]
+    )
+    low, high = mean_band(1, len(nis))
+
+    assert len(nis) > 20_000
+    assert low < nis.mean() < high
+    assert abs(following.mean()) < 2.0 / math.sqrt(len(following))
+
+
+def test_errors_without_a_compass_are_consistent_along_an_arc() -> None:
+    """NEES is too high in x, y and heading, but consistent in rotation and displacement."""
+    settings = fine_encoders(None)
+    ends = [drive_traced(settings, seed).steps[-1] for seed in range(400)]
+    rows = drive_many(settings, np.arange(400, dtype=np.uint64))
+    low, high = mean_band(3, 400)
+
+    assert rows[:, NEES].mean() > high + 1.0
+    assert low < np.mean([nees_along_the_arc(row) for row in ends]) < high

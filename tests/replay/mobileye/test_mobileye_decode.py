@@ -1,7 +1,8 @@
-"""Frames of a bus are decoded to tables; only frames of one image are joined."""
+"""Mobileye frames: layout, decoding and times."""
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from itertools import pairwise
 from math import cos, sin
@@ -11,12 +12,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.columns import Block, CanFrames, Table
+from crosscue.replay.columns import Block, CanFrames, Int64s, Table
+from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.mobileye.bits import extract, leading_words, payloads_of, place_bits
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
+from crosscue.replay.mobileye.clock import SET_ANEW, WENT_BACK, unwrap
 from crosscue.replay.mobileye.geometry import DevicePosition
-from crosscue.replay.mobileye.layout import VARIANTS
+from crosscue.replay.mobileye.layout import VARIANTS, describe, layout, parse_layout
 from crosscue.replay.mobileye.settings import MobileyeSettings
+from crosscue.replay.mobileye.wire import values_of
 from support.mobileye_frames import MS, frames, random_drive, status, values
 
 ORIGIN_MOUNTING = DevicePosition()
@@ -167,3 +172,142 @@ def test_rows_that_are_not_can_frames_are_refused() -> None:
     decoder = MobileyeDecoder("can1", Ledger("log"))
     with pytest.raises(ValueError, match="can1: expected CanFrames, got Table"):
         decoder(Block("can1", np.zeros(0, dtype=np.int64), Table({})))
+
+
+def decoded_value(name: str, field: str, text: str, variant: str = "") -> float:
+    message = layout()[name]
+    payload = np.zeros((1, 8), dtype=np.uint8)
+    raw = bytes.fromhex(text)
+    payload[0, : len(raw)] = list(raw)
+    number = VARIANTS.index(variant) if variant else -1
+    values = values_of(message, leading_words(payload), np.array([number], dtype=np.int8))
+    return float(values[field][0])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "field", "expected"),
+    [
+        ("obstacle_a", "0180014002003003", "obstacle_id", 1),
+        ("obstacle_a", "0180014002003003", "x_m", 24.0),
+        ("obstacle_a", "0180014002003003", "y_m", -28.0),
+        ("obstacle_a", "0180014002003003", "type", 3),
+        ("obstacle_a", "0180014002003003", "status", 3),
+        ("obstacle_b", "1184030000000000", "length_m", 8.5),
+        ("obstacle_b", "1184030000000000", "width_m", 6.6),
+        ("obstacle_b", "1184030000000000", "age_frames", 3),
+        ("obstacle_c", "0000000000103007", "replaced", 1),
+        ("obstacle_c", "0000000000103007", "angle_rad", 18.4),
+        ("status", "020505FF0103", "count", 2),
+        ("status", "020505FF0103", "counter_ms", 5),
+        ("status", "020505FF0103", "application_version", 5),
+        ("status", "020505FF0103", "cut_in_left", 1),
+        ("status", "020505FF0103", "cut_in_right", 1),
+        ("status", "020505FF0103", "stop_go", 15),
+        ("status", "020505FF0103", "protocol_version", 1),
+        ("lane_details", "0040200200000000", "c2_per_m", 0x4000 * 3.81e-6),
+        ("lane_details", "0040200200000000", "c1", 0.272),
+    ],
+)
+def test_published_frames_decode_to_published_values(
+    name: str, text: str, field: str, expected: float
+) -> None:
+    assert decoded_value(name, field, text, "classic") == pytest.approx(expected, rel=1e-12)
+
+
+def test_describe_lists_every_field_once() -> None:
+    rows = list(describe())
+    assert len(rows) == sum(len(m.fields) for m in layout().messages)
+    assert rows[0].ids == "0x738"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('fields = [{name = "a", start = 60, bits = 8}]', "a: bits 60+8 do not fit 8 bytes"),
+        ('fields = [{name = "a", start = 0, bits = 8}, {name = "b", start = 7, bits = 1}]', "b"),
+        ('fields = [{name = "a", start = 4, bits = 8, order = "big"}]', "of complete bytes"),
+        ('fields = [{name = "a", start = 0, bits = 8, only = "new"}]', "only 'new'; there are"),
+        ('fields = [{name = "a", start = 24, bits = 9}]', "m.a: does not fit the payload"),
+    ],
+)
+def test_invalid_layout_is_refused(text: str, message: str) -> None:
+    head = '[[message]]\nname = "m"\nabout = ""\ntable = "t"\nid = 1\nlengths = [4]\n'
+    with pytest.raises(SchemaError, match=re.escape(message)):
+        parse_layout(head + text)
+
+
+@given(
+    start=st.integers(0, 63), bits=st.integers(1, 32), signed=st.booleans(), seed=st.integers(0, 99)
+)
+def test_extract_inverts_place(start: int, bits: int, signed: bool, seed: int) -> None:
+    bits = min(bits, 64 - start)
+    low = -(1 << (bits - 1)) if signed else 0
+    raw = np.random.default_rng(seed).integers(low, low + (1 << bits), 20)
+    words = place_bits(raw, start, bits, False)
+    np.testing.assert_array_equal(extract(words, start, bits, signed, False), raw)
+    np.testing.assert_array_equal(leading_words(payloads_of(words)), words)
+
+
+MS_CLOCK = 1_000_000
+
+
+def camera(n: int, period_ms: int = 66, drift: float = 0.0) -> tuple[Int64s, Int64s]:
+    """Return image times on the log's clock, and the device's counter at these times."""
+    image_ns = 10**18 + np.arange(n, dtype=np.int64) * period_ms * MS_CLOCK
+    device_ns = (np.arange(n) * period_ms * MS_CLOCK * (1 + drift)).astype(np.int64) + 77 * MS_CLOCK
+    return image_ns, device_ns // MS_CLOCK & 0xFF
+
+
+def error_without_offset(image_ns: Int64s, truth_ns: Int64s) -> Int64s:
+    """Return the error minus its median, because a constant offset cannot be observed."""
+    error = image_ns - truth_ns
+    return error - np.int64(np.median(error))
+
+
+@given(seed=st.integers(0, 1000), period_ms=st.integers(50, 110), jitter_ms=st.integers(0, 90))
+def test_arrival_jitter_is_removed(seed: int, period_ms: int, jitter_ms: int) -> None:
+    rng = np.random.default_rng(seed)
+    image_ns, counter_ms = camera(400, period_ms)
+    latency_ns = 5 * MS_CLOCK + rng.exponential(jitter_ms * MS_CLOCK / 5 + 1, 400).clip(
+        0, jitter_ms * MS_CLOCK
+    )
+    log_ns = np.maximum.accumulate(image_ns + latency_ns.astype(np.int64))
+    found = unwrap(counter_ms, log_ns).image_ns
+
+    settled = np.s_[60:]
+    assert np.abs(error_without_offset(found[settled], image_ns[settled])).max() <= 4 * MS_CLOCK
+    assert (np.diff(found) >= 0).all()
+    assert (found <= log_ns).all()
+
+
+@given(
+    counters=st.lists(st.integers(0, 255), min_size=1, max_size=60),
+    steps=st.lists(st.integers(0, 3 * 10**11), min_size=60, max_size=60),
+)
+def test_image_times_are_ordered_and_precede_their_frames(
+    counters: list[int], steps: list[int]
+) -> None:
+    log_ns = np.cumsum(np.array(steps[: len(counters)], dtype=np.int64))
+    found = unwrap(np.array(counters), log_ns).image_ns
+
+    assert (np.diff(found) >= 0).all()
+    assert (found <= log_ns).all()
+    assert (log_ns - found).max() < 256 * MS_CLOCK or (np.diff(found) == 0).any()
+
+
+def test_device_restart_is_followed_and_reported() -> None:
+    image_ns, counter_ms = camera(400)
+    counter_ms = np.where(np.arange(400) < 200, counter_ms, (counter_ms - 100) & 0xFF)
+    found = unwrap(counter_ms, image_ns)
+
+    np.testing.assert_allclose(found.image_ns[280:], image_ns[280:], atol=2 * MS_CLOCK)
+    assert any(n.startswith(f"{SET_ANEW} (1 times") for n in found.notices)
+
+
+def test_log_clock_set_back_restarts_image_times() -> None:
+    image_ns, counter_ms = camera(100)
+    log_ns = np.where(np.arange(100) < 50, image_ns, image_ns - 10**12)
+    found = unwrap(counter_ms, log_ns)
+
+    np.testing.assert_allclose(found.image_ns, log_ns, atol=MS_CLOCK)
+    assert found.notices == (f"{WENT_BACK} (1 times, first at {log_ns[50]} ns)",)

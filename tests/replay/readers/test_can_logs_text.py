@@ -1,4 +1,4 @@
-"""Text logs of CAN: every line is used, skipped or dropped, whatever its dialect."""
+"""Text logs."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ from pathlib import Path
 from typing import Final
 
 import can
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.columns import DATA, ERROR, REMOTE
+from crosscue.replay.columns import DATA, ERROR, REMOTE, Table
 from crosscue.replay.errors import LogFormatError
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.can_text.lines import Lines, Tail, read_lines
 from crosscue.replay.readers.can_text.message_numbers import GO_BACK, MISFIT, MISSING
 from crosscue.replay.readers.can_text.trc import NOT_UNDERSTOOD
+from crosscue.replay.readers.text_log import MAX_LINE, Row, TextLog
 from support.can_files import Sent, assert_equal_to_python_can, random_frames, read_back, trc
 from support.data import shared
 
@@ -383,3 +386,30 @@ def test_message_numbers_that_are_not_consecutive_are_reported(
     assert sum(map(len, found.values())) == rows
     assert ledger.topic("").dropped == dropped
     assert ledger.topic("").dropped_unknown == unknown
+
+
+def row_of(line: str) -> Row:
+    t_ns, *values = line.split()
+    return int(t_ns), *map(float, values)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["not a number", "5 1.0", "5 1.0 2.0 3.0", f"{1 << 64} 1.0 2.0", "5 1.0 " + "2" * MAX_LINE],
+)
+def test_invalid_line_is_dropped_and_others_are_read(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.txt"
+    path.write_text(f"1 2.0 3.0\n{line}\n9 4.0 5.0\n")
+    ledger = Ledger("log.txt")
+
+    (block,) = TextLog(path, "text", "/rows", ["x_m", "y_m"], row_of).read(ledger)
+
+    assert block.log_ns.tolist() == [1, 9]
+    assert isinstance(block.rows, Table)
+    assert {name: block.rows.columns[name].tolist() for name in block.rows.columns} == {
+        "x_m": [2.0, 4.0],
+        "y_m": [3.0, 5.0],
+    }
+    assert block.rows.columns["x_m"].dtype == np.float64
+    account = ledger.topic("/rows")
+    assert (account.found, sum(account.dropped.values())) == (2, 1)

@@ -1,21 +1,32 @@
-"""Columns written as ROS 2 messages are read back unchanged, also by rosbags."""
+"""Converted messages, salvaged logs and the memory of both."""
 
 from __future__ import annotations
 
+import json
+import re
+import struct
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from crosscue.eval import cli
+from crosscue.eval.cli import run as crosscue
 from crosscue.replay.columns import Block, CanFrames, Images, Messages, Rows, Table, Topic
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.refuse import MISFIT
 from crosscue.replay.encode.outgoing import TIME_MISFIT, Outgoing
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import Encoders
+from support.data import shared
+from support.mcap_damage import sound_parts
+from support.mcap_files import McapFile, channel, header, message, read_back, record, schema
+from support.measured import measured
 from support.ros_messages import (
     block_of,
     messages_of,
@@ -25,6 +36,7 @@ from support.ros_messages import (
     ros1_topic,
     ros2_store,
 )
+from support.rosbag_files import read_rows, rows_of, write_bag
 
 QUICK = settings(max_examples=40, deadline=None)
 
@@ -240,3 +252,147 @@ def test_stamps_out_of_ros2_range_are_skipped() -> None:
 
     assert len(out.block) == 1
     assert ledger.topic("/t").skipped == {TIME_MISFIT: 2}
+
+
+def cdr(i: int) -> bytes:
+    """Return a CDR message of the definition ``int32 x``."""
+    return b"\x00\x01\x00\x00" + struct.pack("<i", i)
+
+
+@pytest.fixture
+def damaged(tmp_path: Path) -> tuple[Path, int]:
+    """Return an unchunked log with one of 600 records damaged, and that record's position."""
+    records = [schema(1), channel(1, 1, "/a")]
+    records += [message(1, 10**18 + i * 10**6, cdr(i)) for i in range(600)]
+    coded = bytearray(McapFile(records, data_crc=True).coded())
+    at = coded.index(records[300])
+    coded[at : at + 30] = bytes(30)
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(coded)
+    return path, at
+
+
+@pytest.mark.parametrize("flags", [[], ["--salvage"]])
+def test_convert_writes_readable_messages_and_exits_with_3(
+    damaged: tuple[Path, int], tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str]
+) -> None:
+    path, at = damaged
+
+    status = crosscue(["convert", str(path), "-o", str(tmp_path / "out.mcap"), *flags])
+
+    printed = capsys.readouterr()
+    assert status == 3
+    spans = re.findall(r"bytes (\d+) to (\d+)", " ".join(printed.err.split()))
+    assert any(at - 39 <= int(a) <= at and int(b) == at + 39 for a, b in spans)
+    assert ("--salvage" in printed.err) == (not flags)
+    read = read_back(path)
+    assert read_back(tmp_path / "out.mcap").messages == read.messages
+    assert read.count() == 598
+
+
+def test_damaged_rosbag1_is_salvaged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_bag(tmp_path / "a.bag", rows_of(600), "bz2")
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 40] = bytes(40)
+    path.write_bytes(content)
+    readable = len(read_rows(path).rows)
+
+    status = crosscue(
+        ["convert", str(path), "-o", str(tmp_path / "out.mcap"), "--salvage", "--json"]
+    )
+
+    account = json.loads(capsys.readouterr().out)
+    assert status == 3
+    assert 0 < readable < 600
+    # The random payloads fit no schema, so each message read is found and then dropped.
+    assert (
+        sum(
+            one["found"] + one["dropped"].get("does not fit its schema", 0)
+            for one in account["topics"].values()
+        )
+        == readable
+    )
+
+
+@pytest.mark.parametrize("command", ["info", "convert"])
+def test_chunk_over_max_chunk_is_refused_with_limit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(McapFile(sound_parts("zstd", is_chunked=True)).coded())
+    out = {
+        "info": [],
+        "convert": ["-o", str(tmp_path / "o.mcap")],
+        "decode": ["-o", str(tmp_path / "t")],
+    }
+
+    status = crosscue([command, str(path), "--max-chunk", "0.001", *out[command]])
+
+    printed = capsys.readouterr()
+    text = " ".join((printed.out + printed.err).split())
+    # A log with no chunk below the limit has nothing to convert.
+    assert status == (3 if command == "info" else 4)
+    assert "the limit is 1048" in text
+
+
+RECORDS = 400_000
+PAYLOAD = b"\0\1\0\0" + bytes(24)
+DATA_END, FOOTER, MESSAGE = 0x0F, 0x02, 0x05
+
+
+def _unchunked_log() -> bytes:
+    """Return an MCAP file of consecutive vectors without chunks and index."""
+    rows = np.zeros(
+        RECORDS,
+        dtype=[
+            ("opcode", "u1"),
+            ("length", "<u8"),
+            ("channel", "<u2"),
+            ("sequence", "<u4"),
+            ("log", "<u8"),
+            ("publish", "<u8"),
+            ("payload", f"V{len(PAYLOAD)}"),
+        ],
+    )
+    rows["opcode"], rows["length"] = MESSAGE, rows.dtype.itemsize - 9
+    rows["channel"], rows["payload"] = 1, np.void(PAYLOAD)
+    rows["log"] = rows["publish"] = 10**18 + 1000 * np.arange(RECORDS)
+    text = b"float64 x\nfloat64 y\nfloat64 z"
+    start = header("ros2") + schema(1, "geometry_msgs/msg/Vector3", "ros2msg", text)
+    end = record(DATA_END, bytes(4)) + record(FOOTER, bytes(20))
+    magic = b"\x89MCAP0\r\n"
+    return magic + start + channel(1, 1, "/v") + rows.tobytes() + end + magic
+
+
+@pytest.mark.slow
+def test_unchunked_log_is_converted_within_memory_limit(tmp_path: Path) -> None:
+    log = tmp_path / "log.mcap"
+    log.write_bytes(_unchunked_log())
+
+    out = str(tmp_path / "out.mcap")
+    status, output, peak_mb = measured(["convert", str(log), "-o", out, "--json"])
+
+    assert status == 0, output
+    assert str(RECORDS) in output
+    assert peak_mb < 200
+
+
+def convert(log: Path, out: Path) -> Path:
+    assert cli.run(["convert", str(log), "-o", str(out)]) in (0, 3)
+    return out
+
+
+def _tables(log: Path, run: Path) -> dict[str, object]:
+    assert cli.run(["replay", str(log), "-o", str(run)]) in (0, 3)
+    names = ("pose", "measurements")
+    return {name: pq.read_table(run / f"{name}.parquet").to_pydict() for name in names}
+
+
+@pytest.mark.slow
+def test_converted_real_segment_replays_like_original(tmp_path: Path) -> None:
+    (log,) = shared("comma2k19/Example_1").glob("*/40")
+
+    assert _tables(convert(log, tmp_path / "log.mcap"), tmp_path / "b") == _tables(
+        log, tmp_path / "a"
+    )

@@ -1,15 +1,25 @@
-"""MCAP files that are unusual but valid: exactly their messages are read."""
+"""MCAP files of other writers: awkward, by the conformance suite, and random."""
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import NonSeekingReader
+from mcap.writer import CompressionType, IndexType, Writer
 
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.reader import McapLog
+from support.mcap_conformance import Conformance, suite
 from support.mcap_files import (
+    MAGIC,
     ChunkOf,
     McapFile,
     Message,
@@ -124,6 +134,135 @@ def test_chunk_without_checksum_among_others_is_reported(tmp_path: Path) -> None
 
     assert reading.count() == 2
     assert any("1 of 2 chunks have no checksum" in notice for notice in reading.ledger.notices)
+
+
+# The only notice about a valid file, and only about one without a summary.
+ALLOWED = "it has no usable summary; topics were found by reading"
+
+
+@pytest.fixture(scope="module")
+def files() -> list[Conformance]:
+    return list(suite())
+
+
+def _summary_at(coded: bytes) -> int:
+    footer_at = len(coded) - 8 - 29
+    return int(struct.unpack_from("<Q", coded, footer_at + 9)[0]) or footer_at
+
+
+def without_summary(coded: bytes) -> bytes:
+    """Return the file up to its data end record, with an empty summary."""
+    empty = record(2, struct.pack("<QQI", 0, 0, 0))
+    return coded[: _summary_at(coded)] + empty + MAGIC
+
+
+def cut_off(coded: bytes) -> bytes:
+    """Return the file up to its data end record."""
+    return coded[: _summary_at(coded)]
+
+
+def _fault(file: Conformance, path: Path, is_cut: bool) -> str:
+    """Return what was read wrong, or an empty string."""
+    reading = read_back(path)
+    types = {topic: file.types.get(topic) for topic in reading.names}
+    losses = [(one.reason, one.count) for one in reading.ledger.details]
+    notices = [one for one in reading.ledger.notices if one != ALLOWED]
+    if reading.messages != file.messages:
+        return f"{reading.names}: {reading.count()} messages"
+    if types != file.types:
+        return f"topics {types}"
+    if losses != ([("the file does not end as it should", None)] if is_cut else []):
+        return f"losses {losses}"
+    return "" if not notices and reading.adds_up() else f"notices {notices}"
+
+
+FORMS: dict[str, Callable[[bytes], bytes]] = {
+    "whole": bytes,
+    "without summary": without_summary,
+    "cut off": cut_off,
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_file_yields_exactly_its_topics_and_messages(
+    files: list[Conformance], form: str, tmp_path: Path
+) -> None:
+    change = FORMS[form]
+    path = tmp_path / "file.mcap"
+    faults = {}
+    for file in files:
+        path.write_bytes(change(file.coded))
+        fault = _fault(file, path, is_cut=form == "cut off")
+        if fault:
+            faults[file.name] = fault
+
+    assert faults == {}, f"{len(faults)} of {len(files)}"
+
+
+MESSAGES = st.lists(
+    st.tuples(
+        st.integers(0, 4),
+        st.integers(0, 2**63 - 1) | st.integers(0, 50),
+        st.integers(0, 2**63 - 1),
+        st.binary(max_size=120),
+    ),
+    max_size=60,
+)
+
+
+@given(
+    messages=MESSAGES,
+    compression=st.sampled_from(list(CompressionType)),
+    index=st.sampled_from([IndexType.NONE, IndexType.CHUNK, IndexType.MESSAGE, IndexType.ALL]),
+    chunk_size=st.sampled_from([1, 200, 2_000, 1 << 20]),
+    use_chunking=st.booleans(),
+    repeat=st.booleans(),
+    statistics=st.booleans(),
+    data_crc=st.booleans(),
+)
+@settings(max_examples=60)
+def test_messages_match_mcap_package(
+    messages: list[tuple[int, int, int, bytes]],
+    compression: CompressionType,
+    index: IndexType,
+    chunk_size: int,
+    use_chunking: bool,
+    repeat: bool,
+    statistics: bool,
+    data_crc: bool,
+) -> None:
+    stream = BytesIO()
+    writer = Writer(
+        stream,
+        chunk_size,
+        compression,
+        index,
+        repeat,
+        repeat,
+        use_chunking,
+        statistics,
+        enable_data_crcs=data_crc,
+    )
+    writer.start()
+    schemas = [writer.register_schema(name, "ros2msg", b"") for name in ("a/B", "c/D")]
+    channels = [writer.register_channel(f"/t{i}", "cdr", (0, *schemas)[i % 3]) for i in range(5)]
+    for sequence, (k, log, publish, payload) in enumerate(messages):
+        writer.add_message(channels[k], log, payload, publish, sequence)
+    writer.finish()  # type: ignore[no-untyped-call]
+
+    theirs: dict[str, list[Message]] = {}
+    stream.seek(0)
+    for _, sent_on, found in NonSeekingReader(stream).iter_messages(log_time_order=False):
+        one = (found.log_time, found.publish_time, found.data)
+        theirs.setdefault(sent_on.topic, []).append(one)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "log.mcap"
+        path.write_bytes(stream.getvalue())
+        ours = read_back(path)
+
+    assert ours.messages == theirs
+    assert ours.ledger.is_whole
+    assert ours.adds_up()
 
 
 @pytest.mark.parametrize("last", [message(2, 3, b"end"), record(0x80, b"private")])
