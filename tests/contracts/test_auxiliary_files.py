@@ -5,8 +5,6 @@ settings. One line names the file, and no file is written. A file of an option i
 log is read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final

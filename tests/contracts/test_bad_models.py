@@ -1,7 +1,5 @@
 """Invalid networks, cards and labels are refused in one line, and no run folder remains."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Declared sizes are limited in every command that opens logs, pictures or networks."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import struct

@@ -1,7 +1,5 @@
 """Masks of a network with a model card are used in eq. 13, 15 and 16."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

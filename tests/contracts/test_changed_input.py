@@ -1,7 +1,5 @@
 """Commands that continue or replace a result refuse one that was made from other inputs."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 

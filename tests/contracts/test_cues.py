@@ -1,7 +1,5 @@
 """Every cue is one row of the table and one rule; everything else iterates over the table."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cut logs are read in part or refused, and a missing camera is blamed on the cut."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

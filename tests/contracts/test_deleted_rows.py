@@ -1,7 +1,5 @@
 """Formats with a row counter report exactly one missing row if one is removed from a log."""
 
-from __future__ import annotations
-
 import bz2
 import json
 import shutil

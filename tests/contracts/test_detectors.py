@@ -1,7 +1,5 @@
 """Every built-in detector fulfils the contract of ``crosscue.testing.check_detector``."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

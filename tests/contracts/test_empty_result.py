@@ -1,7 +1,5 @@
 """Valid input without a result: one line and no files, and what was there stays."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -4,8 +4,6 @@ Commands are expanded by bash and parsed by their own parsers, Python is compare
 interface, settings are read as the files they belong to, and queries run on a small catalog.
 """
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterator

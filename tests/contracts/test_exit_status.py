@@ -1,7 +1,5 @@
 """Commands return the exit status that docs/reference/exit_status.md states in each row."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -3,8 +3,6 @@
 Commands that read a run open its log, DBC file and tables again under the names that were written.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

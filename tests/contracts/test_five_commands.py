@@ -1,7 +1,5 @@
 """The commands of the how-to page lead from an exported network to a scored drive."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

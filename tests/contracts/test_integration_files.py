@@ -1,7 +1,5 @@
 """The action for pull requests, and the lock file, do what they say."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

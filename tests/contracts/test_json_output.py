@@ -1,7 +1,5 @@
 """With ``--json`` every command prints exactly one strict JSON document."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any, Final

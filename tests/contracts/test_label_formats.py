@@ -1,7 +1,5 @@
 """Formats of labelling tools preserve boxes, labels and times when written and read."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """The page of licences names every installed dependency that is not permissive."""
 
-from __future__ import annotations
-
 import re
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reading, decoding, replaying and scoring a drive import none of the heavy libraries."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """A link among the files of a log is refused by name; the log itself may be given as a link."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Final

@@ -3,8 +3,6 @@
 It is named with its reason, the other pictures are processed, and the exit status is 3.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import shutil

@@ -3,8 +3,6 @@
 Options that name a file are in ``test_auxiliary_files.py``.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from pathlib import Path

@@ -3,8 +3,6 @@
 The commands are those of the table ``COMMANDS`` that have the option and write a folder.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

@@ -3,8 +3,6 @@
 Each case plants something under a name that crosscue reads or writes, and runs a command on it.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import resource

@@ -1,7 +1,5 @@
 """An installed package adds a detector, a cue, a reader and a data set, and checks them."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Readers and data sets fulfil their contracts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final

@@ -3,8 +3,6 @@
 Each test compares whole run folders, file by file. Only ``NOT_COMPARED`` is left out.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Secrets in addresses of logs: no command prints, stores or names them."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Times beyond what can be stored, and times that run backward, are reported for what they are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

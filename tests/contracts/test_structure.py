@@ -3,8 +3,6 @@
 import-linter holds the direction between packages; this covers the modules inside them.
 """
 
-from __future__ import annotations
-
 from graphlib import TopologicalSorter
 
 import grimp

@@ -1,7 +1,5 @@
 """Labelled boxes in four formats: the same boxes, and one line for unreadable labels."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter

@@ -1,7 +1,5 @@
 """KITTI drives: streams, times and truth agree with the drive; what is missing is reported."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """KITTI odometry: the camera's track in a level map frame, and its pictures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """nuScenes on generated tables with its published schema, without a drive of the data set."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

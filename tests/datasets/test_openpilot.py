@@ -1,7 +1,5 @@
 """openpilot segments: values, times and axes as the Cap'n Proto library wrote them; damage."""
 
-from __future__ import annotations
-
 import bz2
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """PandaSet sequences: streams, odometry and truth agree with the drive."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A phone on the dashboard: axes, clocks and units, and the effects of damage."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

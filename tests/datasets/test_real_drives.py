@@ -1,7 +1,5 @@
 """The real drives of the documentation: their vehicle files and annotations match their logs."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Trajectory files and the geodesy of their positions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of the base class of box detectors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Boxes: suppression, choice of proposals, pooling and drawn labels."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of the catalog: every entry is complete, and downloads are verified and resumed."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of pictures with drawn detections, road and cues."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 

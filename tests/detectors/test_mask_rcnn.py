@@ -1,7 +1,5 @@
 """Tests of the Mask R-CNN detector: agreement with torchvision, batches, and checkpoints."""
 
-from __future__ import annotations
-
 import io
 import pickle
 from dataclasses import dataclass, field, replace

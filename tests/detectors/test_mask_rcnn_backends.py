@@ -1,7 +1,5 @@
 """Tests that each Mask R-CNN back end returns the detections of torchvision's network."""
 
-from __future__ import annotations
-
 import copy
 import os
 import subprocess

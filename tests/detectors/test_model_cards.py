@@ -1,7 +1,5 @@
 """Networks with model cards: boxes, inputs, damaged files and implausible results."""
 
-from __future__ import annotations
-
 import hashlib
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of the road network: training, resumption, checkpoints, and commands."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A card is drafted for segmentation networks as well, and the road is drawn in a picture."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

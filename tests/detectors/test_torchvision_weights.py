@@ -1,7 +1,5 @@
 """Tests of torchvision weights: recognition by their tensors, and torchvision's results."""
 
-from __future__ import annotations
-
 import argparse
 import io
 import os

@@ -1,7 +1,5 @@
 """An error of a function names its argument in Python, and the option on the command line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """Tests of approaches: opening and closing, the gate, dissent, and rejected evidence."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Properties of approaches that hold for any evidence."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import replace

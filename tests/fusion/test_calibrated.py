@@ -1,7 +1,5 @@
 """Tests of fitted messages: single and repeated observations, and recovery by the fit."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Messages and marginals compared with the equation, with enumeration, and with a library."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence

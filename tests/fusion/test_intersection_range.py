@@ -1,7 +1,5 @@
 """Scalar filter compared with hand-computed results, the printed equations, and simulation."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The fit of messages and of their fades, with numbers worked out by hand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Tests of persistence: single and repeated frames do not count, lasting cues count a few times."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

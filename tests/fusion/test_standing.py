@@ -1,7 +1,5 @@
 """A standing car gains no evidence of static things, however long it stands."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final

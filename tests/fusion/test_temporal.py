@@ -1,7 +1,5 @@
 """Hidden Markov model: compared with enumeration, and its invariants."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from typing import Final

@@ -1,7 +1,5 @@
 """Fit of the hidden Markov model: it recovers rates, and its exponent reflects repetition."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Delay of pictures against signals of a car, on motions that are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

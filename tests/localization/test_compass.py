@@ -1,7 +1,5 @@
 """The compass, front wheels, GNSS positions and navigation."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, replace
 

@@ -1,7 +1,5 @@
 """Constant errors of the odometry as states: derivatives, updates, consistency, and none at all."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tests of the pose filter, and comparison with filterpy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

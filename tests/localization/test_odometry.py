@@ -1,7 +1,5 @@
 """Tests of dead reckoning from wheel speeds."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

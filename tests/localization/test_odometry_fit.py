@@ -1,7 +1,5 @@
 """Tests of the fit of odometry to known positions, on simulated drives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

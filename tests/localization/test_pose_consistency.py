@@ -3,8 +3,6 @@
 All drives are simulated, with exactly the noise that the filter assumes.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Wrong arguments are refused with the argument's name, what is expected and what was found."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Final

@@ -1,7 +1,5 @@
 """Tests of the batch smoother: exactness in the linear case, and consistency in simulation."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of the direction of travel from two pictures."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Visual odometry on pictures of a known plane between two known walls."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Final

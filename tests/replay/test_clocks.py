@@ -1,7 +1,5 @@
 """Clocks of a log: gaps, offsets and what is found."""
 
-from __future__ import annotations
-
 import re
 import tracemalloc
 from dataclasses import replace

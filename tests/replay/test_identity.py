@@ -1,7 +1,5 @@
 """Identity of logs, checksums and versions."""
 
-from __future__ import annotations
-
 import importlib
 import shutil
 import subprocess

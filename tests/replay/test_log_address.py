@@ -1,7 +1,5 @@
 """Addresses of logs: what their text drops, and that nothing else gets at it."""
 
-from __future__ import annotations
-
 import copy
 import json
 import pickle

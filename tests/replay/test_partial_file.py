@@ -1,7 +1,5 @@
 """Partial files and processes that end early."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

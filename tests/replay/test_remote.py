@@ -1,7 +1,5 @@
 """Remote logs are fetched once, until they change or their store stalls."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import uuid

@@ -1,7 +1,5 @@
 """Commands on parts of remote logs, with the transferred bytes counted by the server."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Parts of remote logs: the same rows as from a local file, with only the part transferred."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

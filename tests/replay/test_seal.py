@@ -1,7 +1,5 @@
 """Seals: a changed byte is detected and located in every format by every reader."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Reading a whole log, with every row accounted for."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """NEES of a simulated drive's filter for errors along an arc."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

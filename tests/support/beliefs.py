@@ -1,7 +1,5 @@
 """The pose filter's steps on beliefs with a time."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

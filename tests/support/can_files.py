@@ -1,7 +1,5 @@
 """CAN logs written from a list of frames, and read back as such a list."""
 
-from __future__ import annotations
-
 import random
 import struct
 import zlib

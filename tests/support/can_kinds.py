@@ -1,7 +1,5 @@
 """Formats and variants of CAN log files, and the expected result of reading them."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Finished runs below one folder: two made-up drives, each with two settings."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """Simulated streams with known clocks, for comparison with clock reports."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """COCO annotations of pictures, with a stop sign in each."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 

@@ -1,7 +1,5 @@
 """Paths of real recordings; tests without them are skipped."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Network outputs of every layout that encode one known box, in a wide or a tall input."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial

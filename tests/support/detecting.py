@@ -1,7 +1,5 @@
 """A simple detector, invalid variants of it, and a card for the real YOLOX-nano."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

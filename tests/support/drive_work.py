@@ -1,7 +1,5 @@
 """Work on made-up drives, importable by workers; the word in a log selects the outcome."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """Valid empty inputs of every kind, and commands that require more than that."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

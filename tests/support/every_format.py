@@ -1,7 +1,5 @@
 """One small log of every format that ``open_log`` supports."""
 
-from __future__ import annotations
-
 import shutil
 import warnings
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """A table of failures, for commands that read one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from crosscue.eval.failures.record import Failure, write_failures

@@ -3,8 +3,6 @@
 The parent process has everything imported and compiled, so that dozens of runs are fast.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os

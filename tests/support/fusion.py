@@ -1,7 +1,5 @@
 """Random factor graphs, situations of their cues, and evidence of made-up drives."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 

@@ -1,7 +1,5 @@
 """Run folders of made-up drives with the tables that the fit of messages reads."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The grey level of each picture is the number of its frame. The detector below co
 it, so that detections do not depend on times, which the clock changes.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Landmarks along ``gap_drive``, whose pictures encode their position as a grey level."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A simulated KITTI raw drive in the published layout: a constant turn at constant speed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A simulated KITTI odometry sequence in the published layout: a constant left turn."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 

@@ -1,7 +1,5 @@
 """A simulated drive past landmarks whose 'pictures' encode the position of the camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small landmark databases and simulated pictures of landmarks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Manifests of made-up runs."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from crosscue.eval.runs.account import LogAccount, TopicLine, account

@@ -1,7 +1,5 @@
 """Small Mask R-CNN checkpoints with random weights, and tiny labelled pictures."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 from pathlib import Path

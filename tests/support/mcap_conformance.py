@@ -4,8 +4,6 @@ The data folder has the suite's descriptions in JSON, and a script that rebuilds
 them. The second family has the same combinations of features with a ROS 2 type and profile.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import json

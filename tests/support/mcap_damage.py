@@ -1,7 +1,5 @@
 """Seeded damage to MCAP files, and a classification of what a reader returns."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass

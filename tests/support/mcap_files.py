@@ -1,7 +1,5 @@
 """MCAP files written record by record, valid or with intended defects, and read back."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Run a command in a separate process and measure its peak memory."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A log in memory, for tests of code that uses readers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

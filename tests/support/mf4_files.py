@@ -1,7 +1,5 @@
 """MDF 4 bus logs written block by block, as unsorted and unfinalized logs of data loggers are."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Mobileye frames from hexadecimal text, or random ones within the ranges of the layout table."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

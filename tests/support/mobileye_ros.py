@@ -4,8 +4,6 @@ They are those of a hypothetical driver that copies each field, with values as o
 as in the message definitions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final

@@ -1,7 +1,5 @@
 """A simulated nuScenes scene in the published schema, with the CAN expansion."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable, Sequence

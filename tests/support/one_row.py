@@ -1,7 +1,5 @@
 """For each format, damage to exactly one row of a log, as by a flipped byte or a lost write."""
 
-from __future__ import annotations
-
 import bz2
 import sqlite3
 import struct

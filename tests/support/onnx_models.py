@@ -1,7 +1,5 @@
 """Small ONNX networks with known outputs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Watch which files this process opens."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

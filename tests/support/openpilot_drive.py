@@ -1,7 +1,5 @@
 """A segment in openpilot's layout, its messages written by the Cap'n Proto library."""
 
-from __future__ import annotations
-
 import bz2
 from functools import cache
 from pathlib import Path

@@ -3,8 +3,6 @@
 Its settings name the file of true objects, so that it cannot be mistaken for a real detector.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

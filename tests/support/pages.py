@@ -1,7 +1,5 @@
 """Code on the pages of the documentation: blocks, inline code, and the commands they run."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """A simulated PandaSet sequence in the published layout: a constant turn at constant speed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The true objects of a simulated drive as detections of a perfect detector."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A simulated drive in the layout of the smartphone driving data set, with a left turn."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """Motion by pictures whose stamps are late, and the signals of the same drive."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from crosscue.localization.camera_delay import PictureMotion

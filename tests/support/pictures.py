@@ -1,7 +1,5 @@
 """Small simulated pictures, encoded."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Callable

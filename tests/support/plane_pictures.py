@@ -1,7 +1,5 @@
 """Pictures of a known plane between two known walls, rendered ray by ray."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

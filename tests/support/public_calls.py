@@ -4,8 +4,6 @@ Names, arguments and attributes of results are looked up by type. The type of a 
 annotation of the function. Expressions of unknown type are not checked.
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import types

@@ -3,8 +3,6 @@
 Queries are ignored, as a server of presigned addresses does once it has checked them.
 """
 
-from __future__ import annotations
-
 import re
 from base64 import b64decode
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Commands that fail as the documentation says: an exit status and one line."""
 
-from __future__ import annotations
-
 import io
 from contextlib import redirect_stderr, redirect_stdout
 

@@ -1,7 +1,5 @@
 """Random ROS types and messages, encoded by rosbags, as an independent check of our decoder."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any

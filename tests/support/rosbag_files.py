@@ -1,7 +1,5 @@
 """Small ROS bags of known content, damaged copies of them, and a comparison of readings."""
 
-from __future__ import annotations
-
 import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence

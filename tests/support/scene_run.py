@@ -1,7 +1,5 @@
 """The made-up drive of ``support.scoring`` with pictures in a log, detections and poses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Final
 

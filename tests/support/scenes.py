@@ -1,7 +1,5 @@
 """Small simulated scenes, built once for all tests, and mirror images of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Final

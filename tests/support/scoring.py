@@ -1,7 +1,5 @@
 """A small made-up drive with scores known by hand: one approach, ten frames per second."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final

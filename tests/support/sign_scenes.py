@@ -1,7 +1,5 @@
 """Simulated pictures of sign templates, scaled, blurred and noisy, over clutter."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

@@ -1,7 +1,5 @@
 """Simulated drives of a car with wheel sensors, gyro and compass, and their truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

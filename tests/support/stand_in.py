@@ -1,7 +1,5 @@
 """A simulated recording and a small network on a local server, in place of the real ones."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path

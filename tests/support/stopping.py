@@ -1,7 +1,5 @@
 """Detectors that stop the program by a signal."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Sequence
 from dataclasses import dataclass

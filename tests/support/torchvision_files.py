@@ -1,7 +1,5 @@
 """Torchvision networks and state dicts with random weights."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

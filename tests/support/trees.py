@@ -1,7 +1,5 @@
 """Contents of folders as values that can be compared."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

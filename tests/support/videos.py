@@ -1,7 +1,5 @@
 """Small simulated videos whose pictures encode their number as a grey level."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 from typing import cast

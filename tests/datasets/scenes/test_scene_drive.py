@@ -1,7 +1,5 @@
 """A simulated drive as files: the readers of real drives read it, and its truth matches."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Simulated scenes: layouts, pictures, road, detections and the car's file."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -3,8 +3,6 @@
 The focal length is 800 px, so a car of 1.55 m that is 62 px high is 800 * 1.55 / 62 = 20 m ahead.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Tests of car tracking: a stationary car never counts as crossing, however the camera moves."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Mobileye cues past the intersection: every condition at its limit, with numbers by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cues of whole frames and their account of candidates, with numbers worked out by hand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Cars in two frames (eq. 15, 16) and the nose of a car, with numbers worked out by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

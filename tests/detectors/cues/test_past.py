@@ -1,7 +1,5 @@
 """Tests of the counts of lane lines and vehicles past an intersection, from a Mobileye bus."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Road area and openings from masks of known ground, projected by the pinhole formula."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Final, NamedTuple

@@ -1,7 +1,5 @@
 """Fractions of road (eq. 13, 14) in the picture and on the ground, with numbers by hand."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

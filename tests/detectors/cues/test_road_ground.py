@@ -1,7 +1,5 @@
 """Tests of road regions on the ground: the ego road is not a side road; far ones are not seen."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Tests that an object found by several detectors counts once, with the better score."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

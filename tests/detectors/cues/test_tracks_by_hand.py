@@ -1,7 +1,5 @@
 """Rules for tracked cars: every condition at its limit, with numbers worked out by hand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

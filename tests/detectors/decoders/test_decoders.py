@@ -4,8 +4,6 @@ Every decoder of the table has a sample with known boxes. It returns these boxes
 another shape with a message, and ``recognise`` finds it from the shapes that a file declares.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Ranges of vehicles, and the plane of the ground."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

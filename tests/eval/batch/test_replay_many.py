@@ -1,7 +1,5 @@
 """Many drives on the command line: failures are reported, and a second start continues."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

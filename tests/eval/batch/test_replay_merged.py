@@ -1,7 +1,5 @@
 """Merged tables of many drives, remote logs and replaced logs."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

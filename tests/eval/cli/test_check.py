@@ -1,7 +1,5 @@
 """``crosscue check``: files are recognised by content and checked against each other."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Errors of commands: one line, the documented exit status, no traceback without -v."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re

@@ -1,7 +1,5 @@
 """Parsers, help and calls are generated from a function's signature and docstring."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

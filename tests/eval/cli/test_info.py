@@ -1,7 +1,5 @@
 """``crosscue info`` prints the contents of a log on any terminal, and as strict JSON."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """A run folder is complete or marked as incomplete after a kill or fault at any time."""
 
-from __future__ import annotations
-
 import errno
 import os
 import random

@@ -1,7 +1,5 @@
 """``crosscue model init`` writes a card that runs, for generated files of each layout."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The progress line of long commands: amount done, rate and time left."""
 
-from __future__ import annotations
-
 import io
 import sys
 

@@ -1,7 +1,5 @@
 """Damage to a sealed log after a run is reported by every command that reads the log again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

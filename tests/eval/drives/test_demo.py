@@ -1,7 +1,5 @@
 """The demonstration on a recorded drive: download, checksums, replay and score."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings of a replay: those that determine a run are compared when a batch is started again."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """Failures of runs: their frames, their ranking and a selection of diverse causes."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

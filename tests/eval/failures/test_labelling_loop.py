@@ -1,7 +1,5 @@
 """The labelling loop: failing frames are exported, corrected, imported and used."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

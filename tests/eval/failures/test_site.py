@@ -1,7 +1,5 @@
 """A site of failures: each failure has a page that lists reach with and without the script."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Moments that look wrong without truth: what the run claims against what else it knows."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

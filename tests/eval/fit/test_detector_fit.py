@@ -1,7 +1,5 @@
 """Thresholds with valid bounds, calibrations, and a card that changes a cue."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The first pose of a drive from GNSS, a truth file or three numbers; and GNSS as truth."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Fit of the landmark threshold: required rates, intervals, pairs from tables and drives."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

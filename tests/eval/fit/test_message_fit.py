@@ -1,7 +1,5 @@
 """Fits of beliefs from run folders and truth files, up to the command line."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from pathlib import Path

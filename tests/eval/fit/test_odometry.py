@@ -1,7 +1,5 @@
 """``fit odometry`` on a simulated drive, from log files to a vehicle file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``check`` and ``score`` apply the same rule to a truth if a log's clock was set back."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Cues are computed once, by ``estimate``, from what ``detect`` has stored."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Sequence

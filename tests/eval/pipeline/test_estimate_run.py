@@ -1,7 +1,5 @@
 """``crosscue estimate``: from stored detections to cues, ranges and beliefs, without pictures."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -4,8 +4,6 @@ The simulated car drives past textured walls. A survey with other image noise fi
 The replay starts with a wrong pose and passes the same walls.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from functools import lru_cache

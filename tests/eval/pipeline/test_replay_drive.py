@@ -1,7 +1,5 @@
 """Replayed poses and travelled distances."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Roads of the scene: what openings say to the belief and to the ranges."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Runs record their inputs: no other run overwrites them, and merging keeps all of them."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import fields, replace

@@ -1,7 +1,5 @@
 """Logs with gaps and clocks that were set, in every stage."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Drives of pictures alone: odometry and roads from the pictures, through detect and estimate."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Public names exist, are documented, and are imported lazily."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

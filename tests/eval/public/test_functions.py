@@ -1,7 +1,5 @@
 """The commands' functions in Python: each returns a record whose repr is a table."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

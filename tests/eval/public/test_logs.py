@@ -1,7 +1,5 @@
 """Drives opened with ``crosscue.open``: tables, frames, signals and losses."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from pathlib import Path

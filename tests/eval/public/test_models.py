@@ -1,7 +1,5 @@
 """Networks in the public interface: the catalog, a user's card, and its check."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

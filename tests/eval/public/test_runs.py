@@ -1,7 +1,5 @@
 """Runs in the public interface: replay, print, estimate again, score and compare."""
 
-from __future__ import annotations
-
 import pyarrow as pa
 import pytest
 

@@ -1,7 +1,5 @@
 """Training pictures from the public interface equal those of the command."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

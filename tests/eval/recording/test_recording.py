@@ -1,7 +1,5 @@
 """The recording of a run: what each frame shows, its parts and its marks."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The viewer in a browser: it listens on this machine only, and ends with the command."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -1,7 +1,5 @@
 """Page of a comparison: verdicts, and pictures of what two runs of one drive found differently."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

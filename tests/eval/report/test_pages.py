@@ -1,7 +1,5 @@
 """Every page is the one page: small, with the same colours everywhere, and commands that run."""
 
-from __future__ import annotations
-
 import html
 import re
 import shlex

@@ -1,7 +1,5 @@
 """The report of a run."""
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Sequence

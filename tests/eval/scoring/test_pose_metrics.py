@@ -1,7 +1,5 @@
 """Pose metrics satisfy invariants, and equal those of evo."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Scores of a run: files, gates, tables and the remembered truth."""
 
-from __future__ import annotations
-
 import builtins
 import io
 import json

@@ -1,7 +1,5 @@
 """Rows that are not scored because their log time occurs twice are counted separately."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

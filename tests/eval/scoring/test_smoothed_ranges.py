@@ -1,7 +1,5 @@
 """Smoothed ranges, and the noise of simulated drives."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Causes of failed approaches, and effects of conditions at the same intersection."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

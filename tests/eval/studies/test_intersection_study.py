@@ -1,7 +1,5 @@
 """The intersections study on few, small simulated drives: tables, resumption and bad input."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Studies of layouts and their report."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

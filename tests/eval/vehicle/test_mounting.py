@@ -1,7 +1,5 @@
 """Focal length, angles, height and delay of a camera, from the drive alone."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from pathlib import Path

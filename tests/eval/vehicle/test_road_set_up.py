@@ -1,7 +1,5 @@
 """The catalog's road network is set up in one option, with its cost and licence stated."""
 
-from __future__ import annotations
-
 from importlib import util
 from pathlib import Path
 

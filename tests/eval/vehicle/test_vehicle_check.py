@@ -1,7 +1,5 @@
 """Check of a vehicle file against a drive: signals, and intrinsics against pictures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of the landmark database: round trip, queries by ellipse, and damaged files."""
 
-from __future__ import annotations
-
 import os
 import resource
 import signal

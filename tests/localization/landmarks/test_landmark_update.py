@@ -1,7 +1,5 @@
 """Updates by landmarks, and their matches."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

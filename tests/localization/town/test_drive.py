@@ -1,7 +1,5 @@
 """Simulated cities, drives through them, and the drives' errors."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from collections import deque

@@ -1,7 +1,5 @@
 """Database files are read correctly, and doubtful contents are reported."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import replace
 from pathlib import Path

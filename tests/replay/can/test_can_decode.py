@@ -1,7 +1,5 @@
 """CAN frames are decoded as by cantools, and all are accounted for."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

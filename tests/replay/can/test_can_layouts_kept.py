@@ -1,7 +1,5 @@
 """Layouts of CAN databases: read directly from the text, and cached for the next start."""
 
-from __future__ import annotations
-
 import random
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Protobuf and JSON: the same columns as ROS types; only damaged messages are dropped."""
 
-from __future__ import annotations
-
 import json
 from base64 import b64encode
 from collections.abc import Mapping

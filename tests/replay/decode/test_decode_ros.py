@@ -1,7 +1,5 @@
 """The decoder of ROS messages agrees with rosbags, also on which messages are invalid."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

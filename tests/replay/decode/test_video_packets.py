@@ -1,7 +1,5 @@
 """Packets of a video are decoded to pictures with their own times."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

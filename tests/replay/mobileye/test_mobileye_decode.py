@@ -1,7 +1,5 @@
 """Mobileye frames: layout, decoding and times."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from itertools import pairwise

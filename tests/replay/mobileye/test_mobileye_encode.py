@@ -1,7 +1,5 @@
 """Encoding and decoding of Mobileye tables are inverse to each other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """ROS messages and CAN frames of a Mobileye decode to the same columns."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

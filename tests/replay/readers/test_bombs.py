@@ -1,7 +1,5 @@
 """Decompression bombs in logs are refused in bounded memory."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import re

@@ -1,7 +1,5 @@
 """CAN logs: every format's frames, and Vector BLF with its containers and hostile files."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 from pathlib import Path

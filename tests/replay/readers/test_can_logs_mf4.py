@@ -1,7 +1,5 @@
 """MDF 4 logs: bus logging and signals, compared with python-can and asammdf."""
 
-from __future__ import annotations
-
 import random
 import warnings
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """MDF 4 logs that are unfinalized, unsorted, truncated, or have virtual channels."""
 
-from __future__ import annotations
-
 import random
 import warnings
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Text logs."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures and videos as logs, and their files of times."""
 
-from __future__ import annotations
-
 import os
 from decimal import Decimal
 from pathlib import Path

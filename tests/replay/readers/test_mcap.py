@@ -1,7 +1,5 @@
 """MCAP files of other writers: awkward, by the conformance suite, and random."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from io import BytesIO

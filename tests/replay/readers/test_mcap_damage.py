@@ -1,7 +1,5 @@
 """Damaged, truncated and hostile MCAP files: readable messages are read, losses are reported."""
 
-from __future__ import annotations
-
 import struct
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """A part of an MCAP log: the same rows as from a complete pass, with only the part read."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from pathlib import Path

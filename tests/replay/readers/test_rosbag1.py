@@ -1,7 +1,5 @@
 """ROS 1 bags: every message of the file is read or reported as dropped."""
 
-from __future__ import annotations
-
 import bz2
 import re
 import struct

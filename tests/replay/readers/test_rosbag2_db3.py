@@ -1,7 +1,5 @@
 """ROS 2 databases: rows, pages and damaged files."""
 
-from __future__ import annotations
-
 import os
 import random
 import sqlite3

@@ -1,7 +1,5 @@
 """ROS 2 bag folders: the files take precedence over metadata.yaml."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from collections import Counter

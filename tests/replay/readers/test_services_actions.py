@@ -1,7 +1,5 @@
 """Service events and actions in bags are recognised and counted, and not reported as damage."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The signals of a vehicle may be on several buses, one per section of the vehicle file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 

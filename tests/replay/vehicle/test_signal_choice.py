@@ -1,7 +1,5 @@
 """The choice of signals and the draft of a vehicle file."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Settings of a vehicle file that are refused or decide what is used."""
 
-from __future__ import annotations
-
 import pytest
 
 from crosscue.replay.errors import VehicleError

@@ -1,7 +1,5 @@
 """``crosscue convert``: each row is written or counted; a file is complete or does not exist."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """Converted messages, salvaged logs and the memory of both."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct

@@ -1,7 +1,5 @@
 """Precision and recall of boxes equal those of pycocotools, and those computed by hand."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import math
