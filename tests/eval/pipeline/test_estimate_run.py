@@ -43,18 +43,8 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _replay(folder: Path, out: Path, *more: str) -> None:
-    arguments = [
-        "replay",
-        str(folder / "drive.mcap"),
-        "--vehicle",
-        str(folder / "vehicle.toml"),
-        "-o",
-        str(out),
-        "--cache",
-        str(folder / "cache.sqlite"),
-        "-q",
-        *more,
-    ]
+    line = f"replay {folder}/drive.mcap --vehicle {folder}/vehicle.toml -o {out} -q"
+    arguments = [*line.split(), "--cache", str(folder / "cache.sqlite"), *more]
     assert run(arguments) == 0
 
 

@@ -9,9 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from crosscue.eval.scoring.columns import RunTables
 from crosscue.eval.scoring.drives import score_drive
 from crosscue.eval.scoring.run_tables import run_tables
-from crosscue.eval.scoring.scene.approaches import associate, judge_approaches, score_approaches
+from crosscue.eval.scoring.scene.approaches import (
+    ApproachesJudged,
+    associate,
+    judge_approaches,
+    score_approaches,
+)
 from crosscue.eval.scoring.scene.belief import (
     CLIP,
     brier,
@@ -23,6 +29,7 @@ from crosscue.eval.scoring.scene.belief import (
 )
 from crosscue.eval.scoring.scene.detection import Definition
 from crosscue.eval.scoring.scene.ranges import judge_range, score_range
+from crosscue.eval.scoring.truth import DriveTruth
 from support.scoring import (
     BELIEF,
     approach,
@@ -37,9 +44,16 @@ from support.scoring import (
 )
 
 
-def test_detection_distance_is_at_first_step_above_threshold() -> None:
-    judged = judge_approaches(good_tables(), good_truth())
+def judged_of(
+    run: RunTables, reported: DriveTruth, definition: Definition = "confirmed"
+) -> ApproachesJudged:
+    judged = judge_approaches(run, reported, definition=definition)
     assert judged is not None
+    return judged
+
+
+def test_detection_distance_is_at_first_step_above_threshold() -> None:
+    judged = judged_of(good_tables(), good_truth())
     (one,) = judged.results
 
     # p(intersection) is 0.95 from frame 10 on (30 m), ranges are from frame 8 on; right is at 15 m.
@@ -55,9 +69,7 @@ def test_detection_distance_is_at_first_step_above_threshold() -> None:
 def test_feature_without_evidence_is_not_seen_rather_than_improbable() -> None:
     steps = {**BELIEF, "left": dict.fromkeys(range(45), 0.5)}
     steps["right"] = {frame: 0.5 + 0.001 * frame for frame in range(45)}
-    judged = judge_approaches(tables(belief=belief_table(steps)), truth())
-
-    assert judged is not None
+    judged = judged_of(tables(belief=belief_table(steps)), truth())
     assert judged.results[0].why_not_full == "never probable enough: right; not seen: left"
 
 
@@ -87,8 +99,7 @@ def test_intersection_is_not_detected_before_it_has_range() -> None:
     never = tables(belief=belief_table(BELIEF))
 
     for run, distance_m, why in ((late, 18.0, ""), (never, None, "no range")):
-        judged = judge_approaches(run, truth())
-        assert judged is not None
+        judged = judged_of(run, truth())
         assert judged.results[0].detected_m == distance_m
         assert judged.results[0].why_not_detected == why
         # Full detection needs no range, as for the dissertation's intersection H.
@@ -104,8 +115,7 @@ def test_full_detection_never_precedes_detection(
     changes: dict[str, dict[int, float]], ranged_from: int
 ) -> None:
     run = tables(belief=belief_table(changes), ranges=range_table(ranged_from, 45))
-    judged = judge_approaches(run, truth())
-    assert judged is not None
+    judged = judged_of(run, truth())
 
     for one in judged.results:
         if one.detected_m is not None and one.full_m is not None:
@@ -117,8 +127,7 @@ def test_full_detection_waits_for_range_unless_scored_as_published() -> None:
 
     cases: list[tuple[Definition, float]] = [("confirmed", 10.0), ("published", 15.0)]
     for definition, full_m in cases:
-        judged = judge_approaches(run, truth(), definition=definition)
-        assert judged is not None
+        judged = judged_of(run, truth(), definition=definition)
         assert (judged.results[0].detected_m, judged.results[0].full_m) == (10.0, full_m)
 
 
@@ -133,11 +142,7 @@ def test_full_detection_requires_intersection_feature_only_with_sign_or_light(
     approaches = (one.model_copy(update={"control": control}),)
     reported = replace(reported, truth=reported.truth.model_copy(update={"approaches": approaches}))
 
-    judged = judge_approaches(
-        tables(belief=without_intersection, ranges=range_table(8, 45)), reported
-    )
-
-    assert judged is not None
+    judged = judged_of(tables(belief=without_intersection, ranges=range_table(8, 45)), reported)
     (result,) = judged.results
     assert result.detected_m is None
     assert result.full_m == full_m
@@ -152,8 +157,7 @@ def test_spike_of_one_frame_is_spurious_unless_scored_as_published() -> None:
         ("published", 36.0, None),
     ]
     for definition, detected_m, spurious_m in cases:
-        judged = judge_approaches(run, truth(), definition=definition)
-        assert judged is not None
+        judged = judged_of(run, truth(), definition=definition)
         (one,) = judged.results
         assert (one.detected_m, one.spurious_m) == (detected_m, spurious_m)
         assert one.why_spurious == ("for fewer than 3 frames" if spurious_m else "")
@@ -167,8 +171,7 @@ def test_range_outside_its_interval_is_not_a_detection() -> None:
         (100.0, 60.0**2, 30.0),
     ):
         ranges = range_table(8, 45, error_m, var_m2)
-        judged = judge_approaches(tables(belief=belief_table(BELIEF), ranges=ranges), truth())
-        assert judged is not None
+        judged = judged_of(tables(belief=belief_table(BELIEF), ranges=ranges), truth())
         (one,) = judged.results
         assert one.detected_m == detected_m
         assert one.spurious_m == (30.0 if detected_m is None else None)
@@ -176,10 +179,8 @@ def test_range_outside_its_interval_is_not_a_detection() -> None:
 
 
 def test_failures_are_excluded_from_means_and_named() -> None:
-    good = judge_approaches(good_tables(), good_truth())
-    bad = judge_approaches(tables(belief=belief_table({"intersection": {5: 0.95}})), truth())
-    assert good is not None
-    assert bad is not None
+    good = judged_of(good_tables(), good_truth())
+    bad = judged_of(tables(belief=belief_table({"intersection": {5: 0.95}})), truth())
     score = score_approaches([good, bad])
 
     assert score is not None
@@ -226,9 +227,7 @@ def test_extra_and_split_approaches_are_counted() -> None:
         belief_table({**BELIEF, "intersection": {70: 0.95}}, 4, range(70, 75)),
     ]
     joined = pa.concat_tables([p.select(["t_ns", "approach", "intersection"]) for p in pieces])
-    judged = judge_approaches(run_tables("made up", belief_table=joined), truth([], [far]))
-
-    assert judged is not None
+    judged = judged_of(run_tables("made up", belief_table=joined), truth([], [far]))
     assert (judged.extra, judged.extra_detected, judged.not_judged) == (1, 1, 1)
     assert judged.results[0].splits == 1
 
@@ -302,8 +301,7 @@ def test_nan_values_are_excluded_and_counted() -> None:
         belief=belief_table({"intersection": {10: 0.95, 12: math.nan, 13: 0.95}, "left": {}}),
         ranges=range_table(8, 45, math.nan),
     )
-    judged = judge_approaches(broken, truth())
-    assert judged is not None
+    judged = judged_of(broken, truth())
 
     assert judged.rows_not_numbers == 1
     assert score_belief(judge_belief(broken, truth()))["intersection"].left_out["not a number"] == 1
