@@ -66,17 +66,18 @@ def reached(
         features: Probabilities by feature, shape (N,) each.
         present: Features that are present; none without an intersection.
         absent: Features that are absent.
-        sure: Shape (N,): True where presence is established, which counts as the intersection.
+        sure: Shape (N,): True where presence is established, which counts as the intersection,
+            present or absent.
     """
-    rows = [np.empty(0) if name not in features else features[name] for name in absent]
+    counted = {k: np.where(sure, 1.0, p) if k == SURE else p for k, p in features.items()}
+    rows = [counted.get(name, np.empty(0)) for name in absent]
     false = tuple(float(one.max()) if len(one) else 0.0 for one in rows)
     if not present:
         return Reached(None, false)
     never = np.full(len(sure), -1.0)
     lowest = np.ones(len(sure))
     for name in present:
-        values = features.get(name, never)
-        lowest = np.minimum(lowest, np.where(sure, 1.0, values) if name == SURE else values)
+        lowest = np.minimum(lowest, counted.get(name, never))
     if len(lowest) < CONFIRM_FRAMES:
         return Reached(-1.0, false)
     windows = np.lib.stride_tricks.sliding_window_view(lowest, CONFIRM_FRAMES)

@@ -25,6 +25,15 @@ def test_thresholds_agree_with_detection_at_each_threshold(seed: int) -> None:
         assert bool((features["right"] > threshold).any()) == (found.false[0] > threshold)
 
 
+def test_established_presence_counts_alike_where_it_is_right_and_where_it_is_wrong() -> None:
+    rising = {"intersection": np.linspace(0.1, 0.6, 6)}
+    sure = np.arange(6) >= 3
+
+    assert reached(rising, ("intersection",), (), sure) == Reached(1.0, ())
+    assert reached(rising, (), ("intersection",), sure) == Reached(None, (1.0,))
+    assert reached(rising, (), ("intersection",), np.zeros(6, np.bool_)) == Reached(None, (0.6,))
+
+
 def test_each_rate_has_the_lowest_threshold_that_keeps_to_it() -> None:
     some = [Reached(0.1 * i, (0.1 * i - 0.05,)) for i in range(1, 11)]
     some += [Reached(None, (0.02,))] * 10
