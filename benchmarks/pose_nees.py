@@ -39,7 +39,8 @@ from crosscue.datasets.simulated.drive import (
 from crosscue.eval.fit.log_signals import read_signals, signal_plan, turn_samples, wheel_speeds
 from crosscue.eval.fit.reference import ReferencePositions, of_gnss, of_truth
 from crosscue.eval.logs.log import opened
-from crosscue.eval.pipeline.pose import odometry_settings, turn_signal_of
+from crosscue.eval.pipeline.pose import odometry_settings
+from crosscue.localization.constants import NO_CONSTANTS
 from crosscue.localization.fit.known_drive import KnownDrive
 from crosscue.localization.fit.odometry import OdometryFit, fit_odometry
 from crosscue.localization.fixes import Fixes
@@ -49,7 +50,7 @@ from crosscue.localization.odometry import (
     TurnSignal,
     WheelSamples,
 )
-from crosscue.localization.pose_filter import State
+from crosscue.localization.pose_filter import State, major_axis_m
 from crosscue.localization.start_pose import START_S, path_of, start_pose
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.signals.kinds import Signal
@@ -173,8 +174,8 @@ def _part(drive: KnownDrive, begin_ns: int, end_ns: int) -> KnownDrive:
     return KnownDrive(drive.wheels, drive.turn, inside, drive.lever_m)
 
 
-def recorded(log: Path, vehicle: Vehicle, truth: Path | None) -> KnownDrive:
-    """Read a recorded drive with its known positions."""
+def recorded(log: Path, vehicle: Vehicle, truth: Path | None) -> dict[str, KnownDrive]:
+    """Read a recorded drive with its known positions, by the source of its turns."""
     with opened(log) as drive:
         planned = signal_plan(drive.logs, vehicle)
         wanted = [Signal.WHEEL_SPEEDS, Signal.YAW_RATE, Signal.STEERING, Signal.POSITION]
@@ -186,9 +187,13 @@ def recorded(log: Path, vehicle: Vehicle, truth: Path | None) -> KnownDrive:
             gnss = planned.source_of(Signal.POSITION)
             assert gnss is not None
             reference = of_gnss(gnss.topic.name, found[Signal.POSITION], vehicle)
-        turn = turn_samples(turn_signal_of(planned, vehicle), found)
     wheels = wheel_speeds(found[Signal.WHEEL_SPEEDS])
-    return KnownDrive(wheels, turn, reference.fixes, reference.lever_m)
+    sources = [signal for signal in (Signal.YAW_RATE, Signal.STEERING) if signal in found]
+    turns = [turn_samples(signal, found) for signal in sources]
+    if wheels.wheels_mps.shape[1] == 4:
+        turns.append(None)
+    drives = [KnownDrive(wheels, turn, reference.fixes, reference.lever_m) for turn in turns]
+    return {one.source: one for one in drives}
 
 
 def simulated(kind: str, seed: int) -> KnownDrive:
@@ -290,6 +295,80 @@ def udacity(file: Path) -> tuple[str, KnownDrive, OdometrySettings]:
     return f"Udacity {file.stem}", drive, car
 
 
+def smartloc(folder: Path) -> tuple[str, KnownDrive, OdometrySettings]:
+    """Read a drive of smartLoc (TU Chemnitz): speed and yaw rate of the car, and true positions.
+
+    The folder has lines of ``libRSF``: ``odom.txt`` of type odom3, ``gt.txt`` of type point3.
+    """
+    odom, gt = (
+        np.loadtxt(folder / f"{name}.txt", usecols=range(1, columns))
+        for name, columns in (("odom", 9), ("gt", 5))
+    )
+    t_ns, true_ns = (np.round(of[:, 0] * 1e9).astype(np.int64) for of in (odom, gt))
+    up = gt[0, 1:] / np.linalg.norm(gt[0, 1:])
+    east = np.cross([0.0, 0.0, 1.0], up)
+    east /= np.linalg.norm(east)
+    xy_m = (gt[:, 1:] - gt[0, 1:]) @ np.column_stack([east, np.cross(up, east)])
+    at = np.searchsorted(true_ns, np.arange(true_ns[0], true_ns[-1], SECOND_NS))
+    fixes = Fixes(true_ns[at], xy_m[at], np.tile(0.01 * np.eye(2), (len(at), 1, 1)))
+    wheels = WheelSamples(t_ns, np.column_stack([odom[:, 1], odom[:, 1]]))
+    drive = KnownDrive(wheels, TurnSignal(t_ns, odom[:, 6], "yaw rate"), fixes, (0.0, 0.0))
+    return "smartLoc, Berlin", drive, odometry_settings(Vehicle(version=1))
+
+
+def ellipses(drives: dict[str, KnownDrive], given: OdometrySettings) -> Iterator[str]:
+    """Yield the ellipse at a drive's end by its gyro, and with the best use of all sources.
+
+    Sources are fused at best as independent yaw rates: their noise and the errors of their biases
+    have the inverse of the sum of inverse variances. On a straight drive, a scale of the right
+    wheels and an offset of the steering are biases.
+    """
+    found = {}
+    for source, drive in drives.items():
+        t_ns = drive.fixes.t_ns
+        found[source] = fit_odometry(drive.until(int(t_ns[0] + t_ns[-1]) // 2), given)
+    gyro, drive = found["yaw rate"], drives["yaw rate"]
+    speed_mps = drive.steps(given).distance_m.sum() / drive.seconds[-1]
+    noise, bias = [], []
+    for source, fit in found.items():
+        sd = dict(zip(fit.constants.names, np.sqrt(np.diagonal(fit.constants.cov)), strict=True))
+        car = fit.settings
+        per_base = speed_mps / (car.wheelbase_m or 1.0)
+        one = {
+            "yaw rate": (car.gyro_noise_rad_per_sqrt_s, sd.get("gyro_bias_radps", 0.0)),
+            "steering": (
+                car.steering_noise_rad_sqrt_m * per_base / math.sqrt(speed_mps),
+                sd.get("steering_offset_rad", 0.0) * per_base / car.steering_ratio,
+            ),
+            "wheels": (
+                car.wheel_turn_rad_per_sqrt_m * math.sqrt(speed_mps),
+                sd.get("right_wheel_scale", 0.0) * speed_mps / car.track_width_m,
+            ),
+        }[source]
+        yield f"{source}: noise {one[0]:.2g} rad after 1 s, s.d. of the bias {one[1]:.2g} rad/s"
+        noise.append(one[0])
+        bias.append(one[1])
+    best, sure = (float(np.sum(np.power(of, -2.0)) ** -0.5) for of in (noise, bias))
+    fused = replace(gyro.settings, gyro_noise_rad_per_sqrt_s=best)
+    factor = np.array(
+        [sure / bias[0] if n == "gyro_bias_radps" else 1.0 for n in gyro.constants.names]
+    )
+    less = replace(
+        gyro.constants,
+        cov=gyro.constants.cov * np.outer(factor, factor),
+        cross=gyro.constants.cross * factor,
+    )
+    for name, car in (
+        ("gyro as fitted to the first half", gyro.car),
+        ("all sources at best", gyro.car._replace(settings=fused, constants=less)),
+        ("gyro without an error of its bias", gyro.car._replace(constants=NO_CONSTANTS)),
+    ):
+        made = drive.reckon(gyro.start, car)
+        (xx, xy), (_, yy) = made.cov_m2[-1].tolist()
+        error_m = np.hypot(*(made.xy_m[-1] - drive.fixes.xy_m[-1]))
+        yield f"{name}: 2-sigma ellipse {major_axis_m(xx, xy, yy):.1f} m, error {error_m:.2f} m"
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
@@ -299,14 +378,22 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0, help="seed of the first of them")
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
     parser.add_argument("--udacity", type=Path, nargs="*", default=[], help="interpolated.csv")
+    parser.add_argument("--smartloc", type=Path, nargs="*", default=[], help="folder of a drive")
+    parser.add_argument("--ellipse", action="store_true", help="only that of the comma minute")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     found: list[Prediction] = []
+    if args.ellipse:
+        segment, truth, car = comma_minute(args.data, args.work)
+        print("\n".join(ellipses(recorded(segment, car, truth), odometry_settings(car))))
+        return
     if args.data is not None:
         for name, drive, car in real_drives(args.data, args.work):
             found += tested(name, drive, car, 0)
     for file in args.udacity:
         found += tested(*udacity(file), 0)
+    for folder in args.smartloc:
+        found += tested(*smartloc(folder), 0)
     car = replace(
         odometry_settings(Vehicle(version=1)), track_width_m=TRACK_WIDTH_M, wheelbase_m=WHEELBASE_M
     )
@@ -318,8 +405,8 @@ def main() -> None:
         args.json.write_text(json.dumps([one._asdict() for one in found], indent=1))
 
 
-def real_drives(data: Path, work: Path) -> Iterator[tuple[str, KnownDrive, OdometrySettings]]:
-    """Yield the recorded drives with known positions."""
+def comma_minute(data: Path, work: Path) -> tuple[Path, Path, Vehicle]:
+    """Return the segment, its truth and its vehicle."""
     work.mkdir(parents=True, exist_ok=True)
     (segment,) = (data / "comma2k19" / "Example_1").glob("*/40")
     truth = work / "comma2k19"
@@ -328,15 +415,22 @@ def real_drives(data: Path, work: Path) -> Iterator[tuple[str, KnownDrive, Odome
     vehicle = work / "rav4.toml"
     if not vehicle.exists():
         crosscue.draft_vehicle(segment, [data / "comma2k19" / "toyota_2017.dbc"], vehicle)
-    car = crosscue.load_vehicle(vehicle)
-    yield "comma2k19", recorded(segment, car, truth), odometry_settings(car)
+    return segment, truth, crosscue.load_vehicle(vehicle)
+
+
+def real_drives(data: Path, work: Path) -> Iterator[tuple[str, KnownDrive, OdometrySettings]]:
+    """Yield the recorded drives with known positions, by each source of turns."""
+    segment, truth, car = comma_minute(data, work)
+    for source, drive in recorded(segment, car, truth).items():
+        yield f"comma2k19, {source}", drive, odometry_settings(car)
     car = Vehicle(version=1)
     phone = data / "odometry" / "smartphone_compass"
-    yield "phone in a BMW", recorded(phone, car, None), odometry_settings(car)
+    for source, drive in recorded(phone, car, None).items():
+        yield f"phone in a BMW, {source}", drive, odometry_settings(car)
     topics = Topics(odometry="oxts/ins_speed")
     car = Vehicle(version=1, topics=topics)
     kitti = data / "odometry" / "kitti_tracking_0001"
-    yield "KITTI tracking 0001", recorded(kitti, car, None), odometry_settings(car)
+    yield "KITTI tracking 0001", recorded(kitti, car, None)["yaw rate"], odometry_settings(car)
 
 
 if __name__ == "__main__":

@@ -26,8 +26,15 @@ from .pose_filter import HEADING, State, predict_pose
 # Parameters of each source of turns.
 TURN_PARAMETERS: Final[Mapping[str, tuple[str, ...]]] = {
     "yaw rate": ("gyro_bias_radps", "yaw_rate_scale"),
-    "steering": ("steering_ratio", "steering_offset_rad", "wheelbase_m"),
+    "steering": ("steering_ratio", "steering_offset_rad", "understeer_s2pm2", "wheelbase_m"),
     "wheels": ("right_wheel_scale", "track_width_m"),
+}
+# Parameters of each source whose errors drift: tyres slip more uphill than downhill, and the road's
+# bank, the load and the temperature change what is straight.
+DRIFTING: Final[Mapping[str, tuple[str, str]]] = {
+    "yaw rate": ("wheel_scale", "gyro_bias_radps"),
+    "steering": ("wheel_scale", "steering_offset_rad"),
+    "wheels": ("wheel_scale", "right_wheel_scale"),
 }
 _UPPER: Final = np.triu_indices(4)
 # Correlation of pose states below which they count as linearly dependent.
@@ -102,14 +109,33 @@ class _Motion:
         zero = np.zeros_like(self.turn_rad)
         return np.divide(self.turn_rad, self.distance_m, zero, where=self.distance_m != 0.0)
 
+    def understeer(self) -> Floats:
+        """Factor by which the wheelbase is in effect longer at speed."""
+        return 1.0 + self.car.understeer_s2pm2 * (self.distance_m / self.dt_s) ** 2
+
+    def base_m(self) -> Floats:
+        """Wheelbase of a car without understeer that turns as this one."""
+        return (self.car.wheelbase_m or 1.0) * self.understeer()
+
     def tangent(self) -> Floats:
         """Tangent of the road-wheel angle."""
-        return (self.car.wheelbase_m or 1.0) * self.curvature()
+        return self.base_m() * self.curvature()
 
     def turn_by_angle(self) -> Floats:
         """Derivative of a turn by steering with respect to the road-wheel angle."""
-        base = self.car.wheelbase_m or 1.0
-        return self.by[BY_STEERING] * self.distance_m * (1.0 + self.tangent() ** 2) / base
+        return self.by[BY_STEERING] * self.distance_m * (1.0 + self.tangent() ** 2) / self.base_m()
+
+    def by_understeer(self) -> Floats:
+        """Derivative of a turn by steering with respect to the understeer."""
+        speed2 = (self.distance_m / self.dt_s) ** 2
+        return -self.by[BY_STEERING] * self.turn_rad * speed2 / self.understeer()
+
+    def by_wheel_scale(self) -> tuple[Floats, Floats]:
+        """Derivatives of distance and turn by the scale of all wheels."""
+        by_speed = 2.0 * self.by[BY_STEERING] * (1.0 - 1.0 / self.understeer())
+        per_turn = 1.0 - self.by[BY_YAW_RATE] - by_speed
+        scale = self.car.wheel_scale
+        return self.distance_m / scale, per_turn * self.turn_rad / scale
 
     def by_delay(self) -> tuple[Floats, Floats]:
         """Derivatives by the wheels' delay: the change of speed, and none of the turn.
@@ -132,14 +158,12 @@ class _Motion:
 _Columns: TypeAlias = Callable[[_Motion], tuple[Floats, Floats] | Floats]
 # Derivatives of distance and turn by each parameter; of the turn only, if there is one column.
 EFFECTS: Final[Mapping[str, _Columns]] = {
-    "wheel_scale": lambda m: (
-        m.distance_m / m.car.wheel_scale,
-        (1.0 - m.by[BY_YAW_RATE]) * m.turn_rad / m.car.wheel_scale,
-    ),
+    "wheel_scale": _Motion.by_wheel_scale,
     "gyro_bias_radps": lambda m: -m.by[BY_YAW_RATE] * m.car.yaw_rate_scale * m.dt_s,
     "yaw_rate_scale": lambda m: m.by[BY_YAW_RATE] * m.turn_rad / m.car.yaw_rate_scale,
     "steering_ratio": lambda m: -m.turn_by_angle() * np.arctan(m.tangent()) / m.car.steering_ratio,
     "steering_offset_rad": lambda m: -m.turn_by_angle() / m.car.steering_ratio,
+    "understeer_s2pm2": _Motion.by_understeer,
     "wheelbase_m": lambda m: -m.by[BY_STEERING] * m.turn_rad / (m.car.wheelbase_m or 1.0),
     "right_wheel_scale": _Motion.by_right,
     "wheel_delay_s": _Motion.by_delay,

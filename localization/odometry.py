@@ -66,6 +66,8 @@ class OdometrySettings:
         gyro_noise_rad_per_sqrt_s: S.d. of the heading after one second.
         steering_ratio: Steering-wheel angle per road-wheel angle; 1 for road-wheel angles.
         steering_offset_rad: Reported angle when driving straight, before the ratio.
+        understeer_s2pm2: Growth of the angle for the same turn with the square of the speed: the
+            inverse square of the car's characteristic speed.
         steering_noise_rad_sqrt_m: Noise density of the road-wheel angle over distance: its s.d.
             times the root of the distance over which its error persists.
         wheel_turn_rad_per_sqrt_m: S.d. of the heading by wheel difference after one metre.
@@ -93,6 +95,7 @@ class OdometrySettings:
     gyro_noise_rad_per_sqrt_s: float = 1e-3
     steering_ratio: float = 1.0
     steering_offset_rad: float = 0.0
+    understeer_s2pm2: float = 0.0
     steering_noise_rad_sqrt_m: float = 0.01
     wheel_turn_rad_per_sqrt_m: float = 0.01
     turn_per_turn: float = 0.0
@@ -117,8 +120,9 @@ class OdometrySettings:
             raise ValueError(
                 f"steering_ratio: expected finite and not 0, got {self.steering_ratio}"
             )
-        if not math.isfinite(self.turn_delay_s):
-            raise ValueError(f"turn_delay_s: expected finite, got {self.turn_delay_s}")
+        for name in ("turn_delay_s", "understeer_s2pm2"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name}: expected finite, got {getattr(self, name)}")
         noises = [f.name for f in fields(self) if "_per_" in f.name or f.name.startswith("gap_")]
         for name in (*noises, "wheel_step_mps", "steering_noise_rad_sqrt_m", "wheel_delay_s"):
             value = getattr(self, name)
@@ -525,8 +529,10 @@ class _Turn:
             return turn_rad, settings.gyro_noise_rad_per_sqrt_s**2 * dt_s
         assert settings.wheelbase_m is not None
         angle_rad = (area / dt_s - settings.steering_offset_rad) / settings.steering_ratio
-        curvature = np.tan(angle_rad) / settings.wheelbase_m
-        by_angle = (1.0 + np.tan(angle_rad) ** 2) / settings.wheelbase_m
+        # Tyres slip sideways, so that a turn at speed needs a larger angle.
+        base_m = settings.wheelbase_m * (1.0 + settings.understeer_s2pm2 * (distance_m / dt_s) ** 2)
+        curvature = np.tan(angle_rad) / base_m
+        by_angle = (1.0 + np.tan(angle_rad) ** 2) / base_m
         variance = (settings.steering_noise_rad_sqrt_m * by_angle) ** 2 * np.abs(distance_m)
         return distance_m * curvature, variance
 

@@ -413,8 +413,7 @@ def _yaw(half: KnownDrive, fit: OdometryFit, reference: ReferencePositions) -> t
     assert reference.heading_rad is not None
     fixes = half.fixes
     rows = np.searchsorted(reference.fixes.t_ns, fixes.t_ns)
-    cov = np.tile(np.eye(2) * fit.fix_sd_m**2, (len(fixes), 1, 1))
-    car = half.follow(fit.start, half.steps(fit.settings, delay_s=fit.value(FIX_DELAY)), cov)
+    car = half.reckon(fit.start, fit.car, len(fixes))
     apart = wrap_all(reference.heading_rad[rows] - car.heading_rad)
     yaw_rad = circular_mean(apart)
     around = wrap_all(apart - yaw_rad)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -12,10 +13,8 @@ from crosscue.localization.constants import (
     NO_CONSTANTS,
     Constants,
     effects,
-    predict_constants,
-    update_constants,
 )
-from crosscue.localization.ekf import pack_belief, unpack_belief, update_point
+from crosscue.localization.ekf import unpack_belief
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import (
     Increments,
@@ -24,7 +23,7 @@ from crosscue.localization.odometry import (
     WheelSamples,
     integrate,
 )
-from crosscue.localization.pose_filter import State, at_point, predict_pose, update_position
+from crosscue.localization.pose_filter import State, arc
 from crosscue.localization.start_pose import start_pose
 from crosscue.replay.compiled import kept
 
@@ -50,6 +49,8 @@ class Steps(NamedTuple):
         distance_var_m2: Shape (M,).
         turn_var_rad2: Shape (M,).
         wander_var_m2: Shape (M,): growth of the variance of the positions' own error, per axis.
+        by: Shape (M, 2, K): derivatives of distance and turn by parameters that are states.
+        drift_var: Shape (M, K): growth of these parameters' variances.
     """
 
     at_fix: Int64s
@@ -58,6 +59,8 @@ class Steps(NamedTuple):
     distance_var_m2: Floats
     turn_var_rad2: Floats
     wander_var_m2: Floats
+    by: Floats
+    drift_var: Floats
 
 
 class Predicted(NamedTuple):
@@ -137,28 +140,28 @@ class KnownDrive:
     def steps(
         self,
         settings: OdometrySettings,
-        drift_radps2: float = 0.0,
         delay_s: float = 0.0,
         wander_m_per_sqrt_s: float = 0.0,
+        names: tuple[str, ...] = (),
+        drift_var_per_s: Sequence[float] | Floats = (),
     ) -> Steps:
         """Compute the odometry between the positions.
 
         Args:
             settings: Odometry settings of the car.
-            drift_radps2: Drift of the gyro's bias, whose value in the settings is that in the
-                middle of the drive.
             delay_s: Delay of the positions' timestamps.
             wander_m_per_sqrt_s: S.d. of the change of the positions' own error in one second.
+            names: K parameters whose deviations are states.
+            drift_var_per_s: Growth of their variances per second, shape (K,).
         """
-        turn = self.turn
-        if turn is not None and drift_radps2:
-            middle_s = (turn.t_ns - self.fixes.t_ns[0]) * 1e-9 - 0.5 * self.seconds[-1]
-            turn = TurnSignal(turn.t_ns, turn.values - drift_radps2 * middle_s, turn.kind)
-        made = integrate(self.wheels, settings, turn).increments
+        made = self.increments(settings)
         columns = made.distance_m, made.turn_rad, made.distance_var_m2, made.turn_var_rad2
         summed = [self._between(made, column, delay_s) for column in columns]
         summed.append(wander_m_per_sqrt_s**2 * self.dt_s)
-        return Steps(self.at_fix, *summed)
+        by = effects(made, settings, names)
+        between = [self._between(made, column, delay_s) for column in by.reshape(len(by), -1).T]
+        arcs = np.array(between).reshape(2, len(names), len(self.knots_s)).transpose(2, 0, 1)
+        return Steps(self.at_fix, *summed, arcs, np.outer(self.dt_s, drift_var_per_s))
 
     def _between(self, made: Increments, column: Floats, delay_s: float) -> Floats:
         """Sum a column of increments over each arc."""
@@ -183,91 +186,118 @@ class KnownDrive:
             car: The car, with its constants at the first position.
             updated: Number of positions, from the first on, that update the filter.
         """
-        steps = self.steps(car.settings, 0.0, car.delay_s, car.wander_m_per_sqrt_s)
-        made, constants = self.increments(car.settings), car.constants
-        by = effects(made, car.settings, constants.names)
-        arcs = np.zeros((len(self.knots_s), *by.shape[1:]))
-        for i, k in np.ndindex(by.shape[1:]):
-            arcs[:, i, k] = self._between(made, by[:, i, k], car.delay_s)
-        rows = zip(*(column.tolist() for column in steps), arcs, self.dt_s.tolist(), strict=True)
-        state, found, cov_m2 = start, [], car.fix_sd_m**2 * np.eye(2)
-        for at_fix, *step, wander_var, arc_by, dt_s in rows:
-            state, constants = predict_constants(state, constants, (*step, 0.0), arc_by, dt_s)
-            state = _wandered(state, wander_var)
-            if at_fix < 0:
-                continue
-            seen = at_point(state, *self.lever_m)
-            found.append(seen)
-            if at_fix < updated:
-                before = unpack_belief(0, state)
-                after = update_point(before, self.fixes.xy_m[at_fix], cov_m2, self.lever_m).belief
-                state, constants = pack_belief(after), update_constants(constants, before, after)
-        return _predicted(np.array(found))
+        made, rows = car.constants, slice(0, 3)
+        steps = self.steps(
+            car.settings, car.delay_s, car.wander_m_per_sqrt_s, made.names, made.drift_var_per_s
+        )
+        pose = unpack_belief(0, start)
+        cov = np.block([[pose.cov[rows, rows], made.cross[rows]], [made.cross[rows].T, made.cov]])
+        cov_m2 = np.tile(car.fix_sd_m**2 * np.eye(2), (updated, 1, 1))
+        return self.follow(np.append(pose.mean[rows], made.mean), cov, steps, cov_m2)
 
-    def follow(self, start: State, steps: Steps, cov_m2: Floats | None = None) -> Predicted:
+    def follow(self, mean: Floats, cov: Floats, steps: Steps, cov_m2: Floats) -> Predicted:
         """Run the filter along the steps.
 
         Args:
-            start: State of the rear axle at the first position.
+            mean: Shape (3 + K,): x, y and heading at the first position, and K parameters'
+                deviations from the settings.
+            cov: Shape (3 + K, 3 + K): their covariance.
             steps: Odometry from there on.
-            cov_m2: Shape (N, 2, 2): covariances of the positions for updates of the filter; None
-                for dead reckoning.
+            cov_m2: Shape (L, 2, 2): covariances of the first L positions, which update the filter.
         """
-        found = np.empty((len(self.fixes), len(State._fields)))
-        cov = np.empty((0, 2, 2)) if cov_m2 is None else cov_m2
+        found = np.empty((len(self.fixes), 6))
         # Compiled, because a fit calls it hundreds of times.
-        count = kept(_follow)(start, steps, self.fixes.xy_m, cov, self.lever_m, found)
-        return _predicted(found[:count])
+        state = np.array(mean, np.float64), np.array(cov, np.float64)
+        kept(_follow)(*state, steps, self.fixes.xy_m, cov_m2, self.lever_m, found)
+        return _predicted(found)
 
 
-def _predicted(states: Floats) -> Predicted:
-    x, y, heading, _, xx, xy, _, _, yy = states.T[:9]
+def _predicted(found: Floats) -> Predicted:
+    x, y, heading, xx, xy, yy = found.T
     spread = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
     return Predicted(np.stack([x, y], axis=1), heading, spread)
 
 
 def _follow(
-    state: State,
+    state: Floats,
+    p: Floats,
     steps: Steps,
     fixes_m: Floats,
     cov_m2: Floats,
     lever_m: tuple[float, float],
     found: Floats,
-) -> int:
-    """Write the state at each position into ``found``; return their number."""
-    at_fix, distance_m, turn_rad, distance_var_m2, turn_var_rad2, wander_var_m2 = steps
+) -> None:
+    """Write the prediction of each position into ``found``; ``state`` and ``p`` change."""
     ahead_m, left_m = lever_m
-    count = 0
-    for row in range(len(at_fix)):
-        state = predict_pose(
-            state, distance_m[row], turn_rad[row], distance_var_m2[row], turn_var_rad2[row], 0.0
-        )
-        state = _wandered(state, wander_var_m2[row])
-        k = at_fix[row]
+    n, count = len(state), 0
+    moved, by, seen = np.zeros((3, n - 2)), np.zeros((3, 2)), np.zeros((2, n))
+    for row in range(len(steps.at_fix)):
+        effect = steps.by[row]
+        distance_m, turn_rad = steps.distance_m[row], steps.turn_rad[row]
+        for k in range(n - 3):
+            distance_m += effect[0, k] * state[3 + k]
+            turn_rad += effect[1, k] * state[3 + k]
+        made, c, s = arc(distance_m, turn_rad), math.cos(state[2]), math.sin(state[2])
+        by[0, 0] = c * made.dx_by_distance - s * made.dy_by_distance
+        by[1, 0] = s * made.dx_by_distance + c * made.dy_by_distance
+        by[0, 1] = c * made.dx_by_turn - s * made.dy_by_turn
+        by[1, 1] = s * made.dx_by_turn + c * made.dy_by_turn
+        by[2, 1] = 1.0
+        moved[1, 0], moved[0, 0] = c * made.dx_m - s * made.dy_m, -s * made.dx_m - c * made.dy_m
+        state[0], state[1] = state[0] + moved[1, 0], state[1] - moved[0, 0]
+        state[2] += turn_rad
+        for i in range(3):
+            for k in range(n - 3):
+                moved[i, 1 + k] = by[i, 0] * effect[0, k] + by[i, 1] * effect[1, k]
+        # F P F', where F - I is ``moved``, in place: rows and columns of x and y before the
+        # heading's, which they need as it was.
+        for i in range(3):
+            for k in range(n - 2):
+                for j in range(n):
+                    p[i, j] += moved[i, k] * p[2 + k, j]
+        for i in range(3):
+            for k in range(n - 2):
+                for j in range(n):
+                    p[j, i] += moved[i, k] * p[j, 2 + k]
+        for i in range(3):
+            for j in range(3):
+                p[i, j] += by[i, 0] * by[j, 0] * steps.distance_var_m2[row]
+                p[i, j] += by[i, 1] * by[j, 1] * steps.turn_var_rad2[row]
+        for i in range(2):
+            # The filter's position includes the error of the positions that wanders.
+            p[i, i] += steps.wander_var_m2[row]
+        for k in range(n - 3):
+            p[3 + k, 3 + k] += steps.drift_var[row, k]
+        k = steps.at_fix[row]
         if k < 0:
             continue
-        seen = at_point(state, ahead_m, left_m)
-        for column in range(len(seen)):
-            found[count, column] = seen[column]
+        c, s = math.cos(state[2]), math.sin(state[2])
+        dx, dy = c * ahead_m - s * left_m, s * ahead_m + c * left_m
+        seen[0], seen[1] = p[0] - dy * p[2], p[1] + dx * p[2]
+        xx, xy = seen[0, 0] - dy * seen[0, 2], seen[0, 1] + dx * seen[0, 2]
+        yy = seen[1, 1] + dx * seen[1, 2]
+        line = found[count]
+        line[0], line[1], line[2] = state[0] + dx, state[1] + dy, state[2]
+        line[3], line[4], line[5] = xx, xy, yy
         count += 1
-        if len(cov_m2):
-            x, y = fixes_m[k, 0], fixes_m[k, 1]
-            weighed = _weighed(seen, x, y, cov_m2[k, 0, 0], cov_m2[k, 0, 1], cov_m2[k, 1, 1])
-            state = at_point(weighed, -ahead_m, -left_m)
-    return count
-
-
-def _wandered(state: State, var_m2: float) -> State:
-    """Let the positions' own error wander; the filter's position includes it."""
-    x, y, heading, speed, xx, xy, xh, xv, yy, yh, yv, hh, hv, vv = state
-    return State(x, y, heading, speed, xx + var_m2, xy, xh, xv, yy + var_m2, yh, yv, hh, hv, vv)
-
-
-def _weighed(seen: State, x: float, y: float, var_x: float, cov_xy: float, var_y: float) -> State:
-    """Update with one position; the weight of an outlier is reduced continuously at the gate."""
-    nis = update_position(seen, x, y, var_x, cov_xy, var_y, 0.0).nis
-    more = max(nis / GATE_NIS, 1.0)
-    return update_position(seen, x, y, more * var_x, more * cov_xy, more * var_y, math.inf).state
+        if k >= len(cov_m2):
+            continue
+        x, y = fixes_m[k, 0] - line[0], fixes_m[k, 1] - line[1]
+        # The weight of an outlier is reduced continuously at the gate.
+        more = 1.0
+        for _ in range(2):
+            sxx, syy = xx + more * cov_m2[k, 0, 0], yy + more * cov_m2[k, 1, 1]
+            sxy = xy + more * cov_m2[k, 0, 1]
+            per = 1.0 / (sxx * syy - sxy * sxy)
+            wx, wy = (syy * x - sxy * y) * per, (sxx * y - sxy * x) * per
+            if more == 1.0:
+                more = max((x * wx + y * wy) / GATE_NIS, 1.0)
+        state += seen[0] * wx + seen[1] * wy
+        for i in range(n):
+            a = (seen[0, i] * syy - seen[1, i] * sxy) * per
+            b = (seen[1, i] * sxx - seen[0, i] * sxy) * per
+            for j in range(n):
+                p[i, j] -= a * seen[0, j] + b * seen[1, j]
 
 
 def whitened(predicted: Predicted, xy_m: Floats, cov_m2: Floats) -> tuple[Floats, Floats]:

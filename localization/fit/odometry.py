@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from crosscue.localization.angles import wrap
-from crosscue.localization.constants import EFFECTS, TURN_PARAMETERS, Constants
+from crosscue.localization.constants import DRIFTING, EFFECTS, TURN_PARAMETERS, Constants
 from crosscue.localization.fit.compass import NotObservable, persistence
 from crosscue.localization.fit.front_wheels import front_wheels
 from crosscue.localization.fit.known_drive import GATE_NIS, Car, KnownDrive, Steps, whitened
@@ -65,6 +65,14 @@ NOISE_FACTOR: Final = 3.0
 # centimetres to a phone among high buildings.
 TYPICAL_WANDER_M: Final = 0.05
 WANDER_FACTOR: Final = 10.0
+# Typical change of the drifting parameters in one second; the steering's is of the road wheels.
+TYPICAL_DRIFT: Final = {
+    "wheel_scale": 2e-4,
+    "gyro_bias_radps": 2e-5,
+    "steering_offset_rad": 1e-4,
+    "right_wheel_scale": 1e-5,
+}
+DRIFT_FACTOR: Final = 10.0
 # Positions and distance with which anything is observable; more is judged by the parameters' s.d.
 MIN_FIXES: Final = 5
 MIN_DISTANCE_M: Final = 20.0
@@ -76,8 +84,6 @@ _LOUD: Final = 2.0
 
 START: Final = ("start_x_m", "start_y_m", "start_heading_rad")
 FIX_DELAY: Final = "fix_delay_s"
-BIAS: Final = "gyro_bias_radps"
-DRIFT: Final = "gyro_drift_radps2"
 FRONT: Final = ("front_left_scale", "front_right_scale")
 
 
@@ -92,10 +98,10 @@ class _Kind(NamedTuple):
 PARAMETERS: Final[Mapping[str, _Kind]] = {
     "wheel_scale": _Kind(0.05, False, "a longer drive"),
     "gyro_bias_radps": _Kind(0.01, False, "a longer drive"),
-    DRIFT: _Kind(1e-5, False, "a longer drive"),
     "yaw_rate_scale": _Kind(0.02, False, "turns"),
     "steering_ratio": _Kind(0.2, True, "turns"),
     "steering_offset_rad": _Kind(0.2, False, "a longer drive"),
+    "understeer_s2pm2": _Kind(0.002, False, "turns at several speeds"),
     "wheelbase_m": _Kind(0.05, True, "tight turns: in wide ones it looks like the steering ratio"),
     "right_wheel_scale": _Kind(0.01, False, "a longer drive"),
     "track_width_m": _Kind(0.1, True, "turns"),
@@ -107,7 +113,7 @@ PARAMETERS: Final[Mapping[str, _Kind]] = {
 }
 # Parameters by turn source, other than those that a filter takes for constant.
 ALSO_OF_TURN: Final[Mapping[str, tuple[str, ...]]] = {
-    "yaw rate": (DRIFT, "turn_delay_s"),
+    "yaw rate": ("turn_delay_s",),
     "steering": ("turn_delay_s",),
     "wheels": (),
 }
@@ -134,8 +140,8 @@ class OdometryFit:
     Attributes:
         source: Source of the change of heading: "yaw rate", "steering" or "wheels".
         settings: Settings with the fitted values and noise; the others as given.
-        fitted: Value and s.d. of the observable parameters. The gyro's drift and the delay of the
-            positions are only here, not in ``settings``.
+        fitted: Value and s.d. of the observable parameters. The delay of the positions is only
+            here, not in ``settings``.
         not_observable: Other parameters, and the kind of drive that they need.
         start: Pose of the rear axle at the first position, with the covariance of the fit.
         start_ns: Time of the first position.
@@ -187,7 +193,7 @@ def fit_odometry(drive: KnownDrive, given: OdometrySettings) -> OdometryFit:
     names = _free(drive, given)
     # Large noise at first: a filter that trusts a wrong bias diverges, and derivatives are useless.
     loud = {n: WIDE * getattr(TYPICAL, n) for n in ("slip_per_sqrt_m", TURN_NOISE[drive.source])}
-    fit = _Fit(drive, names, _changed(given, loud), 1.0, WIDE * TYPICAL_WANDER_M)
+    fit = _Fit(drive, names, _changed(given, loud), 1.0, WIDE * TYPICAL_WANDER_M, (0.0, 0.0))
     values = fit.solve(fit.first_guess())
     fit = replace(fit, given=given)
     values = fit.solve(values)
@@ -260,6 +266,7 @@ class _Fit:
     given: OdometrySettings
     fix_scale: float
     wander_m_per_sqrt_s: float
+    drift_per_sqrt_s: tuple[float, float]
 
     def first_guess(self) -> Values:
         start = self.drive.start(self.given)
@@ -275,14 +282,14 @@ class _Fit:
 
     def _steps(self, values: Values, noise: Values) -> Steps:
         car = _changed(self.settings(values), noise)
-        drift, delay_s = values.get(DRIFT, 0.0), values.get(FIX_DELAY, 0.0)
-        return self.drive.steps(car, drift, delay_s, self.wander_m_per_sqrt_s)
+        delay_s = values.get(FIX_DELAY, 0.0)
+        names, drift_var = DRIFTING[self.drive.source], np.square(self.drift_per_sqrt_s)
+        return self.drive.steps(car, delay_s, self.wander_m_per_sqrt_s, names, drift_var)
 
     def _seen(self, values: Values, steps: Steps, fix_scale: float) -> tuple[Floats, Floats]:
-        x, y, heading = (values[name] for name in START)
-        start = State(x, y, heading, *(0.0,) * 11)
+        mean = np.array([*(values[name] for name in START), 0.0, 0.0])
         fixes, cov = self.drive.fixes, self.drive.fixes.cov_m2 * fix_scale**2
-        return whitened(self.drive.follow(start, steps, cov), fixes.xy_m, cov)
+        return whitened(self.drive.follow(mean, np.zeros((5, 5)), steps, cov), fixes.xy_m, cov)
 
     def solve(self, values: Values) -> Values:
         """Fit the most likely values under the current noise."""
@@ -369,51 +376,59 @@ class _Fit:
         slip, turn = self._noises()
         min_scale = MIN_FIX_SD_M / self.drive.fix_sd_m
         current = (*self._noise(), self.fix_scale)
-        typical = np.log([getattr(TYPICAL, slip), getattr(TYPICAL, turn), TYPICAL_WANDER_M])
-        factor = np.log([NOISE_FACTOR, NOISE_FACTOR, WANDER_FACTOR])
+        drift = [TYPICAL_DRIFT[name] for name in DRIFTING[self.drive.source]]
+        drift[1] *= abs(self.given.steering_ratio) if self.drive.source == "steering" else 1.0
+        typical = np.log([getattr(TYPICAL, slip), getattr(TYPICAL, turn), TYPICAL_WANDER_M, *drift])
+        factor = np.log([NOISE_FACTOR] * 2 + [WANDER_FACTOR] + [DRIFT_FACTOR] * 2)
         # Variances are linear in the noise's, so odometry is integrated thrice and not hundredfold.
         silent = self._steps(values, {slip: 0.0, turn: 0.0})
         by_slip = self._steps(values, {slip: 1.0, turn: 0.0}).distance_var_m2
         by_turn = self._steps(values, {slip: 0.0, turn: 1.0}).turn_var_rad2
 
         def unlikely(logs: Floats) -> float:
-            slip_var, turn_var, wander_var, _ = np.exp(2.0 * logs)
+            slip_var, turn_var, wander_var, *drift_var = np.exp(2.0 * logs[:5]).tolist()
             steps = silent._replace(
                 distance_var_m2=silent.distance_var_m2
                 + slip_var * (by_slip - silent.distance_var_m2),
                 turn_var_rad2=silent.turn_var_rad2 + turn_var * (by_turn - silent.turn_var_rad2),
                 wander_var_m2=wander_var * self.drive.dt_s,
+                drift_var=np.outer(self.drive.dt_s, drift_var),
             )
             # Not the least s.d.: larger than the residuals, it would leave no noise to be seen.
-            white, log_det = self._seen(values, steps, max(math.exp(logs[3]), LEAST * min_scale))
+            white, log_det = self._seen(values, steps, max(math.exp(logs[5]), LEAST * min_scale))
             nis = np.sum(white**2, axis=1)
             far = np.sqrt(np.maximum(nis * GATE_NIS, 0.0))
             robust = np.where(nis > GATE_NIS, 2.0 * far - GATE_NIS, nis)
             # Positions cannot tell small noise from none, but a car has some.
-            apart = (logs[:3] - typical) / factor
+            apart = (logs[:5] - typical) / factor
             return 0.5 * float(np.sum(robust + log_det) + np.sum(apart**2))
 
         first = np.log(np.maximum(current, _MIN_SD))
-        simplex = np.vstack([first, first + np.diag([-1.0] * 4)])
-        options = {"xatol": 0.02, "fatol": 0.02, "maxfev": 300, "initial_simplex": simplex}
+        first[3:5] = np.maximum(first[3:5], typical[3:])
+        simplex = np.vstack([first, first + np.diag([-1.0] * 6)])
+        options = {"xatol": 0.02, "fatol": 0.02, "maxfev": 500, "initial_simplex": simplex}
         logs = minimize(unlikely, first, method="Nelder-Mead", options=options).x
         for i in range(3 if is_upper else 0):
-            step = 0.05 * np.eye(4)[i]
+            step = 0.05 * np.eye(6)[i]
             limit = unlikely(logs) + 0.5
             while logs[i] < _LOUD and unlikely(logs + step) < limit:
                 logs = logs + step
-        *noise, wander, scale = np.exp(logs).tolist()
-        given = _changed(self.given, dict(zip((slip, turn), noise, strict=True)))
+        slip_sd, turn_sd, wander, *drift, scale = np.exp(logs).tolist()
+        given = _changed(self.given, {slip: slip_sd, turn: turn_sd})
         return replace(
-            self, given=given, fix_scale=max(scale, min_scale), wander_m_per_sqrt_s=wander
+            self,
+            given=given,
+            fix_scale=max(scale, min_scale),
+            wander_m_per_sqrt_s=wander,
+            drift_per_sqrt_s=(drift[0], drift[1]),
         )
 
     def _noises(self) -> tuple[str, str]:
         return "slip_per_sqrt_m", TURN_NOISE[self.drive.source]
 
-    def _noise(self) -> tuple[float, float, float]:
-        slip, turn = (float(getattr(self.given, name)) for name in self._noises())
-        return slip, turn, self.wander_m_per_sqrt_s
+    def _noise(self) -> tuple[float, ...]:
+        noise = (float(getattr(self.given, name)) for name in self._noises())
+        return *noise, self.wander_m_per_sqrt_s, *self.drift_per_sqrt_s
 
     def is_like(self, other: _Fit) -> bool:
         """Whether the noise is about the same."""
@@ -481,9 +496,8 @@ def _result(
     rows = [i for i, name in enumerate(names) if name in EFFECTS or name == FIX_DELAY]
     sign = np.array([-1.0 if names[i] == FIX_DELAY else 1.0 for i in rows])
     constant = tuple("wheel_delay_s" if names[i] == FIX_DELAY else names[i] for i in rows)
+    drifts = dict(zip(DRIFTING[drive.source], fit.drift_per_sqrt_s, strict=True))
     cross = np.vstack([cov[np.ix_(at, rows)], np.zeros(len(rows))]) * sign
-    # Its own s.d. is no drift.
-    drift_var = max(values.get(DRIFT, 0.0) ** 2 - sd.get(DRIFT, 0.0) ** 2, 0.0) * drive.seconds[-1]
     return OdometryFit(
         source=drive.source,
         settings=_changed(settings, {one.setting: one.scale for one in front}),
@@ -502,7 +516,7 @@ def _result(
             np.zeros(len(rows)),
             cov[np.ix_(rows, rows)] * np.outer(sign, sign),
             cross,
-            np.array([drift_var if name == BIAS else 0.0 for name in constant]),
+            np.array([drifts.get(name, 0.0) ** 2 for name in constant]),
         ),
         fix_sd_m=fit.fix_scale * drive.fix_sd_m,
         wander_m_per_sqrt_s=fit.wander_m_per_sqrt_s,

@@ -50,6 +50,7 @@ ConstantName: TypeAlias = Literal[
     "yaw_rate_scale",
     "steering_ratio",
     "steering_offset_rad",
+    "understeer_s2pm2",
     "wheelbase_m",
     "right_wheel_scale",
     "track_width_m",
@@ -119,6 +120,9 @@ class Odometry(Section):
     a minute."""
     steering_ratio: Positive = 15.0
     steering_offset_rad: Finite = 0.0
+    understeer_s2pm2: Finite = 0.0
+    """Growth of the steering angle for the same turn with the square of the speed, typically 0.001
+    to 0.003 s2/m2; by default 0, as published."""
     steering_noise_rad_sqrt_m: NotNegative = 0.01
     wheel_turn_rad_per_sqrt_m: NotNegative = 0.03
     """Growth of the heading error with ``heading_from = "wheels"``. The default covers tyres that

@@ -44,6 +44,7 @@ CAR = OdometrySettings(
     gyro_bias_radps=0.004,
     steering_ratio=15.0,
     steering_offset_rad=0.03,
+    understeer_s2pm2=0.002,
     slip_per_sqrt_m=0.02,
     gyro_noise_rad_per_sqrt_s=1e-3,
 )

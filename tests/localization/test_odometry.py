@@ -80,6 +80,18 @@ def test_wheels_steering_and_gyro_agree_on_a_circle() -> None:
     assert set(by_gyro.turn_source) == {BY_YAW_RATE}
 
 
+def test_steering_of_a_car_that_understeers_yields_its_circle_at_any_speed() -> None:
+    """At the characteristic speed (20 m/s here) a turn needs twice the angle (Gillespie, 6.2)."""
+    car = replace(CAR, steering_ratio=15.0, understeer_s2pm2=1.0 / 20.0**2)
+    for speed in (2.0, 20.0, 30.0):
+        angle = 15.0 * math.atan(BASE_M / 100.0 * (1.0 + (speed / 20.0) ** 2))
+        speeds = on_circle(100.0, speed)
+        steering = TurnSignal(speeds.t_ns, np.full(len(speeds), angle), "steering")
+        made = integrate(speeds, car, steering).increments
+
+        assert made.turn_rad.sum() == pytest.approx(2.0 * speed / 100.0)
+
+
 def test_reverse_flag_negates_wheel_speeds() -> None:
     forward = on_circle(10.0, 2.0, 51)
     flagged = WheelSamples(forward.t_ns, forward.wheels_mps, np.ones(51, np.bool_))

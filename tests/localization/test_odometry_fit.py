@@ -8,7 +8,7 @@ import pytest
 from crosscue.localization.fit.known_drive import KnownDrive
 from crosscue.localization.fit.odometry import OdometryFit, fit_odometry
 from crosscue.localization.fixes import Fixes
-from crosscue.localization.odometry import OdometrySettings, TurnSignal, integrate
+from crosscue.localization.odometry import OdometrySettings, TurnSignal, WheelSamples, integrate
 from crosscue.localization.start_pose import start_pose
 from crosscue.replay.columns import Floats
 from support.simulated_drive import BASE_M, TRACK_M, Truth, drive, gyro, wheels
@@ -140,6 +140,49 @@ def test_wander_of_the_positions_is_not_taken_for_slip_or_noise_of_the_gyro() ->
     assert fit.settings.gyro_noise_rad_per_sqrt_s < 0.005
     bias = next(one for one in fit.fitted if one.parameter == "gyro_bias_radps")
     assert abs(bias.value - TRUE["gyro_bias_radps"]) < 3.0 * bias.sd < 0.006
+
+
+def steered(seed: int, understeer: float, drift: tuple[float, float]) -> KnownDrive:
+    """100 s at 16 to 28 m/s; wheel scale and offset of the road wheels walk randomly."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(2001) * 0.05
+    speed = 22.0 + 6.0 * np.sin(t_s / 7.0)
+    yaw = 0.05 * np.sin(t_s / 3.0)
+    heading = np.append(0.0, np.cumsum(0.025 * (yaw[1:] + yaw[:-1])))
+    rate = speed * np.exp(1j * heading)
+    at = np.append(0.0, np.cumsum(0.025 * (rate[1:] + rate[:-1])))
+    t_ns = np.round(t_s * 1e9).astype(np.int64)
+    truth = Truth(t_ns, np.column_stack([at.real, at.imag, heading]), speed, yaw)
+    scale, offset = (sd * np.cumsum(rng.normal(0.0, 0.05**0.5, len(t_s))) for sd in drift)
+    angle = np.arctan(BASE_M * yaw / speed * (1.0 + understeer * speed**2)) + offset
+    angle += rng.normal(0.0, 0.001, len(t_s))
+    reported = np.column_stack([speed, speed]) / (1.0 + scale)[:, None]
+    fixes = positions(truth, 0.2, rng, lever=False)
+    turn = TurnSignal(t_ns, 15.0 * angle, "steering")
+    return KnownDrive(WheelSamples(t_ns, reported), turn, fixes, (0.0, 0.0))
+
+
+def test_understeer_is_fitted_where_speed_and_turns_change() -> None:
+    car = replace(CAR, steering_ratio=15.0)
+    fit = fit_odometry(steered(1, 0.002, (0.0, 0.0)), car)
+
+    (found,) = (one for one in fit.fitted if one.parameter == "understeer_s2pm2")
+    assert abs(found.value - 0.002) < 3.0 * found.sd < 0.002
+
+
+def test_drift_of_scale_and_offset_is_found_and_is_the_constants() -> None:
+    """Grade and bank: without their drift, the stated s.d. of a part says nothing of the next."""
+    car = replace(CAR, steering_ratio=15.0)
+    found = []
+    for seed in (1, 2, 3):
+        fit = fit_odometry(steered(seed, 0.0, (4e-4, 3e-4)), car)
+        drift = dict(zip(fit.constants.names, fit.constants.drift_var_per_s, strict=True))
+        found.append([drift.pop("wheel_scale"), drift.pop("steering_offset_rad")])
+        assert not any(drift.values())
+    scale, offset = np.exp(np.mean(np.log(found), axis=0) / 2.0)
+
+    assert scale == pytest.approx(4e-4, rel=0.6)
+    assert offset == pytest.approx(15.0 * 3e-4, rel=0.6)
 
 
 def test_least_sd_of_a_position_does_not_hide_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
