@@ -332,17 +332,17 @@ def ellipses(drives: dict[str, KnownDrive], given: OdometrySettings) -> Iterator
     noise, bias = [], []
     for source, fit in found.items():
         sd = dict(zip(fit.constants.names, np.sqrt(np.diagonal(fit.constants.cov)), strict=True))
-        car = fit.settings
-        per_base = speed_mps / (car.wheelbase_m or 1.0)
+        made = fit.settings
+        per_base = speed_mps / (made.wheelbase_m or 1.0)
         one = {
-            "yaw rate": (car.gyro_noise_rad_per_sqrt_s, sd.get("gyro_bias_radps", 0.0)),
+            "yaw rate": (made.gyro_noise_rad_per_sqrt_s, sd.get("gyro_bias_radps", 0.0)),
             "steering": (
-                car.steering_noise_rad_sqrt_m * per_base / math.sqrt(speed_mps),
-                sd.get("steering_offset_rad", 0.0) * per_base / car.steering_ratio,
+                made.steering_noise_rad_sqrt_m * per_base / math.sqrt(speed_mps),
+                sd.get("steering_offset_rad", 0.0) * per_base / made.steering_ratio,
             ),
             "wheels": (
-                car.wheel_turn_rad_per_sqrt_m * math.sqrt(speed_mps),
-                sd.get("right_wheel_scale", 0.0) * speed_mps / car.track_width_m,
+                made.wheel_turn_rad_per_sqrt_m * math.sqrt(speed_mps),
+                sd.get("right_wheel_scale", 0.0) * speed_mps / made.track_width_m,
             ),
         }[source]
         yield f"{source}: noise {one[0]:.2g} rad after 1 s, s.d. of the bias {one[1]:.2g} rad/s"
@@ -363,9 +363,9 @@ def ellipses(drives: dict[str, KnownDrive], given: OdometrySettings) -> Iterator
         ("all sources at best", gyro.car._replace(settings=fused, constants=less)),
         ("gyro without an error of its bias", gyro.car._replace(constants=NO_CONSTANTS)),
     ):
-        made = drive.reckon(gyro.start, car)
-        (xx, xy), (_, yy) = made.cov_m2[-1].tolist()
-        error_m = np.hypot(*(made.xy_m[-1] - drive.fixes.xy_m[-1]))
+        path = drive.reckon(gyro.start, car)
+        (xx, xy), (_, yy) = path.cov_m2[-1].tolist()
+        error_m = np.hypot(*(path.xy_m[-1] - drive.fixes.xy_m[-1]))
         yield f"{name}: 2-sigma ellipse {major_axis_m(xx, xy, yy):.1f} m, error {error_m:.2f} m"
 
 
@@ -384,8 +384,9 @@ def main() -> None:
     args = parser.parse_args()
     found: list[Prediction] = []
     if args.ellipse:
-        segment, truth, car = comma_minute(args.data, args.work)
-        print("\n".join(ellipses(recorded(segment, car, truth), odometry_settings(car))))
+        segment, truth, vehicle = comma_minute(args.data, args.work)
+        drives = recorded(segment, vehicle, truth)
+        print("\n".join(ellipses(drives, odometry_settings(vehicle))))
         return
     if args.data is not None:
         for name, drive, car in real_drives(args.data, args.work):

@@ -156,12 +156,16 @@ class KnownDrive:
         """
         made = self.increments(settings)
         columns = made.distance_m, made.turn_rad, made.distance_var_m2, made.turn_var_rad2
-        summed = [self._between(made, column, delay_s) for column in columns]
-        summed.append(wander_m_per_sqrt_s**2 * self.dt_s)
+        summed = (self._between(made, column, delay_s) for column in columns)
+        wander_var_m2 = wander_m_per_sqrt_s**2 * self.dt_s
         by = effects(made, settings, names)
         between = [self._between(made, column, delay_s) for column in by.reshape(len(by), -1).T]
         arcs = np.array(between).reshape(2, len(names), len(self.knots_s)).transpose(2, 0, 1)
-        return Steps(self.at_fix, *summed, arcs, np.outer(self.dt_s, drift_var_per_s))
+        drift_var = np.outer(self.dt_s, drift_var_per_s)
+        way_m, turn_rad, way_var_m2, turn_var_rad2 = summed
+        return Steps(
+            self.at_fix, way_m, turn_rad, way_var_m2, turn_var_rad2, wander_var_m2, arcs, drift_var
+        )
 
     def _between(self, made: Increments, column: Floats, delay_s: float) -> Floats:
         """Sum a column of increments over each arc."""
