@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from crosscue.localization.angles import wrap, wrap_all
-from crosscue.localization.ekf import PoseBelief, coast, odometry_derivatives, pack_belief
+from crosscue.localization.ekf import (
+    PoseBelief,
+    coast,
+    odometry_derivatives,
+    pack_belief,
+    update_point,
+)
 from crosscue.localization.pose_filter import arc, major_axis_m, update_position
 from crosscue.replay.columns import Floats
 from support.beliefs import driven, with_heading, with_position, with_speed
@@ -299,6 +305,8 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: PoseBelief(9, np.full(4, np.nan), np.eye(4)), "belief at 9 ns: expected finite"),
     (lambda: PoseBelief(9, np.zeros(4), np.full((4, 4), np.inf)), "belief at 9 ns: expected finit"),
     (lambda: PoseBelief(0, np.zeros(4), -np.eye(4)), "cov: expected variances >= 0, got"),
+    (lambda: update_point(belief(), np.array([math.nan, 0.0]), np.eye(2)), "belief at 1000 ns: ex"),
+    (lambda: update_point(belief(), np.zeros(2), np.full((2, 2), math.nan)), "belief at 1000 ns: "),
 ]
 
 

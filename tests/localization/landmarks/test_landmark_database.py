@@ -6,6 +6,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +116,21 @@ def test_invalid_covariance_is_refused(cov: list[list[float]], message: str) -> 
         LandmarkPosition("bad", np.zeros(2), np.array(cov))
 
 
+@pytest.mark.parametrize(
+    ("change", "message"), [("x_m = 9e999", "finite"), ("var_x_m2 = -1.0", "positive definite")]
+)
+def test_landmark_in_the_file_that_no_update_can_use_is_damage(
+    grid: Path, tmp_path: Path, change: str, message: str
+) -> None:
+    copy = tmp_path / "damaged.db"
+    copy.write_bytes(grid.read_bytes())
+    with closing(sqlite3.connect(copy)) as sql, sql:
+        sql.execute(f"UPDATE landmark SET {change} WHERE id = 1")  # noqa: S608
+
+    with LandmarkDatabase(copy) as database, pytest.raises(LogFormatError, match=message):
+        list(database)
+
+
 @pytest.mark.parametrize("fraction", [0.5, 0.02, 0.99])
 def test_truncated_file_is_refused_and_unchanged(
     grid: Path, tmp_path: Path, fraction: float
@@ -190,6 +206,7 @@ def test_second_concurrent_writer_is_refused(
 
 WRITE_MANY = """
 import os, sys
+from contextlib import closing
 from pathlib import Path
 from crosscue.localization.landmarks.database import LandmarkWriter
 from support.landmark_files import place_at, some_features
