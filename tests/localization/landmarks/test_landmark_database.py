@@ -125,7 +125,7 @@ def test_landmark_in_the_file_that_no_update_can_use_is_damage(
     copy = tmp_path / "damaged.db"
     copy.write_bytes(grid.read_bytes())
     with closing(sqlite3.connect(copy)) as sql, sql:
-        sql.execute(f"UPDATE landmark SET {change} WHERE id = 1")  # noqa: S608
+        sql.execute(f"UPDATE landmark SET {change} WHERE id = 1")
 
     with LandmarkDatabase(copy) as database, pytest.raises(LogFormatError, match=message):
         list(database)
