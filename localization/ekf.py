@@ -80,7 +80,12 @@ def update_point(
         cov_m2: Shape (2, 2), positive definite.
         lever_m: The point, ahead of and to the left of the rear axle.
         gate_nis: NIS above which the position is rejected; None accepts everything.
+
+    Raises:
+        ValueError: A number is not finite.
     """
+    if not (np.isfinite(xy_m).all() and np.isfinite(cov_m2).all()):
+        raise ValueError(f"position: expected finite numbers, got {xy_m}, {cov_m2}")
     (x_m, y_m), ((xx, xy), (_, yy)) = xy_m.tolist(), cov_m2.tolist()
     ahead_m, left_m = lever_m
     gate = math.inf if gate_nis is None else gate_nis

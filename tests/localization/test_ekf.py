@@ -305,8 +305,11 @@ REFUSALS: list[tuple[Callable[[], object], str]] = [
     (lambda: PoseBelief(9, np.full(4, np.nan), np.eye(4)), "belief at 9 ns: expected finite"),
     (lambda: PoseBelief(9, np.zeros(4), np.full((4, 4), np.inf)), "belief at 9 ns: expected finit"),
     (lambda: PoseBelief(0, np.zeros(4), -np.eye(4)), "cov: expected variances >= 0, got"),
-    (lambda: update_point(belief(), np.array([math.nan, 0.0]), np.eye(2)), "belief at 1000 ns: ex"),
-    (lambda: update_point(belief(), np.zeros(2), np.full((2, 2), math.nan)), "belief at 1000 ns: "),
+    (
+        lambda: update_point(belief(), np.array([math.nan, 0.0]), np.eye(2)),
+        "position: expected fin",
+    ),
+    (lambda: update_point(belief(), np.zeros(2), np.full((2, 2), math.nan)), "position: expected"),
 ]
 
 
