@@ -3,7 +3,9 @@
 Each frame's road mask is projected to level ground with the camera's height and attitude. A cell
 holds the weighted mean of its views: nearer views weigh more, by the inverse square of the
 distance, because one row of the mask then covers less ground. Cells behind vehicles are not seen
-in that frame. The grid is fixed to the ground and moves on in whole cells.
+in that frame. What stands beside the road hides the ground behind it, so a view past its edge says
+little: there is no road on the wall of a house, but perhaps in the side street behind. The grid is
+fixed to the ground and moves on in whole cells.
 """
 
 from __future__ import annotations
@@ -35,8 +37,13 @@ REACH_M: Final = 50.0
 SHARP_M: Final = 10.0
 # Margin around vehicles, as a fraction of the box, behind which the ground counts as hidden.
 MARGIN: Final = 0.05
-# What a pixel of a mask shows.
-HIDDEN, SHOWS_GROUND, SHOWS_ROAD = 0, 1, 2
+# Ground beyond an edge of the road that is seen with it, such as a kerb and a footway, and the
+# weight of views of no road further behind it.
+BESIDE_M: Final = 2.0
+BEHIND: Final = 0.1
+# What a pixel of a mask shows, and its weight.
+HIDDEN, SHOWS_GROUND, SHOWS_ROAD, SHOWS_BEHIND = 0, 1, 2, 3
+WEIGHTS: Final = np.array([0.0, 1.0, 1.0, BEHIND], np.float32)
 
 
 def reach_of(camera: Mounted, road: RoadMask) -> float:
@@ -130,10 +137,14 @@ class RoadArea:
         x = sums(*left) * (across * scale) + (plane.center_px[0] * across + 1.0)
         y = sums(*up) * (down * scale) + (plane.center_px[1] * down + 1.0)
         x, y = np.clip(x, 0.0, mask_width + 1.0), np.clip(y, 0.0, mask_height + 1.0)
-        shown = _shown(road.pixels(), boxes_px * [across, down, across, down])
+        rows_px = (np.arange(mask_height) + 0.5) / down - plane.center_px[1]
+        below = plane.focal_px * math.sin(pitch_rad) + rows_px * math.cos(pitch_rad)
+        above_px = plane.focal_px * math.cos(pitch_rad) - rows_px * math.sin(pitch_rad)
+        away_m = camera.z_m * above_px / np.maximum(below, 1e-3)
+        shown = _shown(road.pixels(), boxes_px * [across, down, across, down], away_m)
         found = shown.take(x.astype(np.int32) * (mask_height + 2) + y.astype(np.int32))
         weight = SHARP_M**2 / np.maximum(ahead_m**2 + left_m**2, SHARP_M**2)
-        weight *= in_reach & (found > HIDDEN)
+        weight *= in_reach * WEIGHTS[found]
         self._road[rows, columns] += weight * (found == SHOWS_ROAD)
         self._seen[rows, columns] += weight
 
@@ -175,15 +186,25 @@ def _index(at_m: Floats) -> NDArray[np.int32]:
     return np.clip((at_m + HALF_M) / CELL_M, 0, CELLS - 1).astype(np.int32)
 
 
-def _shown(is_road: NDArray[np.bool_], boxes_px: Floats) -> NDArray[np.uint8]:
-    """Ground, road and what vehicles hide: columns of the mask, with a border of one pixel."""
+def _shown(is_road: NDArray[np.bool_], boxes_px: Floats, away_m: Floats) -> NDArray[np.uint8]:
+    """What pixels show: columns of the mask, with a border of one pixel.
+
+    Args:
+        is_road: The mask.
+        boxes_px: Shape (N, 4): boxes of vehicles in its pixels.
+        away_m: Distance of level ground by row.
+    """
     height, width = is_road.shape
     framed = np.zeros((width + 2, height + 2), np.uint8)
     shown = framed[1:-1, 1:-1].T
     np.add(is_road, np.uint8(SHOWS_GROUND), out=shown)
+    # Lower end of each pixel's run without road, which goes up to the pixel.
+    next_road = np.where(is_road, np.arange(height)[:, None], height)[::-1]
+    edges = np.minimum.accumulate(next_road, axis=0)[::-1] - 1
+    shown[~is_road & (away_m[:, None] - away_m[edges] > BESIDE_M)] = SHOWS_BEHIND
     margin = MARGIN * (boxes_px[:, 2:] - boxes_px[:, :2])
-    edges = boxes_px + np.column_stack([-margin[:, 0], 0.0 * margin[:, 0], margin])
-    for x0, y0, x1, y1 in np.maximum(np.rint(edges), 0).astype(int).tolist():
+    widened = boxes_px + np.column_stack([-margin[:, 0], 0.0 * margin[:, 0], margin])
+    for x0, y0, x1, y1 in np.maximum(np.rint(widened), 0).astype(int).tolist():
         shown[y0:y1, x0:x1] = HIDDEN
     return framed
 

@@ -33,8 +33,17 @@ class Pose(NamedTuple):
     heading_rad: float = 0.0
 
 
-def mask(ground: Ground, pose: Pose, pitch_rad: float = 0.0, flipped: float = 0.0) -> RoadMask:
-    """What a perfect network sees of the ground, with a share of pixels flipped."""
+def mask(
+    ground: Ground,
+    pose: Pose,
+    pitch_rad: float = 0.0,
+    flipped: float = 0.0,
+    wall_m: float = math.inf,
+) -> RoadMask:
+    """What a perfect network sees of the ground, with a share of pixels flipped.
+
+    Houses stand ``wall_m`` to the left of the road, but not from 40 to 46 m.
+    """
     width, height = MASK_PX
     u, v = np.meshgrid((np.arange(width) + 0.5) * 2.0, (np.arange(height) + 0.5) * 2.0)
     right, down = (u - 620.0) / 707.0, (v - 183.0) / 707.0
@@ -47,6 +56,9 @@ def mask(ground: Ground, pose: Pose, pitch_rad: float = 0.0, flipped: float = 0.
     cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
     at_x, at_y = pose.x_m + x * cos - y * sin, pose.y_m + x * sin + y * cos
     is_road = np.isfinite(at_x) & ground(np.nan_to_num(at_x), np.nan_to_num(at_y))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        meets_m = pose.x_m + 1.0 + (at_x - pose.x_m - 1.0) * (wall_m - pose.y_m) / (at_y - pose.y_m)
+    is_road &= ~(at_y > wall_m) | ((meets_m > 40.0) & (meets_m < 46.0))
     is_road ^= np.random.default_rng(7).random(is_road.shape) < flipped
     return RoadMask(0, SIZE_PX, rle.encode_mask(is_road, (0, 0), MASK_PX), MASK_PX)
 
@@ -59,6 +71,7 @@ def driven(
     flipped: float = 0.0,
     boxes_px: Floats = NO_BOXES,
     turn_rad: float = 0.0,
+    wall_m: float = math.inf,
 ) -> list[Seen]:
     """Results of a drive in steps of one metre."""
     first = mask(ground, Pose(0.0))
@@ -73,7 +86,7 @@ def driven(
                 pose.heading_rad + turn_rad,
             )
             area.move(STEP_M, turn_rad)
-        area.see(mask(ground, pose, pitch_rad, flipped), boxes_px, pitch_rad)
+        area.see(mask(ground, pose, pitch_rad, flipped, wall_m), boxes_px, pitch_rad)
         found.append(openings(area.plan(), STEP_M if i else 0.0, turn_rad if i else 0.0))
     return found
 
@@ -217,3 +230,21 @@ def test_reach_grows_with_height_and_focal_length_and_is_none_without_one() -> N
     assert reach_of(CAMERA, seen) == pytest.approx(math.sqrt(1.5 * 1.65 * 353.5))
     assert reach_of(Camera(focal_px=5000.0, z_m=3.0), seen) == 50.0
     assert reach_of(Camera(), seen) == 0.0
+
+
+def between_houses(x: Floats, y: Floats) -> NDArray[np.bool_]:
+    """A street 6 m wide to the left, from 40 m on."""
+    return straight(x, y) | ((x > 40.0) & (x < 46.0) & (y > 0.0))
+
+
+@pytest.mark.parametrize(("wall_m", "least_m"), [(6.5, 7.0), (7.5, 13.0)])
+def test_street_between_houses_is_seen_as_soon_as_its_ground_is(
+    wall_m: float, least_m: float
+) -> None:
+    """From afar, a house hides the street behind it, which is no view of a missing street."""
+    found = driven(between_houses, 36, wall_m=wall_m)
+
+    first = next(i for i, one in enumerate(found) if one.legs.left == 1.0)
+    assert 40.0 - first > least_m
+    assert found[first].start_m == pytest.approx(40.0 - first, abs=2.5)
+    assert not any(one.openings for one in driven(straight, 36, wall_m=wall_m))
