@@ -13,8 +13,9 @@ The dissertation scores one approach per run, but a drive has many. The life of 
 
 Only signs with a range and cues with ``can_start`` keep evidence fresh, because road straight
 ahead is seen everywhere. Staleness depends on distance, not on time, so the approach of a car that
-waits at the stop line remains open. While it stands, only cues of moving objects are evidence; only
-the published belief (``source``) counts every frame. Without odometry, the distance is estimated
+waits at the stop line remains open. While it stands, a static cue is evidence only until it was
+seen there once: a light may come into view, but looking on tells nothing more. Only the published
+belief (``source``) counts every frame. Without odometry, the distance is estimated
 with ``RangeFilter.unseen_mps``, which also widens the ranges; a range that is too wide is dropped.
 Only the published belief lets this distance end an approach whose evidence is still in view.
 """
@@ -111,7 +112,7 @@ class _Moved(NamedTuple):
 
     Attributes:
         advanced_m: Signed distance, negative in reverse.
-        is_standing: True if only cues of moving objects count.
+        is_standing: True if only moving objects count, and static ones not yet seen there.
     """
 
     way_m: float
@@ -160,6 +161,8 @@ class Approaches:
         self._since_static_m = math.inf
         self._static = frozenset(cue.name for cue in graph.cues if not cue.moves)
         self._is_published = fusion.kind in ("source", None)
+        # Static cues that count no more until the car moves on.
+        self._seen_here: set[str] = set()
 
     def __call__(self, evidence: FrameEvidence, past: PastCues = no_past_cues) -> Step:
         """Process the next evidence; it is ignored if it is not later than the previous one."""
@@ -184,13 +187,18 @@ class Approaches:
         is_standing = self._since_static_m < STANDING_M and not self._is_published
         if not is_standing:
             self._since_static_m = 0.0
+            self._seen_here.clear()
         return moved._replace(is_standing=is_standing)
 
     def _without_static(self, counts: Mapping[str, int], moved: _Moved) -> Mapping[str, int]:
-        """Counts that are evidence: those of moving objects only, while the car stands."""
+        """Counts that are evidence: while the car stands, of moving objects and of what is new.
+
+        The filter over a drive judges static cues by steps of distance only.
+        """
         if not moved.is_standing:
             return counts
-        return {cue: count for cue, count in counts.items() if cue not in self._static}
+        known = self._seen_here if self._over_drive is None else self._static
+        return {cue: count for cue, count in counts.items() if cue not in self._static & known}
 
     def _judged(self, evidence: FrameEvidence, past: PastCues, moved: _Moved) -> Step:
         """Update the belief with what counts as evidence."""
@@ -224,6 +232,7 @@ class Approaches:
         self._rest_m = 0.0
         self._since_range_m = math.inf
         self._since_static_m = math.inf
+        self._seen_here.clear()
 
     def finish(self) -> None:
         """End the drive; an open approach is counted as closed by it."""
@@ -233,8 +242,11 @@ class Approaches:
     def _confirmed(self, counts: Mapping[str, int], is_new_picture: bool) -> Confirmed:
         """Counts that can be used: all, or the confirmed ones with persistence."""
         if self._persistence is None:
-            return Confirmed(counts, {})
-        return self._persistence(counts, is_new_picture=is_new_picture)
+            confirmed = Confirmed(counts, {})
+        else:
+            confirmed = self._persistence(counts, is_new_picture=is_new_picture)
+        self._seen_here.update(cue for cue, count in confirmed.counts.items() if count > 0)
+        return confirmed
 
     def _count_silent(self, silent: Mapping[str, str]) -> None:
         self.counts.update(f"{cue} not believed: {why}" for cue, why in silent.items())

@@ -23,7 +23,7 @@ class Situation:
         advanced_m: As ``moved_m``, but negative in reverse.
         advanced_var_m2: Variance of ``advanced_m``.
         ranges: Ranges to the intersection's start measured in this frame, with their variances.
-        is_standing: True if the car stands, so that ``counts`` has cues of moving objects only.
+        is_standing: True if the car stands; ``counts`` then lacks static cues already seen there.
     """
 
     counts: Mapping[str, int]
