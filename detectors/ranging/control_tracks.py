@@ -125,7 +125,10 @@ class ControlTracks:
         )
         for (k, i), track in zip(rows, tracks.of_boxes, strict=True):
             if track is not None:
-                track.looks.update(found[k].looks[i : i + 1])
+                x0, y0, x1, y1 = found[k].boxes_px[i].tolist()
+                for look in found[k].looks[i : i + 1]:
+                    # Twice the size shows four times as much.
+                    track.looks[look] += round((x1 - x0) * (y1 - y0))
                 decisions[k][i] = _other_sign(track) or (
                     ACCEPTED if track.is_accepted else TOO_LITTLE_EVIDENCE
                 )
@@ -159,7 +162,7 @@ def _log_odds(score: float) -> float:
 
 
 def _other_sign(track: ObjectTrack) -> str | None:
-    """Return which other sign a track is, if more of its boxes look like others than like it."""
+    """Return which other sign a track is, if its boxes look more like others than like it."""
     others = {look: n for look, n in track.looks.items() if look in OTHER_SIGNS}
     if sum(others.values()) <= track.looks["stop"]:
         return None

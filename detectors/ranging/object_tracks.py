@@ -141,7 +141,7 @@ class ObjectTrack:
         hits: Number of frames with an observation and a new picture.
         is_accepted: True once the evidence was sufficient, until it is against an object.
         is_way_unknown: True if the distance travelled to the newest frame is unknown.
-        looks: Number of boxes by the result of the second look at them.
+        looks: Area of the boxes, in pixels, by the result of the second look at them.
         aspect: Height over width, as the median of its newest boxes.
     """
 

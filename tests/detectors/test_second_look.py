@@ -31,6 +31,10 @@ def sign(kind: str) -> Bytes:
     if kind == "no entry":
         cv2.circle(picture, (120, 120), 116, RED, -1)
         cv2.rectangle(picture, (28, 100), (212, 140), WHITE, -1)
+    if kind == "red detour":
+        cv2.rectangle(picture, (10, 10), (230, 230), (10, 40, 230), -1)
+        for x in (28, 78, 128, 178):
+            cv2.rectangle(picture, (x, 82), (x + 34, 158), (20, 20, 60), 11)
     if kind in ("detour", "signal ahead"):
         cv2.fillPoly(picture, [diamond], ORANGE if kind == "detour" else YELLOW)
         cv2.rectangle(picture, (95, 80), (145, 160), (20, 20, 20), 8)
@@ -54,6 +58,8 @@ def seen(kind: str, side_px: int, light: float = 1.0) -> tuple[Bytes, NDArray[np
         ("stop", "stop"),
         ("no entry", "bar"),
         ("detour", "orange"),
+        # Sunlit, the orange of a work-zone sign is red: only its letters tell.
+        ("red detour", "plain"),
         ("signal ahead", "yellow"),
         ("back", "pale"),
     ],

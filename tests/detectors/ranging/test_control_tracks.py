@@ -19,6 +19,7 @@ STEP = CarStep(None, 0.0, 0.0, 0.1)
 # Place (x, y), score, and what the pixels show.
 Seen = tuple[float, float, float, str]
 LIGHT, SIGN = "traffic light", "stop sign"
+CORNERS = np.array([[-1.0, -1.0, 1.0, 1.0]])
 
 
 def car(text: str = "") -> Vehicle:
@@ -187,6 +188,7 @@ def test_dark_housing_needs_more_frames_than_a_lit_one() -> None:
         ("orange", "looks like another sign: orange"),
         ("yellow", "looks like another sign: yellow"),
         ("pale", "looks like another sign: not red"),
+        ("plain", "looks like another sign: no white letters"),
     ],
 )
 def test_sign_that_looks_like_another_one_is_rejected_with_the_reason(look: str, why: str) -> None:
@@ -197,6 +199,19 @@ def test_sign_that_looks_like_another_one_is_rejected_with_the_reason(look: str,
     assert decided([[one] for one in mostly], SIGN)[-1] == (why,)
     assert decided([[(600.0, 140.0, 0.95, "stop")]] * 4, SIGN)[-1] == (ACCEPTED,)
     assert decided([[(600.0, 140.0, 0.95, "unknown")]] * 4, SIGN)[-1] == (ACCEPTED,)
+
+
+def test_near_look_at_a_sign_counts_more_than_far_ones() -> None:
+    """At night, letters of 8 px run together to a bar; nearer, they are letters."""
+    tracks, said = ControlTracks(car()), list[str]()
+    for i in range(16):
+        side_px = 24.0 * 1.06**i
+        one = frame([(600.0, 140.0, 0.9, "bar" if i < 9 else "stop")], SIGN)
+        boxes_px = np.array([[600.0, 140.0, 600.0, 140.0]]) + 0.5 * side_px * CORNERS
+        said += tracks([replace(one, boxes_px=boxes_px)], STEP)[0].decisions
+
+    assert said[8] == "looks like another sign: a white bar"
+    assert said[-1] == ACCEPTED
 
 
 def test_cue_counts_accepted_tracks_and_the_rest_is_accounted_for() -> None:
