@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import Floats
 
-from .road_area import CELL_M, RoadPlan
+from .road_area import CELL_M, NEAREST_M, RoadPlan
 
 # Fraction of the views above which a cell is road.
 ROAD: Final = 0.5
@@ -125,9 +125,12 @@ class RoadOpenings:
 
     Attributes:
         height_m: Height of the camera above the ground.
+        nearest_m: Distance of the nearest ground in view ahead of the rear axle. An opening must
+            begin with enough of it in view; beside the car, edges are only estimated anew.
     """
 
     height_m: float
+    nearest_m: float = NEAREST_M
     _candidates: list[_Candidate] = field(default_factory=list)
     _rests_m: float = 0.0
 
@@ -186,7 +189,7 @@ class RoadOpenings:
                 )
                 nearest.hits += nearest.missed > 0
                 nearest.missed = 0
-            else:
+            elif opening.end_m - max(opening.start_m, self.nearest_m) >= LENGTH_M[0]:
                 self._candidates.append(_Candidate(opening))
         self._candidates = [
             one

@@ -9,7 +9,7 @@ from typing import Final
 
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.observed import NOT_SEEN, FrameDetections, RoadFractions
-from crosscue.detectors.cues.road_area import RoadArea, RoadPlan, reach_of
+from crosscue.detectors.cues.road_area import NEAREST_M, RoadArea, RoadPlan, reach_of
 from crosscue.detectors.cues.road_openings import RoadOpenings, Seen
 from crosscue.eval.pipeline.visual import MOVING, TABLE, moving_boxes
 from crosscue.eval.runs.tables.parquet import TableFolder
@@ -40,7 +40,8 @@ class Roads:
     _pitch_rad: float = field(init=False)
 
     def __post_init__(self) -> None:
-        self._openings = RoadOpenings(self.vehicle.camera.z_m)
+        camera = self.vehicle.camera
+        self._openings = RoadOpenings(camera.z_m, NEAREST_M + camera.x_m)
         self._pitch_rad = next(iter(self.pitches_rad.values()), self.vehicle.camera.pitch_rad)
 
     def __call__(self, frame: FrameDetections, evidence: FrameEvidence) -> RoadFractions | None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
-from crosscue.detectors.cues.road_area import CELL_M, RoadArea, reach_of
+from crosscue.detectors.cues.road_area import CELL_M, RoadArea, RoadPlan, reach_of
 from crosscue.detectors.cues.road_openings import Legs, RoadOpenings, Seen
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.camera import Camera
@@ -248,3 +248,17 @@ def test_street_between_houses_is_seen_as_soon_as_its_ground_is(
     assert 40.0 - first > least_m
     assert found[first].start_m == pytest.approx(40.0 - first, abs=2.5)
     assert not any(one.openings for one in driven(straight, 36, wall_m=wall_m))
+
+
+@pytest.mark.parametrize(("start_m", "is_found"), [(-2.0, False), (-0.5, False), (2.0, True)])
+def test_opening_begins_with_ground_in_view(start_m: float, is_found: bool) -> None:
+    """What looks like one only beside the car, behind the ground in view, is an edge's estimate."""
+    ahead_m, left_m = np.arange(-10.0, 36.0, CELL_M), np.arange(25.0, -25.0, -CELL_M)
+    x, y = np.meshgrid(ahead_m, left_m, indexing="ij")
+    is_open = (x > start_m) & (x < start_m + 7.5) & (y > 0.0) & (y < 12.0)
+    plan = RoadPlan(ahead_m, left_m, ((np.abs(y) < 3.0) | is_open).astype(np.float64))
+    openings = RoadOpenings(CAMERA.z_m, nearest_m=5.0)
+
+    found = [openings(plan, 0.0) for _ in range(3)][-1]
+
+    assert bool(found.openings) == is_found
