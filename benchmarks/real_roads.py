@@ -1,8 +1,13 @@
-"""Scoreboard of real drives: one line each for lights, legs, first distance, pieces and ranges.
+"""Scoreboard of real drives: one line each for lights, stop signs, legs, pieces and ranges.
 
 Run it as ``python benchmarks/real_roads.py OUT [DRIVE ...]``; without names it replays every drive
 of ``$CROSSCUE_DATA`` (or ``../shared/data``), pictures alone unless the name says otherwise.
 Detections are cached in OUT. Drives marked ``*`` were used in development and prove nothing.
+
+``real_roads.json`` has drives of public repositories that are not in ``$CROSSCUE_DATA``: put the
+file of ``source`` to ``sequences/`` + ``pictures`` there, or the drive is left out. Its annotations
+were made by eye and frozen before the first run. Frames of cues and approaches are inclusive, of
+the pictures that ``cut`` takes (first, last, step); null is uncertain and not scored.
 
 A leg counts by the highest belief within the annotated frames: above 0.9 it is believed, and wrong
 where there is none. At its prior it is not seen; below, a missing leg is right. Anything else is
@@ -17,12 +22,14 @@ import os
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.detectors.catalog.fetch import fetch_weights
 from crosscue.eval.drives.replay import replay_drive
@@ -30,6 +37,9 @@ from crosscue.eval.pipeline.run import Run
 from crosscue.replay.columns import Floats
 
 DATA: Final = Path(os.environ.get("CROSSCUE_DATA", "../shared/data"))
+# Frames between those whose cues are scored.
+EVERY: Final = 5
+CUES: Final = ("traffic_light", "stop_sign")
 FEATURES: Final = ("left", "right", "straight")
 BELIEVED: Final = 0.9
 DETECTORS: Final = """
@@ -62,7 +72,7 @@ class Drive:
 
     Attributes:
         folder: Folder below ``sequences``.
-        pictures: Pattern of its pictures; ``*.mp4`` for a video of which every second is used.
+        pictures: Pattern of its pictures, or of a video.
         rate_hz: Rate of the pictures.
         camera: Lines of ``[camera]``; empty where nothing is known.
         approaches: Approaches; empty to read ``annotation.json``.
@@ -70,6 +80,9 @@ class Drive:
         travelled: Distance of each picture along the true track of the camera.
         is_development: True if it was used in development.
         has_odometry: True to replay the folder itself, with its odometry.
+        cut: First, last and step of the pictures that are used.
+        rows: First row and row behind the last; None for all.
+        in_view: Ranges of frames of each cue, and whether it is in view.
     """
 
     folder: str
@@ -81,6 +94,9 @@ class Drive:
     travelled: Callable[[Path], Floats] | None = None
     is_development: bool = True
     has_odometry: bool = False
+    cut: tuple[int, int, int] = (0, 10**6, 1)
+    rows: tuple[int, int] | None = None
+    in_view: Mapping[str, Sequence[tuple[int, int, bool | None]]] = field(default_factory=dict)
 
 
 def kitti_travelled(folder: Path) -> Floats:
@@ -101,6 +117,32 @@ def _along(xyz_m: Floats) -> Floats:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
+def recorded_drives() -> Iterator[tuple[str, Drive]]:
+    """Yield the drives of ``real_roads.json``."""
+    tree = json.loads(Path(__file__).with_suffix(".json").read_text())
+    for name, one in tree.items():
+        folder, pictures = one["pictures"].split("/")
+        yield (
+            name,
+            Drive(
+                folder,
+                pictures,
+                one["rate_hz"],
+                _KITTI_0926 if one.get("is_kitti") else "",
+                tuple(
+                    Approach(first, last, approach["features"])
+                    for approach in one["approaches"]
+                    for first, last in (approach["frames"],)
+                ),
+                is_development=one["is_development"],
+                cut=tuple(one["cut"]),
+                rows=tuple(one["rows"]) if "rows" in one else None,
+                in_view={cue: one[cue] for cue in CUES},
+            ),
+        )
+
+
+_KITTI_0926: Final = f"focal_px = 721.5\ncenter_px = [609.6, 172.9]\n{KITTI}"
 _PANDASET: Final = Drive(
     "pandaset_002",
     "camera/front_camera/*.jpg",
@@ -135,10 +177,10 @@ DRIVES: Final[dict[str, Drive]] = {
         "kitti_red_light_queue",
         "*.jpg",
         10.0,
-        f"focal_px = 721.5\ncenter_px = [609.6, 172.9]\n{KITTI}",
+        _KITTI_0926,
     ),
     "camvid_0016e5_light": Drive("camvid_0016e5_light", "*.jpg", 15.0),
-    "highway_straight": Drive("highway_straight", "*.mp4", 12.5),
+    "highway_straight": Drive("highway_straight", "*.mp4", 12.5, cut=(0, 10**6, 2)),
     "us_dashcam": Drive(
         "us_signalized_intersection_dashcam",
         "*.jpg",
@@ -147,6 +189,7 @@ DRIVES: Final[dict[str, Drive]] = {
             Approach(0, 110, {"intersection": True, "left": None, "right": True, "straight": True}),
         ),
     ),
+    **dict(recorded_drives()),
 }
 
 
@@ -154,13 +197,24 @@ DRIVES: Final[dict[str, Drive]] = {
 class Score:
     """Counts of one drive."""
 
-    lights: Counter[str] = field(default_factory=Counter)
+    cues: dict[str, Counter[str]] = field(default_factory=dict)
     legs: dict[str, str] = field(default_factory=dict)
     first: str = "-"
     pieces: int = 0
     false_intersections: int = 0
     ranges: tuple[int, int] = (0, 0)
     minutes: float = 0.0
+
+
+def pictures_of(source: Path, pattern: str) -> Iterator[Path | NDArray[np.uint8]]:
+    """Yield the pictures of a folder, or of the video there."""
+    for path in sorted(source.glob(pattern)):
+        if path.suffix in (".png", ".jpg"):
+            yield path
+        elif path.suffix in (".mp4", ".gif"):
+            video = cv2.VideoCapture(str(path))
+            while (read := video.read())[0]:
+                yield np.asarray(read[1], np.uint8)
 
 
 def log_of(name: str, drive: Drive, out: Path) -> Path:
@@ -172,17 +226,14 @@ def log_of(name: str, drive: Drive, out: Path) -> Path:
     if folder.is_dir():
         return folder
     folder.mkdir(parents=True)
-    if drive.pictures == "*.mp4":
-        import cv2
-
-        video, number = cv2.VideoCapture(str(next(source.glob(drive.pictures)))), 0
-        while (read := video.read())[0]:
-            if number % 2 == 0:
-                cv2.imwrite(str(folder / f"{number:04}.png"), read[1])
-            number += 1
-    for path in sorted(source.glob(drive.pictures)) if drive.pictures != "*.mp4" else ():
-        if path.suffix in (".png", ".jpg"):
-            shutil.copy(path, folder)
+    first, last, step = drive.cut
+    for number, picture in enumerate(pictures_of(source, drive.pictures)):
+        if first <= number <= last and (number - first) % step == 0:
+            if isinstance(picture, Path):
+                shutil.copy(picture, folder)
+            else:
+                rows = slice(*(drive.rows or (None,)))
+                cv2.imwrite(str(folder / f"{number:04}.png"), picture[rows])
     folder.joinpath("timestamps.txt").write_text(f"rate_hz: {drive.rate_hz}\n")
     return folder
 
@@ -202,31 +253,41 @@ def replayed(name: str, drive: Drive, out: Path) -> Run:
     )
 
 
-def annotated(drive: Drive) -> tuple[tuple[Approach, ...], dict[int, bool]]:
-    """Return the approaches, and by frame whether a light is in view where that is certain."""
+def annotated(drive: Drive) -> tuple[tuple[Approach, ...], list[tuple[int, str, bool]]]:
+    """Return the approaches, and of frames whether a cue is in view where that is certain."""
     file = DATA / "sequences" / drive.folder / "annotation.json"
     if not file.is_file():
-        return drive.approaches, {}
+        return drive.approaches, [
+            (frame, cue, is_there)
+            for cue, ranges in drive.in_view.items()
+            for first, last, is_there in ranges
+            for frame in range(-(-first // EVERY) * EVERY, last + 1, EVERY)
+            if is_there is not None
+        ]
     tree = json.loads(file.read_text())
     approaches = tuple(
         Approach(one["frames"][0], one["frames"][1], one["features"]) for one in tree["approaches"]
     )
-    lights = {one["frame"]: one["cues"]["traffic_light"] for one in tree["frames"]}
-    return approaches, {frame: seen for frame, seen in lights.items() if seen is not None}
+    return approaches, [
+        (one["frame"], cue, one["cues"][cue])
+        for one in tree["frames"]
+        for cue in CUES
+        if one["cues"][cue] is not None
+    ]
 
 
 def scored(run: Run, drive: Drive) -> Score:
     """Score one run."""
-    approaches, lights = annotated(drive)
+    approaches, in_view = annotated(drive)
     times = np.sort(run["frames"]["t_ns"].to_numpy())
     score = Score(minutes=float(times[-1] - times[0]) / 60e9)
-    cues = run["cues"].to_pylist()
-    found = {row["t_ns"]: row["count"] > 0 for row in cues if row["cue"] == "traffic_light"}
-    for frame, is_there in lights.items():
-        if frame < len(times) and times[frame] in found:
-            score.lights[
-                "right" if found[times[frame]] == is_there else "missed" if is_there else "false"
-            ] += 1
+    found = {(row["t_ns"], row["cue"]): row["count"] > 0 for row in run["cues"].to_pylist()}
+    score.cues = {cue: Counter() for cue in CUES}
+    for frame, cue, is_there in in_view:
+        is_found = found.get((times[frame], cue)) if frame < len(times) else None
+        if is_found is not None:
+            kind = "right" if is_found == is_there else "missed" if is_there else "false"
+            score.cues[cue][kind] += 1
     beliefs = run["belief"].to_pylist()
     frame_of = {int(t_ns): i for i, t_ns in enumerate(times)}
     believed: dict[int, list[int]] = {}
@@ -237,9 +298,9 @@ def scored(run: Run, drive: Drive) -> Score:
     if drive.travelled is not None:
         travelled = drive.travelled(DATA / "sequences" / drive.folder)
     claimed: set[int] = set()
-    for approach in approaches:
+    for number, approach in enumerate(approaches, 1):
         rows = [r for r in beliefs if approach.first <= frame_of[r["t_ns"]] <= approach.last]
-        _legs(score, approach, rows)
+        _legs(score, approach, rows, f"{number} " if len(approaches) > 1 else "")
         ours = {
             number
             for number, frames in believed.items()
@@ -260,7 +321,9 @@ def scored(run: Run, drive: Drive) -> Score:
     return score
 
 
-def _legs(score: Score, approach: Approach, rows: Sequence[Mapping[str, float]]) -> None:
+def _legs(
+    score: Score, approach: Approach, rows: Sequence[Mapping[str, float]], prefix: str
+) -> None:
     for name in FEATURES:
         truth = approach.features.get(name)
         if truth is None:
@@ -268,13 +331,13 @@ def _legs(score: Score, approach: Approach, rows: Sequence[Mapping[str, float]])
         best = max((row[name] for row in rows), default=0.5)
         is_seen = any(row[name] != 0.5 for row in rows)
         if best > BELIEVED:
-            score.legs[name] = "right" if truth else "WRONG"
+            score.legs[prefix + name] = "right" if truth else "WRONG"
         elif not is_seen:
-            score.legs[name] = "not seen"
+            score.legs[prefix + name] = "not seen"
         elif not truth and rows[-1][name] < 0.5:
-            score.legs[name] = "right"
+            score.legs[prefix + name] = "right"
         else:
-            score.legs[name] = f"undecided {rows[-1][name]:.2f}"
+            score.legs[prefix + name] = f"undecided {rows[-1][name]:.2f}"
 
 
 def _ranges(
@@ -302,18 +365,24 @@ def main(arguments: Sequence[str]) -> None:
     for model, folder in MODELS.items():
         fetch_weights(model, DATA / "weights" / folder)
     print(
-        f"{'drive':24} {'lights right/missed/false':26} {'legs':52} {'first':>9} {'pieces':>6} "
-        f"{'false':>6} {'in 95 %':>8}"
+        f"{'drive':24} {'lights':>9} {'stop signs':>10} (right/missed/false) {'legs':52} "
+        f"{'first':>9} {'pieces':>6} {'false':>6} {'in 95 %':>8}"
     )
     for name in arguments[1:] or DRIVES:
         drive = DRIVES[name]
+        if not any((DATA / "sequences" / drive.folder).glob(drive.pictures)):
+            print(f"{name:24} no {drive.folder}/{drive.pictures} in sequences")
+            continue
         score = scored(replayed(name, drive, out), drive)
-        lights = "/".join(str(score.lights[kind]) for kind in ("right", "missed", "false"))
+        lights, stops = (
+            "/".join(str(score.cues[cue][kind]) for kind in ("right", "missed", "false"))
+            for cue in CUES
+        )
         legs = ", ".join(f"{leg} {what}" for leg, what in score.legs.items()) or "-"
         inside, total = score.ranges
         print(
-            f"{name + ('*' if drive.is_development else ''):24} {lights:26} {legs:52} "
-            f"{score.first:>9} {score.pieces:6} {score.false_intersections:6} "
+            f"{name + ('*' if drive.is_development else ''):24} {lights:>9} {stops:>10} "
+            f"{'':20} {legs:52} {score.first:>9} {score.pieces:6} {score.false_intersections:6} "
             f"{f'{inside}/{total}' if total else '-':>8}",
             flush=True,
         )
