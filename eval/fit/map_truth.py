@@ -33,7 +33,7 @@ def truth_from_map(
     output: Path | str,
     vehicle: Vehicle | Path | str | None = None,
 ) -> WrittenTruth:
-    """Write the intersections of a map that a drive comes to, from its GNSS positions.
+    """Write the intersections of a map that a drive with GNSS positions comes to.
 
     Each approach has its legs, its control where the map states one, and its distances. The map is
     an OpenStreetMap extract. An approach without a stated control has the control "none" and the
