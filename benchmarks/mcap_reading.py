@@ -18,7 +18,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -33,6 +32,7 @@ from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
 import crosscue
+from crosscue.replay.files.checksum import crc32
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS
 from crosscue.replay.readers.mcap.bytes import ByteFile
@@ -208,7 +208,7 @@ def bare(path: Path, is_checked: bool = False) -> int:
             elif item.head.compression == "lz4":
                 body = lz4.frame.decompress(body)
             if is_checked:
-                zlib.crc32(body)
+                crc32(body)
     file.close()
     return 0
 
@@ -316,6 +316,7 @@ def memory(megabytes: int) -> None:
 PEAK = """
 import sys
 from pathlib import Path
+from crosscue.replay.files.checksum import crc32
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 import crosscue.replay.readers.mcap.reader

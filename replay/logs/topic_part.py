@@ -1,65 +1,13 @@
-"""Decoded rows of one topic over a time range, for plots and notebooks.
-
-Where the log has an index, only the relevant parts are read; see ``Log.read``.
-"""
+"""Flat columns of the decoded rows of one topic, for tables, plots and notebooks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.base import Log, Selection, name_of
-from crosscue.replay.columns import Block, CanFrames, Images, Table, Topic
-from crosscue.replay.decode import decoder_for
-from crosscue.replay.errors import UsageError
-from crosscue.replay.ledger import Ledger
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TopicPart:
-    """Rows of one topic.
-
-    Attributes:
-        topic: The topic.
-        blocks: Rows in stored order, as columns where the type is known, else as messages.
-        ledger: Account of this pass over the log.
-    """
-
-    topic: Topic
-    blocks: tuple[Block, ...]
-    ledger: Ledger
-
-    def __len__(self) -> int:
-        return sum(map(len, self.blocks))
-
-
-def read_topic(
-    log: Log, name: str, start_ns: int | None = None, end_ns: int | None = None
-) -> TopicPart:
-    """Read the rows of one topic with ``start_ns <= log time < end_ns`` into memory.
-
-    Args:
-        log: An open log.
-        name: Name of the topic.
-        start_ns: First log time, or None for the log's beginning.
-        end_ns: End of the log times, exclusive, or None for the log's end.
-
-    Raises:
-        UsageError: The log has no such topic; the message lists the available topics.
-        SchemaError: The log's definition of the type is damaged.
-    """
-    topic = next((one for one in log.topics if one.name == name), None)
-    if topic is None:
-        known = ", ".join(one.name for one in log.topics)
-        raise UsageError(f"{name_of(log)}: no topic {name!r}; there are: {known}")
-    ledger, decode = Ledger(name_of(log)), decoder_for(topic)
-    blocks = log.read(ledger, Selection(frozenset({name}), start_ns, end_ns))
-    if decode is None:
-        return TopicPart(topic, tuple(blocks), ledger)
-    return TopicPart(topic, tuple(decode(block, ledger) for block in blocks), ledger)
+from crosscue.replay.columns import Block, CanFrames, Images, Table
 
 
 def topic_columns(blocks: Sequence[Block]) -> dict[str, NDArray[np.generic]]:

@@ -5,6 +5,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 import crosscue
@@ -47,6 +48,21 @@ def test_each_format_yields_tables_or_frames(name: str, tmp_path: Path) -> None:
             assert table.column_names[0] == "log_t_ns"
             rows += len(table)
     assert rows or warned
+
+
+@pytest.mark.filterwarnings("ignore::crosscue.LossWarning")
+@pytest.mark.parametrize("name", sorted(EVERY_FORMAT))
+def test_batches_of_a_log_are_the_tables_of_its_topics(name: str, tmp_path: Path) -> None:
+    with crosscue.open(EVERY_FORMAT[name](tmp_path)) as log:
+        batches: dict[str, list[pa.RecordBatch]] = {}
+        for topic, batch in log.batches():
+            batches.setdefault(topic, []).append(batch)
+        for topic, parts in batches.items():
+            found = pa.Table.from_batches(parts)
+            if "coding" in found.column_names:
+                assert len(found) == sum(1 for _ in log[topic].frames())
+            else:
+                assert found.equals(log[topic].table())
 
 
 def test_time_spans_are_half_open_and_intersect(drive: DriveFiles) -> None:
