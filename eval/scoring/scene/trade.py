@@ -66,10 +66,14 @@ def reached(
         features: Probabilities by feature, shape (N,) each.
         present: Features that are present; none without an intersection.
         absent: Features that are absent.
-        sure: Shape (N,): True where presence is established, which counts as the intersection,
-            present or absent.
+        sure: Shape (N,): True where presence is established. The intersection, present or absent,
+            then counts with the greatest probability so far, which established it.
     """
-    counted = {k: np.where(sure, 1.0, p) if k == SURE else p for k, p in features.items()}
+    counted = dict(features)
+    if SURE in features:
+        # What established it once, at any lower threshold, is the greatest probability so far.
+        so_far = np.maximum.accumulate(np.max(np.stack([*features.values()]), axis=0))
+        counted[SURE] = np.where(sure, so_far, features[SURE])
     rows = [counted.get(name, np.empty(0)) for name in absent]
     false = tuple(float(one.max()) if len(one) else 0.0 for one in rows)
     if not present:

@@ -17,20 +17,22 @@ def test_thresholds_agree_with_detection_at_each_threshold(seed: int) -> None:
     found = reached(features, PRESENT, ABSENT, sure)
 
     assert found.full is not None
+    so_far = np.maximum.accumulate(np.max([*features.values()], axis=0))
     for threshold in np.linspace(0.0, 1.0, 41):
-        above = ((features["intersection"] > threshold) | sure) & (features["left"] > threshold)
+        is_sure = (features["intersection"] > threshold) | (sure & (so_far > threshold))
+        above = is_sure & (features["left"] > threshold)
         is_full = bool(held(above, CONFIRM_FRAMES).any())
-        # Where presence is established, the intersection counts at any threshold below 1.
-        assert is_full == (found.full > threshold) or threshold == 1.0
+        # Where presence is established, the intersection counts as what established it.
+        assert is_full == (found.full > threshold)
         assert bool((features["right"] > threshold).any()) == (found.false[0] > threshold)
 
 
 def test_established_presence_counts_alike_where_it_is_right_and_where_it_is_wrong() -> None:
-    rising = {"intersection": np.linspace(0.1, 0.6, 6)}
+    rising = {"intersection": np.linspace(0.1, 0.6, 6), "left": np.array([0, 0, 0.9, 0, 0, 0])}
     sure = np.arange(6) >= 3
 
-    assert reached(rising, ("intersection",), (), sure) == Reached(1.0, ())
-    assert reached(rising, (), ("intersection",), sure) == Reached(None, (1.0,))
+    assert reached(rising, ("intersection",), (), sure) == Reached(0.9, ())
+    assert reached(rising, (), ("intersection",), sure) == Reached(None, (0.9,))
     assert reached(rising, (), ("intersection",), np.zeros(6, np.bool_)) == Reached(None, (0.6,))
 
 
