@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from crosscue.replay.formats import known_formats
 from crosscue.replay.logs.opening import open_log
 
 from .replay.columns import CanFrames, Images, Messages, Table
+from .replay.errors import CrosscueError
 from .replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ __all__ = ["check_cue", "check_dataset", "check_detector", "check_reader"]
 
 # Log time and content of each row in stored order, by topic.
 Rows: TypeAlias = dict[str, list[tuple[int, object]]]
+T = TypeVar("T")
 
 
 def check_reader(
@@ -94,13 +96,15 @@ def check_detector(build: Callable[[], Detector], *, tolerance: float = 1e-3) ->
     """
     from crosscue.detectors.base import fault_of, reportable
 
-    detect = build()
+    detect = _asked(build)
+    lacking = [name for name in ("view", "identity", "__call__") if not hasattr(detect, name)]
+    _expect(not lacking, f"no {', '.join(lacking)}; derive from crosscue.BoxDetector")
     _expect(isinstance(detect.identity, str) and bool(detect.identity), "identity: expected a text")
     _expect(build().identity == detect.identity, "identity: differs when it is built again")
     labels = reportable(detect)
     frames = _frames(detect.view.is_grey)
     before = [frame.pixels.copy() for frame in frames]
-    together = detect(frames)
+    together = _asked(lambda: detect(frames))
     for frame, pixels in zip(frames, before, strict=True):
         _expect(np.array_equal(frame.pixels, pixels), "it changed a frame's pixels")
     _expect(len(together) == len(frames), f"{len(frames)} frames, {len(together)} results")
@@ -184,6 +188,16 @@ def check_dataset(
         f"truth: the track of {truth.pose_point}: expected its mounting and mounting_source",
     )
     check_reader(log, damage_one_row)
+
+
+def _asked(call: Callable[[], T]) -> T:
+    """Return the result of a call; an error breaks the contract."""
+    try:
+        return call()
+    except CrosscueError as error:
+        raise AssertionError(str(error)) from error
+    except Exception as error:
+        raise AssertionError(f"it failed: {type(error).__name__}: {error}") from error
 
 
 def _expect(is_kept: bool, text: str) -> None:

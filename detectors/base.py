@@ -315,9 +315,11 @@ def _fault_of_boxes(found: Detections, labels: Sequence[str] | None) -> str | No
     boxes, ends = found.boxes_px, (*found.size_px, *found.size_px)
     is_ordered = np.all(boxes[:, :2] <= boxes[:, 2:], axis=1)
     is_inside = np.all((boxes >= 0.0) & (boxes <= ends), axis=1)
+    # Clipped corners may be 0, and nothing is within one pixel.
+    is_in_pixels = ~np.all((boxes > 0.0) & (boxes <= 1.0), axis=1)
     is_fraction = (found.scores >= 0.0) & (found.scores <= 1.0)
     is_known = np.array([bool(x) and (labels is None or x in labels) for x in found.labels], bool)
-    wrong = np.flatnonzero(~(is_ordered & is_inside & is_fraction & is_known))
+    wrong = np.flatnonzero(~(is_ordered & is_inside & is_in_pixels & is_fraction & is_known))
     if not len(wrong):
         return None
     i = int(wrong[0])
@@ -327,6 +329,8 @@ def _fault_of_boxes(found: Detections, labels: Sequence[str] | None) -> str | No
         return f"{where}: x1 < x0 or y1 < y0; expected x0, y0, x1, y1 and not a width and a height"
     if not is_inside[i]:
         return f"{where}: not inside the picture of {found.size_px} px; clip it"
+    if not is_in_pixels[i]:
+        return f"{where}: corners below 1; expected pixels, not fractions of the picture"
     if not is_fraction[i]:
         return f"{where}: score {found.scores[i]:g}; expected 0 to 1"
     return f"{where}: label not declared; expected one of {', '.join(labels or ('any text',))}"

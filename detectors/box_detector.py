@@ -5,17 +5,19 @@ from __future__ import annotations
 import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, ClassVar, Self, TypeAlias
+from math import isfinite
+from typing import Any, ClassVar, Final, Self, TypeAlias
 
 import numpy as np
 
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.errors import UsageError, VehicleError
 
 from .base import Detections, Frame, View
 from .settings import Settings, identity_of, settings_of
 
 # Label, score from 0 to 1, and x0, y0, x1, y1 in pixels of the decoded frame.
 ScoredBox: TypeAlias = tuple[str, float, Sequence[float]]
+_ITEM: Final = "(label, score, (x0, y0, x1, y1)) with finite numbers"
 
 
 class BoxDetector(Settings):
@@ -82,11 +84,16 @@ class BoxDetector(Settings):
         Raises:
             VehicleError: A setting is unknown or its value is invalid, or there are no labels.
         """
-        if not getattr(cls, "labels", ()):
-            raise VehicleError(
-                f'detector {cls.name}: no labels; set labels = ("stop sign",) or what it reports'
-            )
         return settings_of(cls, given, f"detector {cls.name}")
+
+    def model_post_init(self, _: object) -> None:
+        """Refuse a class without labels."""
+        labels = getattr(self, "labels", None)
+        if not labels or isinstance(labels, str):
+            raise VehicleError(
+                f"detector {self.name}: {'no labels' if not labels else f'labels is {labels!r}'}; "
+                'set labels = ("stop sign",) or what it reports'
+            )
 
     @property
     def identity(self) -> str:
@@ -105,19 +112,23 @@ def as_detections(frame: Frame, found: Iterable[ScoredBox]) -> Detections:
     """Return boxes in pixels of the decoded frame as detections in the camera's pixels.
 
     Raises:
-        TypeError: An item is not a label, a score and four numbers.
+        UsageError: An item is not a label, a score and four numbers.
     """
     labels, scores, boxes = [], [], []
-    for item in found:
+    where = f"frame at {frame.t_ns} ns: "
+    if not isinstance(found, Iterable):
+        raise UsageError(f"{where}returned {_short(found)}; expected {_ITEM} for each box, or none")
+    for i, item in enumerate(found):
         try:
             label, score, corners = item
-            boxes.append([float(value) for value in corners])
-            scores.append(float(score))
+            numbers = [float(score), *map(float, corners)]
         except (TypeError, ValueError):
-            boxes.append([])
-        if len(boxes[-1]) != 4 or not isinstance(label, str):
-            raise TypeError(f"yielded {item!r}; expected (label, score, (x0, y0, x1, y1))")
+            label, numbers = None, []
+        if len(numbers) != 5 or not isinstance(label, str) or not all(map(isfinite, numbers)):
+            raise UsageError(f"{where}box {i}: yielded {_short(item)}; expected {_ITEM}")
         labels.append(label)
+        scores.append(numbers[0])
+        boxes.append(numbers[1:])
     return Detections(
         frame.t_ns,
         frame.size_px,
@@ -126,6 +137,10 @@ def as_detections(frame: Frame, found: Iterable[ScoredBox]) -> Detections:
         tuple(labels),
         (b"",) * len(labels),
     )
+
+
+def _short(value: object) -> str:
+    return " ".join(repr(value).split())[:80]
 
 
 class FunctionDetector:

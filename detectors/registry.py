@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from inspect import getattr_static, isfunction
+from inspect import Parameter, getattr_static, isfunction, signature
 from operator import attrgetter
 from pathlib import Path
 from typing import Final, cast
@@ -43,6 +43,7 @@ _EMBEDDED_BY: Final = {"mask-rcnn": ("network", "embedded"), "road": ("checkpoin
 # Endings of files with weights, which need a card.
 _WEIGHTS: Final = (".onnx", ".pt", ".pth", ".safetensors", ".tflite", ".xml")
 
+_POSITIONAL: Final = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
 # Attributes that every ``Detector`` has.
 _PARTS: Final = ("view", "identity", "__call__")
 
@@ -91,18 +92,9 @@ def _choice_of_object(given: object) -> DetectorChoice:
             f"detectors: {given!r}: expected a name, a class, a function from a frame to its "
             "boxes, or a detector"
         )
-    if isfunction(given):
-        factory: Callable[..., object] = partial(FunctionDetector, given)
-    elif isinstance(given, type):
-        factory = given
-    else:
-        factory = partial(_itself, given)
-    choice = DetectorChoice(str(name), f"{kind.__module__}:{kind.__qualname__}", factory=factory)
+    place = f"{kind.__module__}:{kind.__qualname__}"
+    choice = DetectorChoice(str(name), place, factory=_factory_from(given))
     return replace(choice, identity=make(choice).identity)
-
-
-def _itself(given: object) -> object:
-    return given
 
 
 def knows_simulated_only(choice: DetectorChoice) -> bool:
@@ -135,7 +127,28 @@ def make(choice: DetectorChoice, table: Mapping[str, str] = BUILTIN) -> Detector
         return _built(choice, choice.factory, choice.kind)
     choice = _with_card(choice, table)
     place, factory = _factory_of(choice, table)
+    if not choice.settings and (_is_of_frames(factory) or not _lacking(factory)):
+        factory = _factory_from(factory)
     return _built(choice, factory, place)
+
+
+def _is_of_frames(given: object) -> bool:
+    """Whether a function has one argument without a default: the frame, without settings."""
+    values = signature(given).parameters.values() if isfunction(given) else ()
+    required = [one for one in values if one.default is one.empty and one.kind in _POSITIONAL]
+    return len(required) == 1
+
+
+def _lacking(given: object) -> list[str]:
+    """Attributes of a detector that an object lacks; static, as a property may hash weights."""
+    return [name for name in _PARTS if getattr_static(given, name, None) is None]
+
+
+def _factory_from(given: object) -> Callable[..., object]:
+    """Return the factory of a detector that is a class, a function of a frame or an object."""
+    if isfunction(given):
+        return partial(FunctionDetector, given)
+    return given if isinstance(given, type) else lambda: given
 
 
 def _built(choice: DetectorChoice, factory: Callable[..., object], place: str) -> Detector:
@@ -151,9 +164,7 @@ def _built(choice: DetectorChoice, factory: Callable[..., object], place: str) -
         built = factory(**choice.settings)
     except TypeError as error:
         raise VehicleError(f"detector {choice.name}: settings do not fit: {error}") from None
-    # Static, because a property may hash a network's weights.
-    lacking = [name for name in _PARTS if getattr_static(built, name, None) is None]
-    if lacking:
+    if lacking := _lacking(built):
         raise VehicleError(
             f"detector {choice.name}: {place} returned a {type(built).__name__} without "
             f"{', '.join(lacking)}; derive from crosscue.BoxDetector, or see crosscue.Detector"

@@ -167,6 +167,8 @@ class Runner:
         ]
         try:
             found = named.detector(frames)
+        except UsageError as error:
+            raise UsageError(f"detector {named.name}: {error}") from None
         except CrosscueError:
             raise
         except Exception as error:

@@ -1,15 +1,18 @@
 """Tests of the base class of box detectors."""
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 import crosscue
 from crosscue.detectors.base import Frame, View
 from crosscue.detectors.box_detector import BoxDetector, ScoredBox
 from crosscue.detectors.registry import chosen, make
-from crosscue.replay.errors import CrosscueError, UsageError, VehicleError
+from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.testing import check_detector
 from support.pictures import picture_folder
 
@@ -73,39 +76,115 @@ def test_other_objects_are_no_detectors() -> None:
         chosen([Corner, Corner], {})
 
 
-class Yields(BoxDetector):
-    """Detector that yields what a test gives it."""
+class Returns(BoxDetector):
+    """Detector that returns what a test gives it."""
 
-    name, labels = "yields", ("stop sign",)
-    item: tuple[object, ...] = ()
+    name, labels = "returns", ("stop sign",)
+    found: Any = None
+
+    def boxes_in(self, frame: Frame) -> Iterable[ScoredBox]:
+        """Return it as it is, rows of numbers as an array."""
+        is_array = self.found and isinstance(self.found[0], list)
+        return np.array(self.found) if is_array else self.found
+
+
+BOX = (10, 8, 15, 12)
+ITEM = "expected (label, score, (x0, y0, x1, y1)) with finite numbers"
+MISTAKES = {
+    "width and height": ([("stop sign", 0.9, (10, 12, 5, 5))], "'stop sign' at (10, 12, 5, 5): x1"),
+    "y before x": ([("stop sign", 0.9, (12, 3, 5, 9))], "x1 < x0 or y1 < y0; expected x0, y0"),
+    "per cent": ([("stop sign", 90, BOX)], "score 90; expected 0 to 1"),
+    "fractions": ([("stop sign", 0.9, (0.1, 0.2, 0.3, 0.4))], "expected pixels, not fractions"),
+    "outside": ([("stop sign", 0.9, (10, 8, 15, 999))], "not inside the picture of"),
+    "negative": ([("stop sign", 0.9, (-10, 8, 15, 12))], "not inside the picture of"),
+    "undeclared": ([("stop_sign", 0.9, BOX)], "label not declared; expected one of stop sign"),
+    "number": ([(11, 0.9, BOX)], f"box 0: yielded (11, 0.9, (10, 8, 15, 12)); {ITEM}"),
+    "no score": ([("stop sign", BOX)], ITEM),
+    "three corners": ([("stop sign", 0.9, (10, 8, 15))], ITEM),
+    "flat": ([("stop sign", 0.9, *BOX)], ITEM),
+    "score first": ([(0.9, "stop sign", BOX)], ITEM),
+    "one box": (("stop sign", 0.9, BOX), "box 0: yielded 'stop sign'; expected"),
+    "dictionaries": ([{"label": "stop sign", "score": 0.9, "box": BOX}], "yielded {'label'"),
+    "rows": ([[10.0, 8.0, 15.0, 12.0, 0.9, 0.0]], "box 0: yielded array([10. "),
+    "no number": (
+        [("stop sign", float("nan"), BOX)],
+        f"box 0: yielded ('stop sign', nan, (10, 8, 15, 12)); {ITEM}",
+    ),
+    "no corner": (
+        [("stop sign", 0.9, BOX), ("stop sign", 0.9, (10, float("nan"), 15, 12))],
+        "box 1: yielded",
+    ),
+    "nothing": (None, "returned None; expected (label"),
+    "a number": (0, "returned 0; expected (label"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistake_is_refused_in_run_and_test_with_frame_and_reason(
+    mistake: str, tmp_path: Path
+) -> None:
+    log = picture_folder(tmp_path / "log", 2, "rate_hz: 10")
+    found, fault = MISTAKES[mistake]
+    detector = Returns.build(found=found)
+
+    with pytest.raises(UsageError) as refused:
+        crosscue.detect_drive(log, tmp_path / "run", detectors=[detector])
+    with pytest.raises(AssertionError) as broken:
+        check_detector(lambda: detector)
+
+    message = str(refused.value)
+    assert re.match(r"detector returns: frame at \d+ ns: ", message)
+    assert fault in message
+    assert "\n" not in message
+    assert re.match(r"frame (at )?7( ns)?: ", str(broken.value))
+    assert fault.replace("24, 16", "160, 96") in str(broken.value)
+
+
+class Failing(BoxDetector):
+    """Detector with a mistake in its code."""
+
+    labels = ("stop sign",)
 
     def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
-        """Return the item as it is."""
-        yield self.item  # type: ignore[misc]
+        """Read a pixel that does not exist."""
+        yield "stop sign", frame.pixels[5000, 5000], BOX
+
+
+class Bare:
+    """Class with the method of a detector only."""
+
+    def __call__(self, frames: object) -> list[object]:
+        """Return nothing."""
+        return []
+
+
+class Abstract(BoxDetector):
+    """Detector without ``boxes_in``."""
+
+    labels = ("stop sign",)
 
 
 @pytest.mark.parametrize(
-    ("item", "fault"),
+    ("kind", "fault"),
     [
-        (("stop sign", 0.9, (10, 20, 5, 5)), "'stop sign' at (10, 20, 5, 5): x1 < x0"),
-        (("stop sign", 90, (10, 8, 15, 12)), "score 90; expected 0 to 1"),
-        (("stop sign", 0.9, (10, 8, 15, 99)), "not inside the picture of (24, 16) px"),
-        (("stop_sign", 0.9, (10, 8, 15, 12)), "label not declared; expected one of stop sign"),
-        (("stop sign", (10, 8, 15, 12)), "expected (label, score, (x0, y0, x1, y1))"),
-        (("stop sign", 0.9, (10, 8, 15)), "expected (label, score, (x0, y0, x1, y1))"),
+        (Failing, "it failed: IndexError: index 5000"),
+        (Bare, "no view, identity; derive from crosscue.BoxDetector"),
+        (Abstract, "it failed: TypeError: Can't instantiate abstract class Abstract"),
     ],
 )
-def test_wrong_box_of_a_run_is_refused_with_frame_and_reason(
-    item: tuple[object, ...], fault: str, tmp_path: Path
-) -> None:
-    log = picture_folder(tmp_path / "log", 2, "rate_hz: 10")
+def test_other_mistakes_break_the_contract_in_one_line(kind: Any, fault: str) -> None:
+    with pytest.raises(AssertionError, match=re.escape(fault)) as broken:
+        check_detector(kind)
 
-    with pytest.raises(CrosscueError) as refused:
-        crosscue.detect_drive(log, tmp_path / "run", detectors=[Yields.build(item=item)])
+    assert "\n" not in str(broken.value)
 
-    assert str(refused.value).startswith("detector yields: ")
-    assert " ns: " in str(refused.value)
-    assert fault in str(refused.value)
+
+corner = Corner(side_px=4)
+
+
+@pytest.mark.parametrize("name", ["bright", "corner", "Corner", "Corner.build"])
+def test_names_of_functions_objects_and_classes_are_detectors(name: str) -> None:
+    check_detector(lambda: make(chosen(f"{__name__}:{name}", {})[0]))
 
 
 class Unnamed(BoxDetector):
@@ -116,6 +195,12 @@ class Unnamed(BoxDetector):
     def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
         """Return nothing."""
         yield from ()
+
+
+class OneText(Unnamed):
+    """Detector whose labels are a text."""
+
+    labels = "stop sign"  # type: ignore[assignment]
 
 
 class Unlabelled(BoxDetector):
@@ -131,3 +216,7 @@ def test_class_without_a_name_is_named_after_itself_and_one_without_labels_is_re
     assert Unnamed.name == "Unnamed"
     with pytest.raises(VehicleError, match="detector Unlabelled: no labels; set labels ="):
         chosen([Unlabelled], {})
+    with pytest.raises(VehicleError, match="detector OneText: labels is 'stop sign'; set labels ="):
+        chosen([OneText], {})
+    with pytest.raises(AssertionError, match="detector Unlabelled: no labels"):
+        check_detector(Unlabelled)
