@@ -332,7 +332,7 @@ def score_detector(
         "of": of,
         "worst": worst,
         "boxes": int((~of.truth.is_ignored).sum()),
-        "lowest": float(of.found.scores.min(initial=1.0)),
+        "lowest": float(of.found.scores.min()) if len(of.found.scores) else None,
         "overlap": overlap,
         "seed": SEED,
         "figure": draw_calibration(found.calibration) if settings.has_figures else None,
