@@ -28,7 +28,7 @@ from pydantic import Field, ValidationError, model_validator
 from crosscue.detectors.decoders.table import AnyBoxOutput
 from crosscue.detectors.networks.weights import Weights
 from crosscue.detectors.settings import Proportion, Settings
-from crosscue.replay.errors import VehicleError
+from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import toml_tree
 from crosscue.replay.limits import MIB
@@ -239,7 +239,8 @@ def read_weights(card: ModelCard, folder: Path) -> Weights:
     """Read the card's weights and compare their hashes.
 
     Raises:
-        VehicleError: The weights are missing, too large, or do not match the card's hash.
+        UsageError: The weights are missing or too large.
+        VehicleError: They do not match the card's hash.
     """
     path = folder / card.weights
     content = _verified(path, card.sha256, "sha256")
@@ -251,13 +252,23 @@ def read_weights(card: ModelCard, folder: Path) -> Weights:
     return Weights(name=str(path), content=content, second=second)
 
 
-def _verified(path: Path, want: str, key: str) -> bytes:
+def model_bytes(path: Path) -> bytes:
+    """Read a model file or weights.
+
+    Raises:
+        UsageError: The file cannot be read, or is too large.
+    """
     try:
         content = read_at_most(path, MAX_BYTES)
-        if content is None:
-            raise VehicleError(f"{path}: over {MAX_BYTES // MIB} MiB; not read")
     except OSError as error:
-        raise VehicleError(f"{path}: {error.strerror}; put the weights next to the card") from None
+        raise UsageError(f"{path}: {error.strerror}; expected a model file or weights") from None
+    if content is None:
+        raise UsageError(f"{path}: over {MAX_BYTES // MIB} MiB; not read")
+    return content
+
+
+def _verified(path: Path, want: str, key: str) -> bytes:
+    content = model_bytes(path)
     found = hashlib.sha256(content).hexdigest()
     if found != want:
         raise VehicleError(

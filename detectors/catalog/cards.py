@@ -11,16 +11,16 @@ from typing import Annotated, ClassVar, Final
 
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.catalog.architectures import WEIGHTS_SUFFIXES
-from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.class_names import COCO_80, COCO_90, class_names_given
 from crosscue.detectors.catalog.draft import Draft, draft_card_text
 from crosscue.detectors.catalog.places import card_named
 from crosscue.detectors.catalog.recognise import closed, guesses, plausible, read_interface
 from crosscue.detectors.decoders.base import Guess, Interface, decoder_name
+from crosscue.detectors.decoders.detr import with_no_object
 from crosscue.detectors.decoders.table import DECODERS
 from crosscue.detectors.images import decode, read_file
 from crosscue.detectors.networks.model_detector import build
-from crosscue.detectors.networks.trial import fault_seen
+from crosscue.detectors.networks.trial import fault_seen, fit_doubt, input_doubt
 from crosscue.detectors.overlay import encode_overlay
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import LogError, UsageError, VehicleError
@@ -31,12 +31,6 @@ from crosscue.verb import Option, keywords
 # Supported tasks in the metadata of Ultralytics' exports.
 _TASKS: Final = ("detect", "segment")
 _MAX_TASK_CHARACTERS: Final = 40
-# The way to fit a picture that a network may be trained with instead of the assumed one.
-_OTHER_FIT: Final = {
-    "stretch": "letterbox",
-    "letterbox": "stretch",
-    "letterbox-center": "stretch",
-}
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -80,12 +74,20 @@ class CardCheck(Result):
         identity: Identity of the detector, unique to its card, weights and version.
         picture: Copy of the picture with detections; None without a picture.
         found: Number of detections by label; None without a picture, and for a road network.
+        doubt: What the network finds if the picture is prepared otherwise, where it finds nothing
+            with the card; else None.
     """
 
     path: Path = field(metadata=json_key("card"))
     identity: str
     picture: Path | None = None
     found: Mapping[str, int] | None = None
+    doubt: str | None = None
+
+    @property
+    def exit_status(self) -> int:
+        """3 where the card may prepare pictures wrongly, else 0."""
+        return 0 if self.doubt is None else 3
 
     def lines(self) -> Iterator[str]:
         """Yield that the card fits, and what was found in the picture."""
@@ -95,6 +97,8 @@ class CardCheck(Result):
             named = [] if counts is None else [f"{n} {name}" for name, n in counts.items()]
             text = "road" if counts is None else ", ".join(named) or "nothing"
             yield f"found      {text}; drawn in {self.picture}"
+        if self.doubt is not None:
+            yield f"doubt      {self.doubt}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +162,7 @@ def draft_card(
     place = path.with_suffix(".toml") if output is None else Path(output)
     if place.exists() and not settings.overwrite:
         raise UsageError(f"{place}: exists; give another name or --overwrite")
-    if place.resolve().parent != path.resolve().parent:
+    if place.parent.resolve() != path.parent.resolve():
         raise UsageError(f"{place}: expected a card in the folder of its weights, {path.parent}")
     if settings.classes is not None:
         if class_names is not None:
@@ -183,11 +187,14 @@ def draft_card(
     # Errors in the picture are reported before a card is written.
     pixels = _pixels_of(seen)[0]
     _try(place, written, pixels)
+    detector = build(card=str(place))
+    doubts = [input_doubt(detector, pixels)]
     # Ultralytics' metadata say how its networks are trained; other files do not.
-    if not model.metadata and (doubt := _other_fit(place, written, pixels)) is not None:
+    doubts += [] if model.metadata else [fit_doubt(detector, pixels)]
+    for doubt in filter(None, doubts):
         written = written.with_assumption(doubt)
         write_text(place, written.text)
-    found = _look(build(card=str(place)), seen, drawing := _drawing(place, seen))
+    found = _look(detector, seen, drawing := _drawing(place, seen))
     return CardDraft(place, written, drawing, None if found is None else len(found))
 
 
@@ -223,7 +230,8 @@ def check_card(
     drawing = _drawing(place, seen) if output is None else Path(output)
     found = _look(detector, seen, drawing)
     counts = None if found is None else dict(Counter(found.labels))
-    return CardCheck(card, detector.identity, drawing, counts)
+    doubt = None if pixels is None else input_doubt(detector, pixels)
+    return CardCheck(card, detector.identity, drawing, counts, doubt)
 
 
 def _guess(path: Path, model: Interface, kind: str | None, names: int) -> Guess:
@@ -244,6 +252,11 @@ def _guess(path: Path, model: Interface, kind: str | None, names: int) -> Guess:
             f"{path}: task in its metadata: expected one of {', '.join(_TASKS)}, found "
             f"{task!r}; export a network that detects boxes"
         )
+    given = model.inputs[0].shape if model.inputs else ()
+    if len(given) == 4 and isinstance(batch := given[0], int) and batch > 1:
+        raise UsageError(f"{path}: runs on {batch} pictures at once; export it for one, or any")
+    if len(given) == 4 and all(isinstance(side, int) and side != 3 for side in given[1::2]):
+        raise UsageError(f"{path}: input {_shape(given)}: expected a picture of three colours")
     found = guesses(model)
     if kind is not None:
         found = [guess for guess in found if guess.settings["kind"] == kind]
@@ -253,7 +266,9 @@ def _guess(path: Path, model: Interface, kind: str | None, names: int) -> Guess:
         counts = (names,) if names else (len(COCO_80), len(COCO_90))
         found = [one for one in found if one.class_count in counts] or found
     if len(found) == 1:
-        return found[0]
+        (guess,) = found
+        is_more = guess.settings["kind"] == "detr" and guess.class_count == names + 1
+        return with_no_object(guess) if names and is_more and not guess.is_decided else guess
     if not found:
         outputs = ", ".join(f"{out.name} {_shape(out.shape)}" for out in model.outputs)
         asked = "" if kind is None else f" as {kind}"
@@ -317,32 +332,6 @@ def _try(place: Path, written: Draft, picture: Bytes | None = None) -> None:
         f"{place}: not written: {fault}, so {written.kind} is not its layout; choose another "
         "--kind, write a card by hand, or a detector (docs: Write a detector)"
     )
-
-
-def _other_fit(place: Path, written: Draft, pixels: Bytes) -> str | None:
-    """Return what the network finds in a picture that is fitted into its input otherwise.
-
-    None if that cannot matter, or the card's own fit is as well without detections.
-    """
-    given = read_card(place).input
-    if given.fit not in _OTHER_FIT:
-        return None
-    height, width = pixels.shape[:2]
-    if width * given.height_px == height * given.width_px:
-        return None
-    counts = []
-    trial = place.with_name(f".{place.stem}.trial.toml")
-    for fit in (given.fit, _OTHER_FIT[given.fit]):
-        write_text(trial, written.text.replace(f'fit = "{given.fit}"', f'fit = "{fit}"'))
-        try:
-            (found,) = build(card=str(trial))([Frame(0, "", pixels, (width, height))])
-        finally:
-            trial.unlink(missing_ok=True)
-        if not isinstance(found, Detections):
-            return None
-        best = f" with scores up to {found.scores.max():.2f}" if len(found) else ""
-        counts.append(f'{len(found)} boxes{best} with fit = "{fit}"')
-    return f"{counts[0]}, {counts[1]} in {width} x {height}: correct input.fit if it is the other"
 
 
 def _pixels_of(picture: Path) -> tuple[Bytes, tuple[int, int]]:

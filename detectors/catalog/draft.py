@@ -136,7 +136,7 @@ def _classes(
         if count is not None and len(names) != count:
             raise UsageError(f"{path}: {count} classes, but {len(names)} class names were passed")
         return tuple(names)
-    if model.class_names:
+    if model.class_names and count in (None, len(model.class_names)):
         certain.append(f"{len(model.class_names)} class names in its metadata")
         return model.class_names
     usual = COCO_90 if guess.numbers_as_coco else COCO_80
@@ -193,6 +193,10 @@ def _input(
     else:
         width, height = size_in(model.metadata) or guess.usual_size_px
         assumed.append(f"its input size is variable; {width} x {height} (--size WxH)")
+    if (limits := model.inputs[0].limits) and usual.get("scale") != (guess.input or {}).get(
+        "scale"
+    ):
+        certain.append(f"its input is quantised for {limits[0]:.3g} to {limits[1]:.3g}")
     if "colour" in usual and not model.class_names:
         assumed.append(f"colours are {usual['colour']}, pictures fitted by {usual.get('fit')}")
     return {"width_px": width, "height_px": height, **usual, **given}

@@ -6,7 +6,7 @@ import ast
 import io
 import math
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -27,16 +27,16 @@ from crosscue.detectors.decoders.base import (
 )
 from crosscue.detectors.decoders.plausible import oddity
 from crosscue.detectors.decoders.table import DECODERS
-from crosscue.detectors.networks.backends import Network, load_network
+from crosscue.detectors.networks.backends import Network, load_network, missing_operation
 from crosscue.detectors.networks.openvino import import_openvino
-from crosscue.detectors.networks.picture_input import prepared
+from crosscue.detectors.networks.trial import candidates_in
 from crosscue.detectors.networks.weights import Weights
 from crosscue.replay.errors import UsageError, one_line
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.tree_text import yaml_tree
 
 from .architectures import WEIGHTS_SUFFIXES
-from .card import MAX_BYTES, Input
+from .card import MAX_BYTES, Input, model_bytes
 from .segmentation import recognise_segmentation
 
 # Maximum number of brackets in metadata; parsing more is slow.
@@ -78,16 +78,12 @@ def read_interface(path: Path) -> Interface:
             f"{', '.join(WEIGHTS_SUFFIXES)}"
         )
     try:
-        content = read_at_most(path, MAX_BYTES)
-        if content is None:
-            raise UsageError(f"{path}: over {MAX_BYTES >> 20} MiB; not read")
-        return _READERS[suffix](content, path)
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}; expected a model file") from None
+        return _READERS[suffix](model_bytes(path), path)
     except UsageError:
         raise
     except Exception as error:
-        raise UsageError(f"{path}: not a complete model file: {one_line(error, 160)}") from None
+        why = missing_operation(error) or f"not a complete model file: {one_line(error, 160)}"
+        raise UsageError(f"{path}: {why}") from None
 
 
 def _of_onnx(content: bytes, path: Path) -> Interface:
@@ -105,7 +101,30 @@ def _of_onnx(content: bytes, path: Path) -> Interface:
         tuple(_tensor(value) for value in model.graph.output),
         metadata,
         class_names(metadata),
+        _scored_classes(model),
     )
+
+
+def _scored_classes(model: Any) -> int | None:
+    """Number of classes whose scores an ONNX file suppresses; None if it does not, or hides it."""
+    nodes = model.graph.node
+    if not any(node.op_type in ("NonMaxSuppression", "EfficientNMS_TRT") for node in nodes):
+        return None
+    import onnx
+
+    try:
+        inferred = onnx.shape_inference.infer_shapes(model).graph
+    except onnx.shape_inference.InferenceError:
+        return None
+    shapes = {value.name: _tensor(value).shape for value in inferred.value_info}
+    found = set()
+    for node in nodes:
+        if node.op_type == "ArgMax":
+            axis = next((one.i for one in node.attribute if one.name == "axis"), 0)
+            found.add(static(shapes.get(node.input[0], ()), axis))
+        elif node.op_type == "EfficientNMS_TRT":
+            found |= {static(shapes.get(name, ()), 2) for name in node.input[1:2]}
+    return found.pop() if len(found) == 1 else None
 
 
 def _tensor(value: Any) -> Tensor:
@@ -149,9 +168,11 @@ def _of_tflite(content: bytes, path: Path) -> Interface:
     net.allocate_tensors()
 
     def tensor(one: Any) -> Tensor:
-        kind = np.dtype(one["dtype"]).name
+        kind, (scale, zero) = np.dtype(one["dtype"]).name, one["quantization"]
         shape = tuple(map(int, one["shape"]))
-        return Tensor(str(one["name"]), shape, kind in ("int32", "int64"), kind == "uint8")
+        limits = ((-128 - zero) * scale, (127 - zero) * scale) if kind == "int8" and scale else None
+        name, is_integer = str(one["name"]), kind in ("int32", "int64")
+        return Tensor(name, shape, is_integer, kind == "uint8", limits)
 
     metadata, names = _appended(content)
     return Interface(
@@ -198,7 +219,7 @@ def _appended(content: bytes) -> tuple[dict[str, str], tuple[str, ...]]:
 def _yaml_metadata(path: Path) -> dict[str, str]:
     """Metadata that Ultralytics writes next to an OpenVINO file, in the form of ONNX metadata.
 
-    Nested values are left out. The result is empty where the file is missing.
+    The result is empty where the file is missing.
 
     Raises:
         UsageError: The file is damaged.
@@ -215,14 +236,7 @@ def _yaml_metadata(path: Path) -> dict[str, str]:
         raise UsageError(f"{path}: not readable as metadata: {why}; correct or remove it") from None
     if not isinstance(found, dict):
         return {}
-    return {str(key): str(value) for key, value in found.items() if _is_flat(value)}
-
-
-def _is_flat(value: object) -> bool:
-    values = value.values() if isinstance(value, dict) else value
-    if not isinstance(values, Iterable) or isinstance(values, str):
-        return True
-    return not any(isinstance(one, dict | list) for one in values)
+    return {str(key): str(value) for key, value in found.items()}
 
 
 _READERS: Final = {".onnx": _of_onnx, ".xml": _of_openvino, ".tflite": _of_tflite}
@@ -332,14 +346,11 @@ def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
     noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
     classes = tuple(str(i) for i in range(guess.class_count or _MANY_CLASSES))
     decoder = next(one for one in DECODERS if decoder_name(one) == guess.settings["kind"])
-    output = decoder.model_validate({**guess.settings, "classes": classes, "score": 0.0})
-    batch = prepared(noise, given)[0]
-    outputs = network(batch[0] if given.layout == "chw" else batch)
+    output = decoder.model_validate({**guess.settings, "classes": classes})
     try:
-        found = output.candidates(outputs, (width, height))
+        found, size = candidates_in(network, output, given, noise)
     except ValueError:
         return False
-    size = np.array([width, height])
     if oddity(found, (width, height), DEFAULT_SCORE) is not None:
         return False
     cells = cell_count((width, height), GRID_STRIDES)
@@ -347,7 +358,7 @@ def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
         return True
     centers = (found.boxes_px[:, 2:] + found.boxes_px[:, :2]) / 2.0
     low, high = np.percentile(centers, (5, 95), axis=0)
-    return bool((high - low > SPREAD_FRACTION * size).all())
+    return bool((high - low > SPREAD_FRACTION * np.array(size)).all())
 
 
 def input_settings(model: Interface, guess: Guess) -> dict[str, object]:
@@ -358,7 +369,23 @@ def input_settings(model: Interface, guess: Guess) -> dict[str, object]:
         # Such a network scales its pixels itself.
         usual = {key: value for key, value in usual.items() if key not in ("mean", "scale")}
         usual["dtype"] = "uint8"
+    elif model.inputs[0].limits is not None:
+        usual |= _quantised(usual, *model.inputs[0].limits)
     return usual
+
+
+def _quantised(usual: Mapping[str, object], low: float, high: float) -> dict[str, object]:
+    """Return mean and scale with which black is the lowest number and white the highest.
+
+    Empty if those of the layout are about these, or differ between colours.
+    """
+    keys = {key: value for key, value in usual.items() if key in ("mean", "scale")}
+    given = Input.model_validate({"width_px": 1, "height_px": 1, **keys})
+    black, white = -given.mean[0] * given.scale[0], (255.0 - given.mean[0]) * given.scale[0]
+    step = (high - low) / 255.0
+    if len({*given.mean}) > 1 or max(abs(black - low), abs(white - high)) < 5.0 * step:
+        return {}
+    return {"mean": (-low / step,) * 3, "scale": (step,) * 3}
 
 
 def guesses(model: Interface) -> list[Guess]:

@@ -14,10 +14,9 @@ from crosscue.detectors.networks.torchvision_weights import (
     tensor_difference,
 )
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.bounded import read_at_most
 
 from .architectures import ARCHITECTURES, ArchitectureName
-from .card import MAX_BYTES
+from .card import model_bytes
 
 _NAMES: Final[tuple[ArchitectureName, ...]] = get_args(ArchitectureName)
 _OURS: Final = b'"crosscue"'
@@ -38,12 +37,7 @@ def recognise_weights(
         UsageError: The file cannot be read, or its tensors match no network or several.
         VehicleError: The file holds more than tensors, or is damaged.
     """
-    try:
-        content = read_at_most(path, MAX_BYTES)
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}; expected a weights file") from None
-    if content is None:
-        raise UsageError(f"{path}: over {MAX_BYTES >> 20} MiB; not read")
+    content = model_bytes(path)
     if path.suffix == ".safetensors" and _OURS in content[:_HEADER_BYTES]:
         raise UsageError(
             f"{path}: written by crosscue train, so it needs no card; set network = {path.name!r} "

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, TypeAlias
 
-from crosscue.detectors.decoders.base import Guess, Interface, Tensor, static
+from crosscue.detectors.decoders.base import IMAGENET, Guess, Interface, Tensor, static
 
 _MAX_CLASSES: Final = 256
 # Maximum size of an output's pixel, in pixels of the input.
 _COARSEST: Final = 8
-# Usual name of the input of networks from Caffe, as those of Open Model Zoo.
-_CAFFE_INPUT: Final = "data"
+# What networks expect by the name of their input: in words, and the keys of the card's ``[input]``.
+_Picture: TypeAlias = tuple[str, dict[str, object]]
+_USUAL: Final[_Picture] = ("RGB, scaled to 0..1", {"colour": "rgb", "scale": (1 / 255,) * 3})
+_PICTURES: Final[dict[str, _Picture]] = {
+    "data": ("BGR, from 0 to 255, as Open Model Zoo's networks expect", {"colour": "bgr"}),
+    "pixel_values": ("RGB with ImageNet's mean, as in Transformers", {"colour": "rgb", **IMAGENET}),
+}
 # Names of drivable classes, without blanks and underscores.
 _DRIVABLE: Final = frozenset(
     {"road", "mark", "roadmark", "marking", "lanemarking", "drivable", "drivablearea", "lane"}
@@ -26,20 +31,16 @@ def recognise_segmentation(model: Interface) -> Guess | None:
     if count is None or any(out.shape != first.shape for out in model.outputs):
         return None
     others = ", ".join(out.name for out in model.outputs[1:])
-    is_caffe = model.inputs[0].name == _CAFFE_INPUT
+    expected, picture = _PICTURES.get(model.inputs[0].name, _USUAL)
     return Guess(
         {"kind": "segmentation", **({"name": first.name} if others else {})},
         count or None,
         (f"{first.name} has {f'{count} scores' if count else 'a class'} for each pixel",),
         (
             *((f"{first.name} is the road, not {others} (output.name)",) if others else ()),
-            "pixels are BGR, from 0 to 255, as Open Model Zoo's networks expect"
-            if is_caffe
-            else "pixels are RGB, scaled to 0..1",
+            f"pixels are {expected}",
         ),
-        {"colour": "bgr", "fit": "stretch"}
-        if is_caffe
-        else {"colour": "rgb", "fit": "stretch", "scale": (1 / 255,) * 3},
+        {**picture, "fit": "stretch"},
         is_decided=False,
     )
 

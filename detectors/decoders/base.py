@@ -60,12 +60,17 @@ class BoxCandidates:
 
 @dataclass(frozen=True, slots=True)
 class Tensor:
-    """An input or output as a model file declares it; None for a variable size."""
+    """An input or output as a model file declares it; None for a variable size.
+
+    Attributes:
+        limits: Lowest and highest number of a tensor of quantised numbers; None for others.
+    """
 
     name: str
     shape: tuple[int | str | None, ...]
     is_integer: bool = False
     is_bytes: bool = False
+    limits: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +82,7 @@ class Interface:
         outputs: Outputs, in the file's order.
         metadata: Text by key, as stored by the exporter.
         class_names: Class names from the metadata; empty if missing.
-        class_count: Number of classes that TFLite's suppression is given; None without it.
+        class_count: Number of classes that a suppression in the file is given; None without it.
     """
 
     inputs: tuple[Tensor, ...]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final, Literal
 
 import numpy as np
@@ -108,6 +109,8 @@ class DetrOutput(BoxOutput):
                 is_decided=False,
             )
         is_rf_detr = (boxes.name, logits.name) == _RF_DETR_NAMES
+        # Deformable DETR, Conditional DETR, DINO and LW-DETR.
+        is_normalised = is_rf_detr or columns == _COCO_COLUMNS_OF_DETR - 1
         return Guess(
             settings,
             columns,
@@ -116,13 +119,27 @@ class DetrOutput(BoxOutput):
                 "logits become scores by the logistic function (RT-DETR, RF-DETR); the first DETR "
                 'has activation = "softmax"',
                 are_fractions,
-                "outputs named as RF-DETR's: pixels with ImageNet's mean and deviation"
-                if is_rf_detr
+                "pixels have ImageNet's mean, as of RF-DETR and of others with COCO's 91 numbers"
+                if is_normalised
                 else "pixels are scaled to 0..1, without a mean",
             ),
-            {**picture, **IMAGENET} if is_rf_detr else picture,
+            {**picture, **IMAGENET} if is_normalised else picture,
             is_decided=is_rf_detr,
         )
+
+
+def with_no_object(guess: Guess) -> Guess:
+    """Return the layout whose last column means "no object", as in DETR and YOLOS."""
+    assumption = (
+        "the last column is no object, as of DETR: softmax, and pixels with ImageNet's mean"
+    )
+    return replace(
+        guess,
+        settings={**guess.settings, "activation": "softmax"},
+        class_count=None if guess.class_count is None else guess.class_count - 1,
+        assumptions=(assumption, *guess.assumptions[1:2]),
+        input={**(guess.input or {}), **IMAGENET},
+    )
 
 
 def _in_pixels(boxes: NDArray[np.float64], size_px: Size) -> NDArray[np.float64]:

@@ -55,7 +55,7 @@ class YoloV7NmsOutput(BoxOutput):
             return None
         return Guess(
             {"kind": "yolov7-nms", "overlap": 1.0},
-            len(model.class_names) or None,
+            len(model.class_names) or model.class_count,
             ("rows of 7, as YOLOv7 exports with --end2end --max-wh",),
             ("boxes are in input pixels",),
             PICTURE,
@@ -88,7 +88,7 @@ class MmdeployOutput(BoxOutput):
             return None
         return Guess(
             {"kind": "mmdeploy", "overlap": 1.0},
-            len(model.class_names) or None,
+            len(model.class_names) or model.class_count,
             ("outputs dets, of 5 columns, and labels, as mmdeploy names them",),
             (
                 "pixels are BGR with ImageNet's mean and deviation, as RTMDet expects; see "
@@ -130,7 +130,7 @@ class EfficientNmsOutput(BoxOutput):
         keys = ("count", "boxes", "scores", "labels")
         return Guess(
             {"kind": "efficient-nms", **dict(zip(keys, names, strict=True)), "overlap": 1.0},
-            len(model.class_names) or None,
+            len(model.class_names) or model.class_count,
             (f"its outputs are called {', '.join(names)}",),
             ("boxes are corners in input pixels",),
             PICTURE,

@@ -44,7 +44,20 @@ def oddity(found: BoxCandidates, size_px: Size, score: float) -> str | None:
         why = _misplaced(found.boxes_px[which], size_px, what)
         if why is not None:
             return why
+    if _are_corners(found.boxes_px[is_box], size_px):
+        return "the boxes are corners, taken for center and size"
     return _alike(found.boxes_px[is_sure], found.scores[is_sure], size_px)
+
+
+def _are_corners(boxes_px: Floats, size_px: Size) -> bool:
+    """Whether "sizes" exceed "centers" all over the picture, as x1 exceeds x0."""
+    centers, sides = (boxes_px[:, :2] + boxes_px[:, 2:]) / 2.0, boxes_px[:, 2:] - boxes_px[:, :2]
+    if (
+        len(boxes_px) < _MANY
+        or (np.percentile(centers, 95, axis=0) < np.multiply(0.8, size_px)).any()
+    ):
+        return False
+    return bool((sides > centers).all(axis=1).mean() >= SENSIBLE_FRACTION)
 
 
 def _misplaced(boxes_px: Floats, size_px: Size, what: str) -> str | None:

@@ -192,21 +192,22 @@ class PrototypeMasks:
 def prototype_output(model: Interface) -> tuple[str, int] | None:
     """Name of the output with prototype masks, and their number; None without such an output."""
     for out in model.outputs:
-        count = static(out.shape, 1)
-        if len(out.shape) == 4 and count == _COEFFICIENTS:
-            return out.name, count
+        # In TFLite files the prototypes are the last axis.
+        if len(out.shape) == 4 and _COEFFICIENTS in (out.shape[1], out.shape[3]):
+            return out.name, _COEFFICIENTS
     return None
 
 
 def prototypes_of(output: Array) -> NDArray[np.float64]:
-    """Remove the batch axis of prototype masks (1, K, h, w).
+    """Remove the batch axis of prototype masks (1, K, h, w), or (1, h, w, K) in TFLite files.
 
     Raises:
         ValueError: The output has another shape.
     """
-    if output.ndim != 4 or output.shape[0] != 1:
-        raise ValueError(f"prototypes: expected (1, K, h, w), got {output.shape}")
-    return np.asarray(output[0], np.float64)
+    if output.ndim != 4 or output.shape[0] != 1 or _COEFFICIENTS not in output.shape:
+        raise ValueError(f"prototypes: expected (1, {_COEFFICIENTS}, h, w), got {output.shape}")
+    is_last = output.shape[1] != _COEFFICIENTS
+    return np.asarray(output[0].transpose(2, 0, 1) if is_last else output[0], np.float64)
 
 
 def _columns(output: Array, rows: int) -> NDArray[np.float64]:

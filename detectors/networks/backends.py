@@ -6,6 +6,7 @@ TFLite in LiteRT. Weights are bytes of a verified hash and never refer to anothe
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -24,12 +25,13 @@ from crosscue.detectors.decoders.base import (
 from crosscue.replay.errors import VehicleError, one_line
 from crosscue.replay.versions import installed
 
-from .free_size import Size, free_size, replace_size
-from .onnx_input import input_shape
+from .free_size import Size, free_size, input_shape, replace_size
 from .openvino import import_openvino
 from .weights import Weights
 
 Array = NDArray[np.generic]
+# Errors of ONNX Runtime and of LiteRT where an operation is unknown.
+_LACKING: Final = re.compile(r"([\w.:]+)\(-?\d+\) is not a registered|custom op: ([\w.-]+\w)")
 # Encoded protobuf key of a tensor that is stored in another file.
 _EXTERNAL: Final = b"\x0a\x08location"
 
@@ -100,15 +102,20 @@ def load_network(
     except VehicleError:
         raise
     except Exception as error:
-        raise VehicleError(
-            f"{weights.name}: {name} cannot read it: {one_line(error, 200)}; is it complete?"
-        ) from None
+        why = missing_operation(error) or f"{one_line(error, 200)}; is it complete?"
+        raise VehicleError(f"{weights.name}: {name} cannot read it: {why}") from None
+
+
+def missing_operation(error: Exception) -> str | None:
+    """Name the operation that a back end does not know; None if its error is another."""
+    found = _LACKING.search(str(error))
+    return found and f"the operation {found[1] or found[2]} is unknown; export it without that"
 
 
 def _missing(name: str, size_px: Size | None) -> str:
     """Return the project that a back end lacks; empty for none."""
     needs = [_PACKAGE[name]]
-    if name == "onnxruntime" and size_px is not None:
+    if (name, size_px is None) in (("onnxruntime", False), ("opencv", True)):
         needs.append(("onnx", "onnx"))
     return next((project for module, project in needs if find_spec(module) is None), "")
 
@@ -150,10 +157,10 @@ def _in_opencv(weights: Weights, threads: int, size_px: Size | None) -> Network:
 
     net = cv2.dnn.readNetFromONNX(np.frombuffer(weights.content, np.uint8))
     names = list(net.getUnconnectedOutLayersNames())
-    wanted = input_shape(weights.content)
+    wanted = None if size_px is not None else input_shape(weights.content)
 
     def call(batch: Array) -> Mapping[str, Array]:
-        if size_px is None and wanted is not None and not _fits(batch.shape, wanted):
+        if wanted is not None and not _fits(batch.shape, wanted):
             raise ValueError(f"got {batch.shape}, the network's own input is {wanted}")
         net.setInput(np.asarray(batch))
         outputs = net.forward(names)

@@ -11,6 +11,7 @@ import re
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -21,6 +22,7 @@ from crosscue.detectors.catalog.architectures import ARCHITECTURES, Architecture
 from crosscue.detectors.catalog.card import MAX_BYTES, ModelCard
 from crosscue.detectors.decoders.base import Array
 from crosscue.detectors.networks.devices import chosen_device, threads_of
+from crosscue.detectors.weights_file import unpack_weights
 from crosscue.replay.errors import VehicleError, one_line
 
 from .weights import Weights
@@ -53,9 +55,8 @@ def read_state_dict(content: bytes, where: str) -> StateDict:
         VehicleError: The file holds code or objects other than tensors, holds no tensors, or is
             damaged.
     """
-    tree = (
-        _safetensors(content, where) if where.endswith(".safetensors") else _torch(content, where)
-    )
+    is_safe = where.endswith(".safetensors")
+    tree = unpack_weights(content, "", Path(where))[1] if is_safe else _torch(content, where)
     notes = []
     for key in _NESTED:
         if isinstance(tree, Mapping) and isinstance(tree.get(key), Mapping):
@@ -83,18 +84,6 @@ _SAVE_OR_EXPORT: Final = f"{_SAVE}, or export the network to ONNX"
 _EXPORT: Final = "export the network to ONNX with the project that wrote it"
 # Packages of networks that are not torchvision's, so that their tensors alone are of no use.
 _PROJECTS: Final = frozenset({"models", "ultralytics", "yolox", "super_gradients", "transformers"})
-
-
-def _safetensors(content: bytes, where: str) -> Mapping[str, Tensor]:
-    from safetensors import SafetensorError
-    from safetensors.torch import load
-
-    try:
-        found: Mapping[str, Tensor] = load(content)
-    except (SafetensorError, ValueError) as error:
-        why = one_line(error, 120)
-        raise VehicleError(f"{where}: not a safetensors file ({why}); is it complete?") from None
-    return found
 
 
 def _torch(content: bytes, where: str) -> Any:

@@ -1,5 +1,6 @@
 """Commands return the exit status that docs/reference/exit_status.md states in each row."""
 
+import hashlib
 import json
 import re
 import shutil
@@ -7,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from support.empty_inputs import COMMANDS, empty_inputs
 from support.every_format import EVERY_FORMAT
 from support.landmark_files import database_of
 from support.mcap_files import ChunkOf, McapFile, channel, message, schema
+from support.onnx_models import bright_box_model
 from support.pictures import picture_folder
 
 PAGE: Final = Path(__file__).parents[2] / "docs" / "reference" / "exit_status.md"
@@ -108,7 +111,11 @@ EMPTY: Final[dict[str, list[tuple[int, str]]]] = {
     "`fit ...`, `train ...`": _empty_cases("fit", "train"),
     "`landmarks add`": _empty_cases("landmarks"),
     "`vehicle init`, `check`": _empty_cases("vehicle", "check"),
-    "`check` of a log": [(1, "check {can_log}"), (3, "check {log} --vehicle {car} --for cues")],
+    "`check` of a log": [
+        (1, "check {can_log}"),
+        (3, "check {log} --vehicle {car} --for cues"),
+    ],
+    "`check` of a model": [(3, "check {dim} --picture {white}")],
     "`merge`": _empty_cases("merge"),
     "`info`, `query`": [
         (0, "info {rowless}"),
@@ -166,6 +173,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     }
     for name, content in cars.items():
         (drive / f"{name}.toml").write_text(content)
+    _dim_network(folder)
     spoiled = picture_folder(folder / "spoiled", 3, "rate_hz: 10\n")
     for one in spoiled.glob("*.png"):
         one.write_bytes(b"\x89PNG")
@@ -189,6 +197,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "noise": folder / "noise",
         "gone": folder / "gone",
         "noise2": folder / "noise2",
+        "white": folder / "white.png",
         "cut": folder / "cut.mcap",
         "older": _copied(run, folder / "older", _of_version_0),
         "cut_run": _copied(run, folder / "cut_run", _cut_table),
@@ -198,6 +207,18 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "spoiled": spoiled,
         **{name: folder / f"{name}.mcap" for name in parts},
     }
+
+
+def _dim_network(folder: Path) -> None:
+    """Write a card with another scale than its network expects, and a picture."""
+    content = bright_box_model()
+    (folder / "dim.onnx").write_bytes(content)
+    (folder / "dim.toml").write_text(
+        f'version = 1\nweights = "dim.onnx"\nsha256 = "{hashlib.sha256(content).hexdigest()}"\n'
+        "[input]\nwidth_px = 96\nheight_px = 64\nscale = [0.004, 0.004, 0.004]\n"
+        '[output]\nkind = "end-to-end"\nclasses = ["bright"]\n'
+    )
+    cv2.imwrite(str(folder / "white.png"), np.full((64, 96, 3), 255, np.uint8))
 
 
 def _copied(run: Path, place: Path, change: Callable[[Path], object]) -> Path:

@@ -13,7 +13,7 @@ import pytest
 import crosscue
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.catalog.recognise import guesses, plausible, read_interface
-from crosscue.detectors.decoders.base import Size, decoder_name
+from crosscue.detectors.decoders.base import Size, cell_grid, decoder_name
 from crosscue.detectors.decoders.table import DECODERS
 from crosscue.detectors.networks.model_detector import build
 from crosscue.replay.errors import VehicleError
@@ -28,7 +28,7 @@ from support.decoder_samples import (
     export,
     nanodet_of_coco,
 )
-from support.onnx_models import bright_box_model
+from support.onnx_models import bright_box_model, constant_model
 
 SIZES: Final = pytest.mark.parametrize("size", [SIZE, TALL], ids=["wide", "tall"])
 # Families whose files another one can have as well: --kind, or the number of class names, decides.
@@ -152,3 +152,43 @@ def test_fit_is_not_in_doubt_where_metadata_or_proportions_decide(tmp_path: Path
         drafted = crosscue.draft_card(net, class_names=["x"], size_px=(96, 64), picture=street)
 
         assert not [line for line in drafted.draft.assumed if "input.fit" in line]
+
+
+@pytest.mark.parametrize("scores", ["ArgMax", "EfficientNMS_TRT"])
+@pytest.mark.parametrize("count", [3, 80])
+def test_number_of_classes_is_read_from_the_suppression(
+    tmp_path: Path, scores: str, count: int
+) -> None:
+    """YOLOv7's export has no names, and its output, rows of 7, does not say how many there are."""
+    net = tmp_path / "net.onnx"
+    model = onnx.load_model_from_string(export(EVERY["yolov7-nms"](SIZE)))
+    graph, helper = model.graph, onnx.helper
+    for name, shape in (("all", (1, 9, count)), ("boxes", (1, 9, 4)), ("best", (1, 1, 9))):
+        graph.initializer.append(onnx.numpy_helper.from_array(np.zeros(shape, np.float32), name))
+    graph.node.append(helper.make_node("Identity", ["all"], ["scores"]))
+    if scores == "ArgMax":
+        graph.node.append(helper.make_node("ArgMax", ["scores"], ["unused"], axis=2))
+        graph.node.append(helper.make_node("NonMaxSuppression", ["boxes", "best"], ["kept"]))
+    else:
+        plugin = helper.make_node(scores, ["boxes", "scores"], ["kept"], domain="TRT")
+        graph.node.append(plugin)
+        model.opset_import.append(helper.make_opsetid("TRT", 1))
+    net.write_bytes(model.SerializeToString())
+
+    guess = guesses(read_interface(net))[0]
+
+    assert (guess.settings["kind"], guess.class_count) == ("yolov7-nms", count)
+
+
+@SIZES
+def test_corners_are_not_taken_for_center_and_size(tmp_path: Path, size: Size) -> None:
+    """LibreYOLO's YOLOv9 has the rows of YOLOv8, with boxes as corners."""
+    net = tmp_path / "net.onnx"
+    corner, stride = cell_grid(size, (8, 16, 32))
+    middle = (corner + 0.5) * stride
+    rows = np.hstack([middle - stride, middle + stride, np.full((len(corner), 3), 0.01)])
+    outputs = {"output": np.clip(rows, 0.0, None).T[None].astype(np.float32)}
+    net.write_bytes(constant_model((1, 3, size[1], size[0]), outputs))
+
+    with pytest.raises(VehicleError, match="on noise, the boxes are corners, taken for center and"):
+        crosscue.draft_card(net, class_names=CLASSES)

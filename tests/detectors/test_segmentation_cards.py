@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import onnx
 import pytest
 from numpy.typing import NDArray
 
@@ -88,3 +89,15 @@ def test_real_network_draws_its_road(tmp_path: Path, weights: str) -> None:
     assert above.mean() < 0.1
     drawn = np.asarray(cv2.imread(str(found.picture)), np.int64)
     assert np.abs(drawn - pixels).max(axis=2).mean() > 10.0
+
+
+def test_networks_of_transformers_get_imagenet_s_mean(tmp_path: Path) -> None:
+    path = network(tmp_path, logits=scores((16, 8)))
+    model = onnx.load(path)
+    assert all(model.graph.input[0].name not in node.input for node in model.graph.node)
+    model.graph.input[0].name = "pixel_values"
+    onnx.save(model, path)
+
+    given = crosscue.model(crosscue.draft_card(path, classes="road,curb").path).card.input
+
+    assert (given.colour, given.mean[0]) == ("rgb", 123.675)

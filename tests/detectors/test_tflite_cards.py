@@ -15,7 +15,7 @@ from crosscue.detectors.base import Detections, Frame, RoadMask
 from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.draft import draft_card_text
 from crosscue.detectors.catalog.recognise import _suppressed_classes, guesses
-from crosscue.detectors.decoders.base import Interface, Size, Tensor, cell_grid
+from crosscue.detectors.decoders.base import Interface, Size, Tensor, cell_count, cell_grid
 from crosscue.detectors.networks.model_detector import build
 from support.data import shared
 from support.decoder_samples import BOX, CLASSES, SIZE, TALL, export
@@ -238,3 +238,50 @@ def test_suppressed_network_of_other_classes_asks_for_their_names(tmp_path: Path
 
     with pytest.raises(crosscue.UsageError, match="5 classes without names"):
         draft_card_text(net, model, guess)
+
+
+@SIZES
+def test_masks_with_channels_last_are_exact(tmp_path: Path, size: Size) -> None:
+    """Ultralytics' segmentation networks in TFLite have prototypes (1, h, w, 32)."""
+    net = tmp_path / "net.tflite"
+    width, height = size
+    table = columns(size)
+    weights = np.zeros((1, 32, table.shape[2]), np.float32)
+    weights[0, 7, 3] = 1.0
+    prototypes = np.full((1, height // 4, width // 4, 32), -9.0, np.float32)
+    # The upper half of the box.
+    prototypes[0, 10:22, 25:55, 7] = 9.0
+    outputs = {"Identity": np.concatenate([table, weights], axis=1), "Identity_1": prototypes}
+    files = {"temp_meta.txt": NAMES["temp_meta.txt"].replace("detect", "segment")}
+    net.write_bytes(constant_tflite((1, height, width, 3), outputs, files=files))
+
+    drafted = crosscue.draft_card(net)
+
+    assert drafted.draft.kind == "yolov8-seg"
+    found = found_in(drafted.path, size)
+    np.testing.assert_allclose(found.boxes_px, [BOX], atol=1e-3)
+    assert found.mask(0)[60, 160]
+    assert not found.mask(0)[120, 160]
+
+
+@pytest.mark.parametrize(
+    ("scale", "zero", "darkest"), [(1 / 127.5, -1, -1.0), (1 / 255, -128, 0.0), (1.0, -128, 0.0)]
+)
+def test_quantised_input_says_how_pixels_are_scaled(
+    tmp_path: Path, scale: float, zero: int, darkest: float
+) -> None:
+    """A YOLOX export in int8 has pixels from 0 to 255, or what it was calibrated with."""
+    net = tmp_path / "net.tflite"
+    rows = np.zeros((1, cell_count(SIZE, (8, 16, 32)), 8), np.float32)
+    content = constant_tflite(
+        (1, SIZE[1], SIZE[0], 3), {"Identity": rows}, dtype="int8", scales={"images": (scale, zero)}
+    )
+    net.write_bytes(content)
+
+    drafted = crosscue.draft_card(net, kind="yolox", class_names=CLASSES)
+
+    given = read_card(drafted.path).input
+    (low, high) = ((np.array([0.0, 255.0]) - given.mean[0]) * given.scale[0]).tolist()
+    np.testing.assert_allclose((low, high), (darkest, darkest + 255.0 * scale), atol=1.01 * scale)
+    is_usual = scale == 1.0
+    assert any("its input is quantised for" in why for why in drafted.draft.certain) != is_usual

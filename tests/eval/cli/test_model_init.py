@@ -122,8 +122,9 @@ def test_class_names_of_openvino_file_are_read(
         (("logits", "pred_boxes"), 80, "sigmoid", False),
         (("logits", "pred_boxes"), 92, "softmax", True),
         (("labels", "dets"), 91, "sigmoid", True),
+        (("logits", "pred_boxes"), 91, "sigmoid", True),
     ],
-    ids=("RT-DETR", "DETR", "RF-DETR"),
+    ids=("RT-DETR", "DETR", "RF-DETR", "Deformable DETR"),
 )
 def test_detr_variants_are_distinguished(
     tmp_path: Path, names: tuple[str, str], columns: int, activation: str, is_normalised: bool
@@ -140,6 +141,48 @@ def test_detr_variants_are_distinguished(
     assert (card.input.mean != (0.0, 0.0, 0.0)) == is_normalised
     number = card.output.classes.index("stop sign") + card.output.first_class
     assert number == (11 if columns == 80 else 13)
+
+
+@pytest.mark.parametrize(
+    ("shape", "said"),
+    [((2, 3, 64, 128), "runs on 2 pictures at once"), ((1, 1, 64, 128), "input 1x1x64x128: exp")],
+)
+def test_network_for_other_inputs_than_one_coloured_picture_is_refused(
+    tmp_path: Path, shape: tuple[int, ...], said: str
+) -> None:
+    path = tmp_path / "my.onnx"
+    path.write_bytes(constant_model(shape, {"output0": _zeros(2, 300, 6)}))
+
+    with pytest.raises(crosscue.UsageError, match=rf"my\.onnx: {said}"):
+        crosscue.draft_card(path, class_names=["a"])
+
+
+def test_operation_that_no_back_end_knows_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "my.onnx"
+    model = onnx.load_model_from_string(constant_model((1, 3, 64, 128), {"rows": _zeros(1, 9, 6)}))
+    model.opset_import.append(onnx.helper.make_opsetid("TRT", 1))
+    plugin = onnx.helper.make_node("EfficientNMS_TRT", ["rows"], ["more"], domain="TRT")
+    model.graph.node.append(plugin)
+    path.write_bytes(model.SerializeToString())
+
+    said = r"the operation TRT:EfficientNMS_TRT is unknown; export it without that"
+    with pytest.raises(crosscue.errors.VehicleError, match=said):
+        crosscue.draft_card(path, class_names=["a"], kind="end-to-end")
+
+
+def test_class_names_tell_detr_with_a_column_for_no_object(tmp_path: Path) -> None:
+    """DETR and YOLOS of Transformers have one column more than classes, RT-DETR has not."""
+    path = tmp_path / "my.onnx"
+    outputs = {"logits": _zeros(1, 50, 4), "pred_boxes": _zeros(1, 50, 4)}
+    path.write_bytes(constant_model((1, 3, 64, 128), outputs))
+
+    found = []
+    for names in (["a", "b", "c"], ["a", "b", "c", "d"]):
+        card = read_card(crosscue.draft_card(path, class_names=names, overwrite=True).path)
+        assert isinstance(card.output, DetrOutput)
+        found.append((card.output.activation, card.input.mean != (0.0, 0.0, 0.0)))
+
+    assert found == [("softmax", True), ("sigmoid", False)]
 
 
 def test_network_with_size_input_receives_the_picture_size(tmp_path: Path) -> None:
