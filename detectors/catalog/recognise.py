@@ -377,13 +377,13 @@ def input_settings(model: Interface, guess: Guess) -> dict[str, object]:
 def _quantised(usual: Mapping[str, object], low: float, high: float) -> dict[str, object]:
     """Return mean and scale with which black is the lowest number and white the highest.
 
-    Empty if those of the layout are about these, or differ between colours.
+    Empty if those of the layout stay within these, or differ between colours.
     """
     keys = {key: value for key, value in usual.items() if key in ("mean", "scale")}
     given = Input.model_validate({"width_px": 1, "height_px": 1, **keys})
     black, white = -given.mean[0] * given.scale[0], (255.0 - given.mean[0]) * given.scale[0]
     step = (high - low) / 255.0
-    if len({*given.mean}) > 1 or max(abs(black - low), abs(white - high)) < 5.0 * step:
+    if len({*given.mean}) > 1 or max(low - black, white - high) < 5.0 * step:
         return {}
     return {"mean": (-low / step,) * 3, "scale": (step,) * 3}
 
