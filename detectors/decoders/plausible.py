@@ -74,8 +74,8 @@ def _misplaced(boxes_px: Floats, size_px: Size, what: str) -> str | None:
             return f"{is_odd.sum()} of {len(boxes_px)} {what} {how}"
     if len(boxes_px) >= _FEW and np.percentile(boxes_px, 99) <= _CORNER_PX:
         return (
-            f"nearly all {len(boxes_px)} {what} are within {_CORNER_PX:g} pixels of the corner: fractions "
-            "taken for pixels"
+            f"nearly all {len(boxes_px)} {what} are within {_CORNER_PX:g} pixels of the corner: "
+            "fractions taken for pixels"
         )
     return None
 

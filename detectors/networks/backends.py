@@ -198,19 +198,26 @@ def _in_openvino(weights: Weights, threads: int, size_px: Size | None) -> Networ
 
 def _in_litert(weights: Weights, threads: int, size_px: Size | None) -> Network:
     litert: Any = import_module("ai_edge_litert.interpreter")
-    net = litert.Interpreter(model_content=weights.content, num_threads=threads)
+    given: dict[str, Any] = {"model_content": weights.content, "num_threads": threads}
+    net, backend = litert.Interpreter(**given), f"litert {installed('ai-edge-litert')}"
+    kinds = {one["dtype"] for one in net.get_tensor_details()}
+    if net.get_input_details()[0]["dtype"] == np.float32 and np.int8 in kinds:
+        # With weights in int8, XNNPACK (LiteRT 2.3) reads memory that nobody has written.
+        plain = litert.OpResolverType.BUILTIN_WITHOUT_DEFAULT_DELEGATES
+        net = litert.Interpreter(**given, experimental_op_resolver_type=plain)
+        backend += " without XNNPACK"
     if size_px is not None:
         first = net.get_input_details()[0]
         net.resize_tensor_input(first["index"], replace_size(first["shape"].tolist(), size_px))
     net.allocate_tensors()
-    given, outputs = net.get_input_details()[0], net.get_output_details()
+    image, outputs = net.get_input_details()[0], net.get_output_details()
 
     def call(batch: Array) -> Mapping[str, Array]:
-        net.set_tensor(given["index"], _quantised(batch, given))
+        net.set_tensor(image["index"], _quantised(batch, image))
         net.invoke()
         return {str(out["name"]): _real(net.get_tensor(out["index"]), out) for out in outputs}
 
-    return _Function(f"litert {installed('ai-edge-litert')}", call)
+    return _Function(backend, call)
 
 
 def _quantised(batch: Array, given: Any) -> Array:

@@ -16,7 +16,9 @@ from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.draft import draft_card_text
 from crosscue.detectors.catalog.recognise import _suppressed_classes, guesses
 from crosscue.detectors.decoders.base import Interface, Size, Tensor, cell_count, cell_grid
+from crosscue.detectors.networks.backends import load_network
 from crosscue.detectors.networks.model_detector import build
+from crosscue.detectors.networks.weights import Weights
 from support.data import shared
 from support.decoder_samples import BOX, CLASSES, SIZE, TALL, export
 from support.decoder_samples import EVERY as FAMILIES
@@ -289,3 +291,15 @@ def test_quantised_input_says_how_pixels_are_scaled(
     np.testing.assert_allclose((low, high), (darkest, brightest), atol=1.01 * scale)
     is_usual = scale >= 1.0
     assert any("its input is quantised for" in why for why in drafted.draft.certain) != is_usual
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.float32])
+def test_network_with_int8_numbers_runs_without_xnnpack(kind: type[np.number[Any]]) -> None:
+    """In Ultralytics' segmentation in int8, it returned NaN for 1,000 numbers in some processes."""
+    rows = np.zeros((1, 6, 50), kind)
+    content = constant_tflite((1, 64, 64, 3), {"rows": rows}, scales={"rows": (0.1, 0)})
+
+    network = load_network(Weights(name="net.tflite", content=content))
+
+    assert network.backend.endswith(" without XNNPACK") == (kind is np.int8)
+    assert not network(np.zeros((1, 64, 64, 3), np.float32))["rows"].any()
