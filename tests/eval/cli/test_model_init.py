@@ -157,6 +157,19 @@ def test_network_for_other_inputs_than_one_coloured_picture_is_refused(
         crosscue.draft_card(path, class_names=["a"])
 
 
+def test_card_of_a_link_is_beside_the_link(tmp_path: Path) -> None:
+    """A cache of downloads names its files by their hash, and links to them."""
+    (tmp_path / "blobs").mkdir()
+    blob, path = tmp_path / "blobs" / "0f3a", tmp_path / "my.onnx"
+    blob.write_bytes(constant_model((1, 3, 64, 128), {"output0": _zeros(1, 300, 6)}))
+    path.symlink_to(blob)
+
+    drafted = crosscue.draft_card(path, class_names=["a"], kind="end-to-end")
+
+    assert drafted.path == tmp_path / "my.toml"
+    assert read_card(drafted.path).weights == "my.onnx"
+
+
 def test_operation_that_no_back_end_knows_is_named(tmp_path: Path) -> None:
     path = tmp_path / "my.onnx"
     model = onnx.load_model_from_string(constant_model((1, 3, 64, 128), {"rows": _zeros(1, 9, 6)}))
