@@ -44,9 +44,10 @@ def oddity(found: BoxCandidates, size_px: Size, score: float) -> str | None:
         why = _misplaced(found.boxes_px[which], size_px, what)
         if why is not None:
             return why
-    if _are_corners(found.boxes_px[is_box], size_px):
+    why = _alike(found.boxes_px[is_sure], found.scores[is_sure], size_px)
+    if why is None and _are_corners(found.boxes_px[is_box], size_px):
         return "the boxes are corners, taken for center and size"
-    return _alike(found.boxes_px[is_sure], found.scores[is_sure], size_px)
+    return why
 
 
 def _are_corners(boxes_px: Floats, size_px: Size) -> bool:

@@ -93,12 +93,12 @@ def test_family_with_numbers_that_are_not_finite_gets_no_card(tmp_path: Path, fa
     assert not net.with_suffix(".toml").exists()
 
 
-def test_number_of_class_names_decides_between_families(tmp_path: Path) -> None:
-    """4 + 3 columns of Paddle's export are 5 + 2 of YOLOX's."""
+def test_boxes_decide_between_families(tmp_path: Path) -> None:
+    """4 + 3 columns of Paddle's export are 5 + 2 of YOLOX's, but its boxes are corners."""
     net = tmp_path / "net.onnx"
     net.write_bytes(export(EVERY["pp-yoloe, one output"](SIZE)))
 
-    with pytest.raises(crosscue.UsageError, match=r"several kinds fit: yolov5 .*pp-yoloe"):
+    with pytest.raises(crosscue.UsageError, match=r"net\.onnx: 3 classes without names"):
         crosscue.draft_card(net)
 
     assert crosscue.draft_card(net, class_names=CLASSES).draft.kind == "pp-yoloe"
