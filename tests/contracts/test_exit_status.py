@@ -111,10 +111,7 @@ EMPTY: Final[dict[str, list[tuple[int, str]]]] = {
     "`fit ...`, `train ...`": _empty_cases("fit", "train"),
     "`landmarks add`": _empty_cases("landmarks"),
     "`vehicle init`, `check`": _empty_cases("vehicle", "check"),
-    "`check` of a log": [
-        (1, "check {can_log}"),
-        (3, "check {log} --vehicle {car} --for cues"),
-    ],
+    "`check` of a log": [(1, "check {can_log}"), (3, "check {log} --vehicle {car} --for cues")],
     "`check` of a model": [(3, "check {dim} --picture {white}")],
     "`merge`": _empty_cases("merge"),
     "`info`, `query`": [

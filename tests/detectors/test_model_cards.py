@@ -5,10 +5,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import onnx
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
@@ -20,9 +20,9 @@ from crosscue.detectors.catalog.cards import check_card
 from crosscue.detectors.catalog.recognise import guesses, read_interface
 from crosscue.detectors.networks.backends import load_network
 from crosscue.detectors.networks.model_detector import build
-from crosscue.detectors.networks.onnx_input import input_shape
 from crosscue.detectors.networks.picture_input import prepared
 from crosscue.detectors.networks.weights import Weights
+from crosscue.eval import cli
 from crosscue.replay.errors import UsageError, VehicleError
 from support.data import shared
 from support.detecting import yolox_card
@@ -201,45 +201,6 @@ def test_fully_convolutional_network_runs_at_the_size_of_the_card(
     assert large.labels.count("car") > small.labels.count("car")
 
 
-def varint(value: int) -> bytes:
-    out = bytearray()
-    while value > 0x7F:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes([*out, value])
-
-
-def part(number: int, content: bytes) -> bytes:
-    return varint(number << 3 | 2) + varint(len(content)) + content
-
-
-def number(field: int, value: int) -> bytes:
-    return varint(field << 3) + varint(value)
-
-
-def value_info(name: bytes, sizes: list[int | None]) -> bytes:
-    dimensions = [part(1, part(2, b"n") if size is None else number(1, size)) for size in sizes]
-    tensor = number(1, 1) + part(2, b"".join(dimensions))
-    return part(1, name) + part(2, part(1, tensor))
-
-
-def model(*inputs: bytes, weights: tuple[bytes, ...] = ()) -> bytes:
-    tensors = [part(5, part(8, name) + part(9, b"\0" * 300)) for name in weights]
-    graph = b"".join([*tensors, *(part(11, one) for one in inputs)])
-    return number(1, 8) + part(2, b"maker") + part(7, graph)
-
-
-@given(st.binary(max_size=60), st.integers(0, 400))
-@settings(max_examples=100)
-def test_damaged_file_yields_an_error_or_a_valid_shape(noise: bytes, cut: int) -> None:
-    for content in (noise, model(value_info(b"x", [1, 3, 8, 8]), weights=(b"w",))[:cut] + noise):
-        try:
-            found = input_shape(content)
-        except ValueError:
-            continue
-        assert found is None or all(size is None or size > 0 for size in found)
-
-
 @pytest.mark.parametrize("backend", ["opencv", "onnxruntime"])
 def test_card_of_another_size_than_its_network_is_refused(backend: str, tmp_path: Path) -> None:
     card = yolox_card(tmp_path, width_px="640")
@@ -372,3 +333,71 @@ def test_without_onnx_network_of_its_own_size_only_runs_in_onnxruntime(
     (tmp_path / "net.onnx").write_bytes(weights.content)
     with pytest.raises(UsageError, match="needs the package onnx: pip install onnx"):
         read_interface(tmp_path / "net.onnx")
+
+
+def blue_box_model() -> bytes:
+    """The network that finds a bright box, in the first channel only."""
+    model = onnx.load_model_from_string(bright_box_model())
+    graph = model.graph
+    graph.initializer.append(onnx.numpy_helper.from_array(np.array([0]), "first"))
+    grey = next(node for node in graph.node if "images" in node.input)
+    grey.input[0] = "blue"
+    graph.node.insert(0, onnx.helper.make_node("Gather", ["images", "first"], ["blue"], axis=1))
+    return bytes(model.SerializeToString())
+
+
+@pytest.mark.parametrize(
+    ("key", "line", "said"),
+    [
+        ("scale", "scale = [0.00392, 0.00392, 0.00392]", "scale = 1, pixels from 0 to 255"),
+        ("mean", "mean = [300.0, 300.0, 300.0]", "scale = 1, pixels from 0 to 255"),
+        ("colour", 'colour = "rgb"', 'colour = "bgr"'),
+    ],
+)
+def test_check_says_with_which_input_a_network_finds_something(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], key: str, line: str, said: str
+) -> None:
+    model = blue_box_model() if key == "colour" else bright_box_model()
+    path = card_of_boxes(tmp_path, model, END_TO_END)
+    text = path.read_text()
+    street = tmp_path / "street.png"
+    cv2.imwrite(str(street), np.full((128, 256, 3), (255, 40, 40), np.uint8))
+    assert check_card(path, street).doubt is None
+
+    path.write_text(text.replace("[output]", f"{line}\n[output]"))
+    status = cli.run(["check", str(path), "--picture", str(street)])
+
+    assert status == 3
+    (doubt,) = [one for one in capsys.readouterr().out.splitlines() if one.startswith("doubt")]
+    assert f"0 boxes above 0.3 in the picture, 1 boxes with scores up to 1.00 with {said}" in doubt
+
+
+def test_check_says_with_which_input_there_is_no_flood_of_sure_boxes(tmp_path: Path) -> None:
+    """Scores of 200 boxes are about the brightness, at most 1."""
+    model = onnx.load_model_from_string(constant_model(SHAPE, {"rows": rows()}))
+    graph, helper = model.graph, onnx.helper
+    for name, values in (("boxes", rows()[..., :4]), ("class", rows()[..., 5:])):
+        graph.initializer.append(onnx.numpy_helper.from_array(values, name))
+    spread = np.linspace(0.0, 0.015, 200, dtype=np.float32).reshape(1, 200, 1)
+    graph.initializer.append(onnx.numpy_helper.from_array(spread, "spread"))
+    del graph.node[:], graph.output[:]
+    graph.node.extend(
+        [
+            helper.make_node("ReduceMean", ["images"], ["grey"], axes=[1, 2, 3], keepdims=0),
+            helper.make_node("Clip", ["grey", "", "one"], ["most"]),
+            helper.make_node("Sub", ["most", "spread"], ["score"]),
+            helper.make_node("Concat", ["boxes", "score", "class"], ["rows"], axis=2),
+        ]
+    )
+    graph.initializer.append(onnx.numpy_helper.from_array(np.array(1.0, np.float32), "one"))
+    given = helper.make_tensor_value_info("rows", onnx.TensorProto.FLOAT, [1, 200, 6])
+    graph.output.append(given)
+    street = tmp_path / "street.png"
+    cv2.imwrite(str(street), np.full((128, 256, 3), 140, np.uint8))
+    path = card_of_boxes(tmp_path, model.SerializeToString(), END_TO_END)
+
+    doubt = check_card(path, street).doubt
+
+    assert doubt is not None
+    assert "boxes with scores up to 1.00 above 0.3 in the picture" in doubt
+    assert "with scale = 1/255, pixels from 0 to 1" in doubt
