@@ -25,8 +25,13 @@ MAX_DELAY_S: Final = 1.0
 STEP_S: Final = 0.02
 # Change of the delay after the search.
 ENDS_S: Final = 0.1
-# S.d. up to which a delay counts as observable.
-OBSERVABLE_SD_S: Final = 0.05
+# A delay is observable if its 95 % interval is at most this wide to each side, and bounded, which
+# shows gross errors, up to an s.d.
+OBSERVABLE_S: Final = 0.015
+BOUNDED_SD_S: Final = 0.05
+# Least change of heading that is a turn: in less, pictures mostly show vibrations of the car, which
+# are faster than the pictures come.
+TURN_RAD: Final = np.radians(3.0)
 MIN_PAIRS: Final = 20
 # Time over which errors of successive pictures are correlated.
 CORRELATED_S: Final = 0.5
@@ -39,7 +44,7 @@ DRIFT_SD: Final = 100e-6
 MAX_GAP_S: Final = 0.5
 # S.d. of the error of the turn rate by pictures that is common to a turn, of the delay from the
 # motion around a standstill because the scene changes, and of the delay from unmodelled filters.
-TURN_SD_RADPS: Final = 3.5e-4
+TURN_SD_RADPS: Final = 2.5e-4
 STOP_SD_S: Final = 0.03
 FILTERS_SD_S: Final = 0.002
 # S.d. of the growth at a standstill, and of the growth of a moving scene as a fraction.
@@ -101,17 +106,23 @@ class CameraDelay:
 
     @property
     def is_observable(self) -> bool:
-        """True if the drive determines the delay."""
-        return self.sd_s <= OBSERVABLE_SD_S
+        """True if the drive determines the delay to 15 ms."""
+        return 1.96 * self.sd_s <= OBSERVABLE_S
+
+    @property
+    def is_bounded(self) -> bool:
+        """True if the drive determines the delay well enough to show a gross error."""
+        return self.sd_s <= BOUNDED_SD_S
 
     def __str__(self) -> str:
-        if not self.is_observable:
+        if not self.is_bounded:
             return f"not observable by {self.signal}: straight and steady"
         drift = ""
         if self.drift_ppm is not None and self.drift_sd_ppm is not None:
             drift = f", drift {self.drift_ppm:+.0f} +- {1.96 * self.drift_sd_ppm:.0f} ppm"
         late = f"{self.delay_s * 1e3:+.0f} +- {1.96 * self.sd_s * 1e3:.0f} ms"
-        return f"{late} by {self.signal}, {self.pairs} pairs of pictures{drift}"
+        coarse = "" if self.is_observable else f"; not observable to {OBSERVABLE_S * 1e3:.0f} ms"
+        return f"{late} by {self.signal}, {self.pairs} pairs of pictures{drift}{coarse}"
 
 
 def delay_by_yaw_rate(
@@ -126,6 +137,8 @@ def delay_by_yaw_rate(
         signal: Its name.
     """
     pairs = motion.take(np.isfinite(motion.turn_rad))
+    if len(pairs.turn_rad) and np.ptp(np.cumsum(pairs.turn_rad)) < TURN_RAD:
+        return CameraDelay(signal)
     integral = _Integral.of(t_ns, yaw_rate_radps)
     return _fitted(signal, pairs, pairs.turn_rad, integral, None)
 
@@ -151,8 +164,8 @@ def delay_by_speed(motion: PictureMotion, t_ns: Int64s, speed_mps: Floats) -> Ca
 
 
 def mean_delay(delays: Sequence[CameraDelay]) -> CameraDelay | None:
-    """Return the weighted mean of the observable delays; None if there is none."""
-    found = [one for one in delays if one.is_observable]
+    """Return the weighted mean of the bounded delays; None if there is none."""
+    found = [one for one in delays if one.is_bounded]
     if len(found) < 2:
         return found[0] if found else None
     weights = np.array([one.sd_s**-2 for one in found])

@@ -91,8 +91,7 @@ def windows_of(value: str, t_ns: Int64s, measured: Floats) -> list[MountingWindo
         t_ns: Times, ascending.
         measured: Measurements; NaN where unknown.
     """
-    known = np.isfinite(measured)
-    t_ns, measured = t_ns[known], measured[known]
+    t_ns, measured = _known(t_ns, measured)
     if not len(t_ns):
         return []
     number = (t_ns - t_ns[0]) // WINDOW_NS
@@ -106,10 +105,13 @@ def windows_of(value: str, t_ns: Int64s, measured: Floats) -> list[MountingWindo
 
 def whole(value: str, t_ns: Int64s, measured: Floats) -> MountingWindow | None:
     """Return the mean of all measurements; None with too few."""
-    known = np.isfinite(measured)
-    if known.sum() < MIN_MEASURED:
-        return None
-    return _window(value, t_ns[known], measured[known])
+    t_ns, measured = _known(t_ns, measured)
+    return _window(value, t_ns, measured) if len(t_ns) >= MIN_MEASURED else None
+
+
+def _known(t_ns: Int64s, measured: Floats) -> tuple[Int64s, Floats]:
+    is_known = np.isfinite(measured)
+    return t_ns[is_known], measured[is_known]
 
 
 def _window(value: str, t_ns: Int64s, measured: Floats) -> MountingWindow:
@@ -126,8 +128,7 @@ def steps_of(value: str, t_ns: Int64s, measured: Floats) -> list[MountingStep]:
         t_ns: Times, ascending.
         measured: Measurements; NaN where unknown.
     """
-    known = np.isfinite(measured)
-    t_ns, measured = t_ns[known], measured[known]
+    t_ns, measured = _known(t_ns, measured)
     found: list[MountingStep] = []
     for at in range(MIN_MEASURED, len(t_ns) - MIN_MEASURED + 1):
         before = measured[:at][t_ns[at] - t_ns[:at] <= BESIDE_NS]

@@ -124,7 +124,8 @@ def estimate_mounting(
             f"focal_px {NOT_CAN}needs a calibration, or pictures of a turn with a yaw rate"
         )
     late = mean_delay(found.delays)
-    if late is None:
+    if late is None or not late.is_observable:
+        late = None
         notes.append(f"delay_s {NOT_CAN}{_why_no_delay(found.delays)}")
     estimate = Estimate(focal_px=found.focal, delay_s=_delay(late), why_not=tuple(notes))
     if found.mounting is None:
@@ -279,7 +280,7 @@ def _delay(late: CameraDelay | None) -> MountingParameter | None:
 def _why_no_delay(delays: tuple[CameraDelay, ...]) -> str:
     if not delays:
         return "needs a yaw rate or the speed"
-    return "; ".join(map(str, delays)) + "; needs a turn or a stop"
+    return "; ".join(map(str, delays)) + "; needs a turn"
 
 
 def _angle(window: MountingWindow) -> MountingParameter:
