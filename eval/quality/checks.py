@@ -56,6 +56,11 @@ CAMERA_DELAY_S: Final = 0.03
 # Time for which a signal that usually changes may stay the same while the car moves.
 FROZEN_S: Final = 2.0
 LOST: Final = 0.01
+# Length of parts of the way that are compared with positions, how much further than it positions
+# may move, and in which share of the parts they may.
+WAY_M: Final = 30.0
+TOO_FAR: Final = 1.3
+FAR_PARTS: Final = 0.15
 # Readings between which a car cannot change: max step, rate of change, and the time between them.
 STEPS: Final = {Signal.WHEEL_SPEEDS: (2.0, 25.0), Signal.YAW_RATE: (0.5, 10.0)}
 STEP_S: Final = 0.2
@@ -300,7 +305,7 @@ def _lag(
     found = delay_by_yaw_rate(motion, late.t_ns, late.values)
     # Both must measure the same motion.
     is_same = SAME_SCALE[0] < found.scale < SAME_SCALE[1] and found.scale_sd < SAME_SD
-    if is_same and found.is_observable and abs(found.delay_s) > limit_s + 4.0 * found.sd_s:
+    if is_same and found.is_bounded and abs(found.delay_s) > limit_s + 4.0 * found.sd_s:
         # The delay is that of the reference.
         text = f"{name}: {-found.delay_s * 1e3:+.0f} ms late against {against}"
         yield "late", of, text, "correct its time stamps, or state its delay under [odometry]"
@@ -310,7 +315,10 @@ def _camera_delay(drive: QualityDrive) -> Found:
     found = mean_delay(drive.delays)
     if found is not None and abs(found.delay_s) > CAMERA_DELAY_S + 3.0 * found.sd_s:
         total_s = drive.vehicle.camera.delay_s + found.delay_s
-        yield "late", SEEING, f"pictures: {found}", f"set camera.delay_s = {total_s:.3f}"
+        advice = f"set camera.delay_s = {total_s:.3f}"
+        if not found.is_observable:
+            advice = "correct their time stamps, or record a turn, which shows the delay to set"
+        yield "late", SEEING, f"pictures: {found}", advice
     for one in drive.delays:
         if one.scale < -4.0 * one.scale_sd:
             text = "yaw rate: turns to the other side than the pictures"
@@ -406,6 +414,26 @@ def _wheels(drive: QualityDrive) -> Found:
         purposes = ("pose", "landmarks") if turns else MOTION
         advice = "check names, units and signs of the signals in the vehicle file"
         yield "wrong", purposes, text.replace("_", " "), advice
+    yield from _ways(drive)
+
+
+def _ways(drive: QualityDrive) -> Found:
+    """Compare positions with the way by the wheels, which no straight line between them exceeds."""
+    position, speed = drive.samples.get(Signal.POSITION), drive.series(Signal.WHEEL_SPEEDS)
+    if position is None or speed is None:
+        return
+    means = 0.5 * np.abs(speed.values[1:] + speed.values[:-1])
+    driven_m = np.concatenate([[0.0], np.cumsum(means * np.diff(speed.t_ns) * 1e-9)])
+    at_m = np.interp(position.t_ns, speed.t_ns, driven_m)
+    firsts = np.unique(at_m // WAY_M, return_index=True)[1]
+    lat, lon = np.radians(position.values[firsts, :2]).T
+    line_m = EARTH_RADIUS_M * np.hypot(np.diff(lat), np.diff(lon) * np.cos(lat[:-1]))
+    way_m = np.diff(at_m[firsts])
+    far = line_m[way_m > 0.5 * WAY_M] / way_m[way_m > 0.5 * WAY_M] > TOO_FAR
+    if far.sum() > 1 and far.mean() > FAR_PARTS:
+        text = f"position: further than the wheels roll, in {far.sum()} of {len(far)} parts"
+        advice = "check its unit, and that latitude and longitude are not exchanged"
+        yield "wrong", ("pose", "landmarks"), text, advice
 
 
 def _pictures(drive: QualityDrive) -> Found:

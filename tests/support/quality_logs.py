@@ -128,7 +128,7 @@ def streams_of(drive: Drive) -> Streams:
 
 def log_of(streams: Streams, begins_s: float = 1000.0) -> MemoryLog:
     """The streams as a log: rows in order of time, in blocks of a second."""
-    topics = tuple(Topic(name, TYPES[name], "columns") for name in streams)
+    topics = tuple(Topic(name, TYPES[name.split("_")[0]], "columns") for name in streams)
     blocks = []
     for name, stream in streams.items():
         for number in np.unique(stream.t_s // 1.0):
