@@ -21,7 +21,7 @@ from crosscue.eval.runs.manifest import DriveManifest
 from crosscue.eval.runs.moments import run_between
 from crosscue.eval.runs.stored_images import StoredCamera, read_pictures, run_camera
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
-from crosscue.eval.scoring.truth import TrueRanges
+from crosscue.eval.scoring.truth import TrueRanges, true_marks
 from crosscue.replay.columns import Floats
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import spelled
@@ -41,6 +41,7 @@ def save_rrd(
     truth: TruthTrack | None = None,
     true_ranges: TrueRanges | None = None,
     part: RecordingSpan = WHOLE,
+    labels: Path | None = None,
 ) -> None:
     """Write the recording of a run atomically; views without data are left out.
 
@@ -50,8 +51,10 @@ def save_rrd(
         truth: The true track, drawn into the map.
         true_ranges: The true ranges, drawn with the estimated ones.
         part: The time span and the views to record.
+        labels: Truth file whose labelled boxes are drawn into the pictures.
 
     Raises:
+        SchemaError: The labelled boxes cannot be read.
         UsageError: The run has no data for any of the views.
         RunError: The run's tables are damaged, or the log with its pictures is not found.
         OutputError: The file cannot be written.
@@ -60,6 +63,7 @@ def save_rrd(
 
     from .columns import time_of
     from .layout import ViewData, blueprint
+    from .marks import log_true_boxes
     from .scene_rows import longest_m, scene_rows
 
     if not part.is_whole:
@@ -72,6 +76,7 @@ def save_rrd(
     topic = None if camera is None else camera.topic.name
     shown = ViewData(topic, pose, has_scene, longest_m(scene), part)
     layout = blueprint(shown)
+    true = {} if labels is None else true_marks(labels, run, scene.frames_ns.tolist())
     first_ns = int(scene.frames_ns[0]) if len(scene.frames_ns) else 0
     time = time_of(first_ns if pose is None else int(pose["t_ns"][0]))
 
@@ -81,6 +86,8 @@ def save_rrd(
         with os.fdopen(door.opened(partial, os.O_WRONLY), "wb") as file:
             recording.save(f"/dev/fd/{file.fileno()}", default_blueprint=layout)
             _log_all(recording, time, run, pose, known, camera, part)
+            if part.shows("cameras") and any(one.boxes for one in true.values()):
+                log_true_boxes(recording, time, true)
             recording.flush()
             recording.disconnect()
 

@@ -6,7 +6,7 @@ of a mask's bytes and keeps the picture visible.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -26,7 +26,8 @@ from crosscue.detectors.cues.cars import (
 )
 from crosscue.detectors.cues.observed import FrameDetections, RoadFractions
 from crosscue.detectors.cues.road import road_fractions
-from crosscue.replay.colours import FOUND, QUIET, ROAD, Colour
+from crosscue.detectors.overlay import TrueMarks
+from crosscue.replay.colours import FOUND, QUIET, ROAD, TRUTH, Colour
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .columns import DriveTime, Shapes, arrows, boxes, labelled_strips, strips
@@ -178,6 +179,20 @@ def road_lines(road: RoadMask) -> list[NDArray[np.float64]]:
     rows, columns = np.nonzero(np.diff(padded, axis=1))
     hatch = np.stack([columns, HATCH_ROWS * rows + 0.5], axis=1).reshape(-1, 2, 2)
     return [line * scale for line in (*rle.borders(is_road, (0, 0)), *hatch)]
+
+
+def log_true_boxes(
+    recording: rr.RecordingStream, time: DriveTime, marks: Mapping[int, TrueMarks]
+) -> None:
+    """Log the labelled boxes of each frame; their labels appear under the pointer."""
+    shapes = Shapes("camera/truth", boxes)
+    for t_ns, true in sorted(marks.items()):
+        shapes.begin(t_ns)
+        for label, box in true.boxes:
+            shapes.add(np.array(box), TRUTH, f"true: {label}")
+    shapes.send(recording, time)
+    style = rr.Boxes2D.from_fields(radii=[_points(1.5)], show_labels=False)
+    recording.log("camera/truth", style, static=True)
 
 
 def log_styles(recording: rr.RecordingStream) -> None:

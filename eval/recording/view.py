@@ -42,7 +42,8 @@ def save_recording(
     Args:
         run: A finished run.
         output: File to write, whose name ends in ``.rrd``; default: ``drive.rrd`` in the run.
-        truth: Truth file, to also draw the true track and ranges (default: that of the last score).
+        truth: Truth file, to also draw the true track, ranges and labelled boxes (default:
+            that of the last score).
         at: Record only from 2 s before this moment to 4 s after it, and mark it: seconds from the
             run's first frame, or nanoseconds as ``17...ns``.
         approach: Record only this approach, by its number in ``belief.parquet``.
@@ -75,7 +76,7 @@ def save_recording(
         ranges = known.ranges
         if known.truth.pose is not None and folder.file("pose.parquet").exists():
             track = truth_track(Path(truth), folder)
-    save_rrd(folder, path, track, ranges, part)
+    save_rrd(folder, path, track, ranges, part, None if truth is None else Path(truth))
     return path
 
 
@@ -141,7 +142,7 @@ class ViewSettings:
         at: Seconds from the run's first frame, or a time (17...ns).
         approach: Number of an approach in belief.parquet.
         only: Comma-separated views, such as cameras,belief.
-        truth: Truth file, to also draw the true track and ranges (default: that of the last score).
+        truth: Truth file, to also draw what is true (default: that of the last score).
         overwrite: Replace an existing recording.
     """
 

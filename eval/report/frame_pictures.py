@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -11,19 +11,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.datasets.truth.coco import read_coco
-from crosscue.datasets.truth.truth import read_truth
 from crosscue.detectors.base import Detections, Found
 from crosscue.detectors.cues.observed import FrameDetections, Place
 from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.images import Encoded
-from crosscue.detectors.overlay import NOTHING_TRUE, TrueMarks, draw_frame
+from crosscue.detectors.overlay import NOTHING_TRUE, draw_frame
 from crosscue.eval.pipeline.scene.road_picture import plans_of
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.moments import frame_times
 from crosscue.eval.runs.stored_images import pictures_at, run_camera
 from crosscue.eval.runs.tables.stored_frames import stored_frames
-from crosscue.eval.scoring.truth import cue_at
+from crosscue.eval.scoring.truth import true_marks
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.cue_table import CUES
@@ -171,30 +168,3 @@ def _jpeg(pixels: NDArray[np.uint8], width_px: int) -> bytes:
         pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
     _, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     return bytes(content.tobytes())
-
-
-def true_marks(truth: Path, run: RunFolder, wanted: Collection[int]) -> Mapping[int, TrueMarks]:
-    """Return the labelled boxes and present cues by time in the run's tables.
-
-    Raises:
-        SchemaError: The truth or its boxes cannot be read.
-    """
-    found = read_truth(truth)
-    moved = frame_times(run)
-    logged = {t_ns: log_ns for log_ns, t_ns in moved.items() if t_ns in wanted}
-    times = {logged.get(t_ns, t_ns): t_ns for t_ns in sorted(wanted)}
-    boxes: dict[int, list[tuple[str, tuple[float, float, float, float]]]] = {}
-    pictures = () if found.objects is None else read_coco(truth.parent / found.objects).pictures
-    for one in pictures:
-        if one.t_ns in times:
-            boxes[times[one.t_ns]] = [
-                (thing.label, thing.box_px) for thing in one.things if thing.box_px is not None
-            ]
-    log_ns = np.array([*times], np.int64)
-    counts: dict[int, dict[str, int]] = {}
-    for cue in dict.fromkeys(one.cue for one in found.cues):
-        at = cue_at([one for one in found.cues if one.cue == cue], log_ns)
-        for row in np.flatnonzero(at.present == 1).tolist():
-            number = max(int(at.count[row]), 1)
-            counts.setdefault(times[int(log_ns[row])], {})[cue] = number
-    return {t: TrueMarks(boxes.get(t, ()), counts.get(t, {})) for t in times.values()}

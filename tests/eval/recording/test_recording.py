@@ -1,5 +1,6 @@
 """The recording of a run: what each frame shows, its parts and its marks."""
 
+import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -28,11 +29,12 @@ from crosscue.eval.recording.plan import log_landmarks
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.moments import run_between
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
+from crosscue.replay.colours import TRUTH
 from crosscue.replay.errors import LogError, UsageError
 from crosscue.replay.vehicle.vehicle import Camera, Regions
 from support.refusals import refusal
 from support.scene_run import FRAMES, LABEL, scene_run
-from support.scoring import at, good_truth
+from support.scoring import at, good_truth, truth_folder
 
 
 def _rows(path: Path) -> Counter[str]:
@@ -121,6 +123,39 @@ def test_run_without_some_tables_records_the_others(
     assert ("/plan/car" in rows) == ("pose" not in without)
     assert ("/plots/belief/left" in rows) == ("belief" not in without)
     assert ("/camera/objects" in rows) == ("frames" not in without)
+
+
+def test_labelled_boxes_are_drawn_beside_detections_in_the_colour_of_the_truth(
+    tmp_path: Path,
+) -> None:
+    run = scene_run(tmp_path / "drive")
+    folder = truth_folder(tmp_path / "truth").parent
+    labelled = {at(3): [(4.0, 5.0, 20.0, 15.0)], at(4): []}
+    categories = [{"id": 1, "name": "stop sign"}]
+    images = [
+        {"id": i, "file_name": f"{i}.jpg", "width": 64, "height": 48, "t_ns": t}
+        for i, t in enumerate(labelled)
+    ]
+    boxes = [
+        {"id": i, "image_id": i, "category_id": 1, "bbox": [x0, y0, x1 - x0, y1 - y0]}
+        for i, found in enumerate(labelled.values())
+        for x0, y0, x1, y1 in found
+    ]
+    tree = {"categories": categories, "images": images, "annotations": boxes}
+    (folder / "objects.json").write_text(json.dumps(tree))
+    written = json.loads((folder / "truth.json").read_text()) | {"objects": "objects.json"}
+    (folder / "truth.json").write_text(json.dumps(written))
+
+    path = crosscue.save_recording(run.path, tmp_path / "a.rrd", folder / "truth.json")
+
+    assert _rows(path)["/camera/truth"] == FRAMES
+    labels = _cells(path, "/camera/truth", "labels")
+    assert [row for row in labels if row] == [["true: stop sign"]]
+    assert labels.index(["true: stop sign"]) == 3
+    (colour,) = next(row for row in _cells(path, "/camera/truth", "colors") if row)
+    assert colour == (TRUTH[0] << 24 | TRUTH[1] << 16 | TRUTH[2] << 8 | 255)
+    crosscue.save_recording(run.path, tmp_path / "b.rrd")
+    assert "/camera/truth" not in _rows(tmp_path / "b.rrd")
 
 
 def test_unsupported_picture_encodings_become_jpeg() -> None:
