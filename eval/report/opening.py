@@ -27,6 +27,7 @@ MAX_MISTAKES: Final = 3
 MAX_TOLD: Final = 4
 # Frames of one cue closer in time than this belong to one mistake.
 APART_NS: Final = 2_000_000_000
+NO_CUE: Final = "no cue shows it"
 # Which moments are kept first when there are too many.
 BELIEVED, MISTAKE, FIRST, FEATURE, LAST = range(5)
 
@@ -244,11 +245,14 @@ def _verdict(result: ApproachResult, cues: Sequence[CueFrames], is_named: bool) 
     believed = [name for name in sides if result.features_m.get(name) is not None]
     if believed:
         parts.append(f"{_listed(believed)} believed and there.")
-    for name in sides:
-        if name not in believed:
-            parts.append(
-                f"{name.capitalize()} is there and was not seen: {_why(result, name, cues)}."
-            )
+    missed = {name: _why(result, name, cues) for name in sides if name not in believed}
+    if missed:
+        is_one, whys = len(missed) == 1, {*missed.values()}
+        each = "; ".join(f"{name}, {why}" for name, why in missed.items())
+        why = each if len(whys) > 1 else whys.pop()
+        why = why if is_one or why != NO_CUE else "no cue shows them"
+        seen = "is there and was not seen" if is_one else "are there and were not seen"
+        parts.append(f"{_listed([*missed])} {seen}: {why}.")
     if result.false_features:
         parts.append(f"{_listed(result.false_features)} believed and not there.")
     return " ".join(parts)
@@ -264,7 +268,7 @@ def _why(result: ApproachResult, feature: str, cues: Sequence[CueFrames]) -> str
         and ((one.approach == result.approach) & (one.count > 0)).any()
     ]
     if not shows:
-        return "no cue shows it"
+        return NO_CUE
     last = result.at_entering.get(feature, math.nan)
     return "never probable enough" + ("" if math.isnan(last) else f", {last:.2f} at the end")
 

@@ -22,7 +22,7 @@ from crosscue.eval.drives.score import mistakes_of
 from crosscue.eval.recording import save_rrd
 from crosscue.eval.report import page
 from crosscue.eval.report.frame_pictures import draw_pictures
-from crosscue.eval.report.opening import opening_of
+from crosscue.eval.report.opening import judged_sentences, opening_of
 from crosscue.eval.report.page import write_report, write_report_without_truth
 from crosscue.eval.report.scene_figures import draw_belief
 from crosscue.eval.report.svg_plot import ticks
@@ -135,6 +135,36 @@ def test_report_opens_with_a_sentence_and_pictures_of_moments(tmp_path: Path) ->
     assert moment_ns(one.run, seconds) == pytest.approx(wrong.t_ns, abs=5e6)
     page = _report_text(tmp_path, one)
     assert f"crosscue view {one.run.path} --at {seconds}</code>" in page
+
+
+@pytest.mark.parametrize(
+    ("last", "told"),
+    [
+        ({}, "Left and right are there and were not seen: no cue shows them."),
+        (
+            {"left": 0.4},
+            "Left and right are there and were not seen: left, never probable enough, 0.40 at the "
+            "end; right, never probable enough.",
+        ),
+    ],
+)
+def test_missed_roads_are_told_in_one_sentence(
+    tmp_path: Path, last: dict[str, float], told: str
+) -> None:
+    one = _scored(tmp_path / "drive")
+    assert one.judged.approaches is not None
+    (result,) = one.judged.approaches.results
+    missed = replace(
+        result, features_m={"intersection": 30.0, "left": None, "right": None}, at_entering=last
+    )
+    cues = tuple(one.judged.cues) if last else ()
+    approaches = replace(one.judged.approaches, results=(missed,))
+    judged = replace(one.judged, cues=cues, approaches=approaches)
+
+    sentences = judged_sentences(replace(one, judged=judged))
+
+    assert sentences[0].endswith(told)
+    assert sentences[0].count("not seen") == 1
 
 
 def test_run_without_a_truth_has_a_report(
