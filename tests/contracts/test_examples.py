@@ -21,7 +21,8 @@ from crosscue.eval.scoring.gates import load_gates
 from crosscue.replay.plugins import GROUPS
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from support.catalog_runs import runs_below
-from support.pages import ROOT, Code, code_of_notebooks, code_of_pages, commands_of
+from support.pages import NOTEBOOKS as NOTEBOOK_FILES
+from support.pages import PAGES, ROOT, Code, code_of_notebooks, code_of_pages, commands_of
 from support.public_calls import faults_in
 
 CODE: Final = code_of_pages()
@@ -281,3 +282,14 @@ def test_invalid_example_is_reported(capsys: pytest.CaptureFixture[str]) -> None
     assert "no option --gnsss" in fault_of(["replay", "a", "-o", "b", "--gnsss", "off"], capsys)
     assert "invalid" in fault_of(["view", "run", "--approach", "last"], capsys)
     assert "yolox-pico" in fault_of(["replay", "a", "-o", "b", "--detectors", "yolox-pico"], capsys)
+
+
+def test_every_figure_is_on_a_page_and_every_picture_of_a_page_exists() -> None:
+    figures = {path.name for path in (ROOT / "docs" / "figures").iterdir()}
+    shown = set()
+    for page in [*PAGES, *NOTEBOOK_FILES]:
+        for link in re.findall(r"!\[[^\]]*\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+            path = page.parent / link
+            assert "://" in link or path.is_file(), f"{page.relative_to(ROOT)}: no file {link}"
+            shown |= {path.name} if path.parent.name == "figures" else set()
+    assert figures == shown

@@ -1,18 +1,23 @@
-"""The action for pull requests, and the lock file, do what they say."""
+"""The action, the workflows, the container and the lock file name what exists."""
 
+import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 from typing import Any, Final
 
+import pytest
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from ruamel.yaml import YAML
 
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive as simulated
+from crosscue.eval import cli
 
 ROOT: Final = Path(__file__).parents[2]
 SCRIPT: Final = ROOT / ".github" / "replay_score_compare.sh"
@@ -78,3 +83,97 @@ def test_lock_file_has_each_dependency_within_its_bounds() -> None:
         one = Requirement(line)
         assert one.specifier.contains(locked[one.name.replace(".", "-")]), line
     assert "://" not in text
+
+
+def _command_fault(line: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """Return why a line ``crosscue COMMAND ...`` is not accepted; empty if it is."""
+    program, name, *words = shlex.split(line)
+    if program != "crosscue" or name not in cli.COMMANDS:
+        return f"no command: {line}"
+    try:
+        cli.parser_of(name)[1].parse_args(words)
+    except SystemExit:
+        return capsys.readouterr().err
+    return ""
+
+
+def _missing_paths(text: str) -> list[str]:
+    """Return the files of the repository that a shell line names and that do not exist."""
+    names = re.findall(r"(?<![\w./-])((?:\.ci|\.github)/[\w./-]+|[\w-]+\.(?:lock|toml|txt))", text)
+    return [name for name in names if not (ROOT / name).exists()]
+
+
+def _is_pinned(action: str) -> bool:
+    return action == "./" or re.fullmatch(r"[\w/-]+@v\d+(\.\d+)*", action) is not None
+
+
+def test_dockerfile_copies_what_exists_and_starts_a_command(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    text = (ROOT / "Dockerfile").read_text()
+    steps = re.findall(r"^([A-Z]+) (.+)$", re.sub(r"\\\n", " ", text), re.MULTILINE)
+    of: dict[str, list[str]] = {}
+    for name, rest in steps:
+        of.setdefault(name, []).append(rest)
+    assert steps[0][0] == "FROM"
+    assert {*of} == {"FROM", "COPY", "RUN", "WORKDIR", "VOLUME", "ENTRYPOINT", "CMD"}
+
+    (version,) = re.findall(r"^python:(\d+\.\d+)-slim$", of["FROM"][0])
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert SpecifierSet(project["requires-python"]).contains(version)
+    assert of["COPY"] == [". /crosscue"]
+    ignored = (ROOT / ".dockerignore").read_text().splitlines()
+    assert not {*ignored} & {"requirements.lock", "pyproject.toml", "README.md", "crosscue"}
+    for path in re.findall(r"/crosscue/([\w./-]+)", of["RUN"][0]):
+        assert (ROOT / path).is_file(), path
+    assert of["VOLUME"] == of["WORKDIR"]
+    words = [*json.loads(of["ENTRYPOINT"][0]), *json.loads(of["CMD"][0])]
+    assert _command_fault(shlex.join(words), capsys) == ""
+    (folder, given) = re.findall(r':(/\w+)" crosscue (.+)$', text, re.MULTILINE)[0]
+    assert folder == of["WORKDIR"][0]
+    assert _command_fault(f"crosscue {given}", capsys) == ""
+
+
+@pytest.mark.parametrize(
+    "path", [*(ROOT / ".github/workflows").glob("*.yml")], ids=lambda p: p.name
+)
+def test_workflow_runs_commands_and_files_that_exist(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = path.read_text()
+    tree = YAML(typ="safe").load(text)
+    action = _action()
+    for job in tree["jobs"].values():
+        steps = job["steps"]
+        assert {*re.findall(r"steps\.(\w+)\.", text)} <= {one.get("id") for one in steps}
+        for step in steps:
+            assert _is_pinned(step.get("uses", "./")), step
+            for line in step.get("run", "").splitlines():
+                assert _missing_paths(line) == []
+                if line.startswith("crosscue"):
+                    assert _command_fault(line, capsys) == ""
+            if step.get("uses") == "./":
+                required = {k for k, one in action["inputs"].items() if one.get("required")}
+                assert required <= {*step["with"]} <= {*action["inputs"]}
+                drive = Path(step["with"]["drives"])
+                made = " ".join(one.get("run", "") for one in steps)
+                assert (
+                    f"simulate {drive.name[0]} --run {int(drive.name[2:])} -o {drive.parent}"
+                    in made
+                )
+    for step in action["runs"]["steps"]:
+        assert _missing_paths(step["run"].replace("${{ github.action_path }}/", "")) == []
+
+
+def test_shell_scripts_of_the_repository_parse() -> None:
+    for script in (SCRIPT, ROOT / ".ci/run", ROOT / ".ci/lowest"):
+        assert script.stat().st_mode & 0o100 or script is SCRIPT, script
+        assert subprocess.run(["bash", "-n", script], check=False).returncode == 0
+
+
+def test_checks_of_integration_files_can_fail(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--colour" in _command_fault("crosscue demo --colour", capsys)
+    assert _command_fault("crosscue drive", capsys) == "no command: crosscue drive"
+    assert _missing_paths("pip install -c requirement.lock .") == ["requirement.lock"]
+    assert _missing_paths(".ci/runs") == [".ci/runs"]
+    assert not _is_pinned("actions/checkout@main")

@@ -1,6 +1,8 @@
 """Formats of labelling tools preserve boxes, labels and times when written and read."""
 
 import json
+import os
+import tracemalloc
 from pathlib import Path
 from typing import Any, Final
 
@@ -137,3 +139,22 @@ def test_coco_file_is_readable_by_pycocotools(tmp_path: Path) -> None:
     assert boxes[0]["bbox"] == [0.0, 0.0, 1280.0, 719.0]
     assert boxes[1]["bbox"] == [10.125, 20.5, 1.25, 679.5625]
     assert [one["name"] for one in tree.loadCats(tree.getCatIds())] == list(labels().labels)
+
+
+@pytest.mark.parametrize("name", LABEL_FORMATS)
+def test_export_above_the_limit_is_refused_before_it_is_read(
+    name: ToolFormat, tmp_path: Path
+) -> None:
+    path = LABEL_FORMATS[name].write(tmp_path, labels())
+    files = [path] if path.is_file() else [*path.rglob("*.json")]
+    for file in [*files, *tmp_path.glob("labels/*.txt")]:
+        os.truncate(file, (512 << 20) + 1)
+
+    tracemalloc.start()
+    with pytest.raises(
+        CrosscueError, match=r"^[^\n]*(over \d+ MiB|more than 536,870,912 bytes)[^\n]*$"
+    ):
+        read_tool_labels(path, {"*": SIZE}, name)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 64 << 20
