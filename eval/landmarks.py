@@ -29,7 +29,7 @@ from crosscue.localization.landmarks.database import (
 from crosscue.localization.landmarks.images import grey_of, read_encoded
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import EmptyResultError, UsageError
-from crosscue.replay.safe_text import visible
+from crosscue.replay.safe_text import counted, visible
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result, json_key
 from crosscue.verb import Option, keywords
@@ -72,7 +72,8 @@ class AddedLandmarks(Result):
             if count
         ]
         rest = f"; left out: {', '.join(left_out)}" if left_out else ""
-        yield f"{self.path}: {counts.added} landmarks added from {counts.pictures} pictures{rest}"
+        pictures = counted(counts.pictures, "picture")
+        yield f"{self.path}: {counted(counts.added, 'landmark')} added from {pictures}{rest}"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -23,6 +23,11 @@ def visible(text: str) -> str:
     )
 
 
+def counted(count: int, noun: str, plural: str = "") -> str:
+    """Return a number with its noun: ``1 drive``, ``2 drives``."""
+    return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
+
+
 def terminal_cells(text: str) -> int:
     """Return the number of terminal columns that ``text`` occupies."""
     if text.isascii():

@@ -31,7 +31,7 @@ from crosscue.replay.errors import UnreadableRunError, UsageError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
-from crosscue.replay.safe_text import visible
+from crosscue.replay.safe_text import counted, visible
 from crosscue.results import HIDDEN, Result
 
 from .paired import FALSE_ALARMS, MIN_PLACES, PairedMetric, Verdict, compare_drives
@@ -428,13 +428,18 @@ def _lines(found: Comparison) -> Iterator[str]:
         yield from _verdict_lines(found, len(differing))
         return
     yield (
-        f"equal      {found.tables_same} tables, {same} judged metrics; "
-        f"different: {len(found.changes)} settings, {len(found.tables)} tables, "
-        f"{len(differing)} judged metrics, {len(found.metrics)} others"
+        f"equal      {counted(found.tables_same, 'table')}, {counted(same, 'judged metric')}; "
+        f"different: {counted(len(found.changes), 'setting')}, "
+        f"{counted(len(found.tables), 'table')}, "
+        f"{counted(len(differing), 'judged metric')}, {counted(len(found.metrics), 'other')}"
     )
     if found.why_no_metrics:
         yield f"{visible(found.why_no_metrics)}; judged by tables alone"
-        yield f"different  {len(found.tables)} tables" if found.tables else "nothing differs"
+        yield (
+            f"different  {counted(len(found.tables), 'table')}"
+            if found.tables
+            else "nothing differs"
+        )
         return
     yield from _verdict_lines(found, len(differing))
 
@@ -444,7 +449,7 @@ def _failure(one: PairedMetric) -> str:
         return ""
     return (
         f"{_value(one.before)} -> {_value(one.after)}, 95 % {one.low:+.3g} to {one.high:+.3g} "
-        f"over {one.places} places"
+        f"over {counted(one.places, 'place')}"
     )
 
 
@@ -456,14 +461,15 @@ def _markdown_lines(found: Comparison) -> Iterator[str]:
     yield (
         f"**{counts[0]} worse, {counts[1]} better, {len(undecided)} undecided"
         f"{_few_text(found)}**, "
-        f"{len(found.judged) - len(differing)} equal, over {both} drives"
+        f"{len(found.judged) - len(differing)} equal, over {counted(both, 'drive')}"
     )
     notes = [
-        f"{only_first} drives only before, {only_second} only after"
+        f"{counted(only_first, 'drive')} only before, {only_second} only after"
         if only_first or only_second
         else "",
-        f"{len(found.left_out)} runs left out" if found.left_out else "",
-        f"{visible(found.why_no_metrics)}; {len(found.tables)} tables differ"
+        f"{counted(len(found.left_out), 'run')} left out" if found.left_out else "",
+        f"{visible(found.why_no_metrics)}; "
+        f"{counted(len(found.tables), 'table differs', 'tables differ')}"
         if found.why_no_metrics
         else "",
     ]
@@ -525,7 +531,7 @@ def _more_text(one: PairedMetric) -> str:
     if not one.more_places:
         return ""
     wanted = "are wanted" if one.verdict == "too few places" else "would decide"
-    return f"; {one.more_places:,} more places {wanted}"
+    return f"; {counted(one.more_places, 'more place')} {wanted}"
 
 
 def _first_of(things: tuple[T, ...], what: str) -> Iterator[T | str]:
@@ -544,7 +550,8 @@ def _table_lines(one: TableChange) -> Iterator[str]:
     yield f"table      {visible(one.name)}: {visible(one.what)} ({rows})"
     for name, column in one.columns.items():
         far = "" if math.isnan(column.largest) else f", by up to {column.largest:.3g}"
-        yield f"           {visible(name)}: {column.rows} rows differ{far}"
+        rows = counted(column.rows, "row differs", "rows differ")
+        yield f"           {visible(name)}: {rows}{far}"
 
 
 def _judged_lines(one: PairedMetric) -> Iterator[str]:
@@ -553,8 +560,7 @@ def _judged_lines(one: PairedMetric) -> Iterator[str]:
     ends = TOO_FEW if math.isnan(one.low) else f"95 % {one.low:+.3g} to {one.high:+.3g}"
     seen = "" if not math.isfinite(one.could_see) else f"; detectable: {one.could_see:.3g}"
     allowed = f"; allowed {one.allowed:.3g}" if one.allowed else ""
-    drives = f"{one.drives} drive" + ("s" if one.drives != 1 else "")
-    places = f"{one.places} place" + ("s" if one.places != 1 else "")
+    drives, places = counted(one.drives, "drive"), counted(one.places, "place")
     over = f"over {drives} at {places}{seen}{_more_text(one)}{allowed}"
     yield f"{'':11}{one.after - one.before:+.3g} ({ends}) {over}"
 

@@ -32,7 +32,7 @@ from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
-from crosscue.replay.safe_text import visible
+from crosscue.replay.safe_text import counted, visible
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
 
@@ -146,11 +146,12 @@ class DetectorScore(Result):
         yield f"detector   {of.detector.name}"
         yield (
             f"labels     {self.labels.where} ({self.labels.format}): {len(of.names)} of "
-            f"{len(self.labels.pictures)} images in the run, {of.rule};"
+            f"{counted(len(self.labels.pictures), 'image')} in the run, {of.rule};"
         )
+        boxes = counted(asked, "box", "boxes")
         yield (
-            f"           {asked:,} boxes to detect, {len(of.truth) - asked:,} not judged; "
-            f"{of.frames - len(of.names):,} frames without labels"
+            f"           {boxes} to detect, {len(of.truth) - asked:,} not judged; "
+            f"{counted(of.frames - len(of.names), 'frame')} without labels"
         )
         yield from (f"left out   {count:,} {why}" for why, count in of.left_out.items())
         others = ", ".join(f"{n:,} {label}" for label, n in of.not_judged.items())
@@ -167,7 +168,7 @@ class DetectorScore(Result):
             if one.detections:
                 yield (
                     f"calibration error {one.error:.3f} of {one.label}, "
-                    f"{one.detections:,} detections"
+                    f"{counted(one.detections, 'detection')}"
                 )
         unit = f"blocks of {self.block_s:g} s" if self.block_s > 0.0 else "single images"
         yield f"intervals  95 %, bootstrap over {unit}, seed {SEED}"

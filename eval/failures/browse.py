@@ -19,7 +19,7 @@ from crosscue.replay.files.whole_file import cannot_write
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
-from crosscue.replay.safe_text import visible
+from crosscue.replay.safe_text import counted, visible
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
 
@@ -63,12 +63,12 @@ class Site(Result):
 
     def lines(self) -> Iterator[str]:
         """Yield counts, reasons of missing pictures, and the page to open."""
-        yield f"failures   {self.failures:,}, {self.pictures:,} pictures"
+        yield f"failures   {self.failures:,}, {counted(self.pictures, 'picture')}"
         if self.without_picture:
-            yield f"           {self.without_picture:,} failures without a picture"
+            yield f"           {counted(self.without_picture, 'failure')} without a picture"
         yield from (f"           {visible(why)}" for why in self.reasons[:PRINTED])
         if len(self.reasons) > PRINTED:
-            yield f"           and {len(self.reasons) - PRINTED:,} more reasons (--json)"
+            yield f"           and {counted(len(self.reasons) - PRINTED, 'more reason')} (--json)"
         yield from (f"left out   {visible(str(error))}" for error in self.failed.values())
         yield f"open       {visible(str(self.index.resolve()))}"
 

@@ -39,7 +39,7 @@ from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree, strict_json, unspelled
 from crosscue.replay.files.whole_file import sha256_of, write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
-from crosscue.replay.safe_text import visible
+from crosscue.replay.safe_text import counted, visible
 from crosscue.replay.vehicle.vehicle import CUES, Vehicle, vehicle_given
 from crosscue.results import Result
 from crosscue.verb import Option, keywords
@@ -94,7 +94,8 @@ class ImportedTruth(Result):
 
     def lines(self) -> Iterator[str]:
         """Yield the numbers of pictures, objects and cues, and the files."""
-        yield f"pictures   {self.pictures} with {self.things} objects, matched {self.rule}"
+        things = counted(self.things, "object")
+        yield f"pictures   {self.pictures} with {things}, matched {self.rule}"
         yield from (f"           {cue}: present in {count}" for cue, count in self.cues.items())
         if not self.cues:
             yield "           no label is a cue; only objects were imported"
@@ -124,10 +125,12 @@ class ImportedLabels(Result):
     def lines(self) -> Iterator[str]:
         """Yield counts, what is missing or ignored, and the files that were written."""
         pictures = sum(one.pictures for one in self.drives.values())
-        things = sum(one.things for one in self.drives.values())
-        yield f"pictures   {pictures:,} with {things:,} objects, of {len(self.drives):,} drives"
+        things = counted(sum(one.things for one in self.drives.values()), "object")
+        drives = counted(len(self.drives), "drive")
+        yield f"pictures   {pictures:,} with {things}, of {drives}"
         if self.missing:
-            yield f"missing    {self.missing:,} exported pictures are not in the annotations"
+            missing = counted(self.missing, "exported picture is", "exported pictures are")
+            yield f"missing    {missing} not in the annotations"
         yield from (f"ignored    {count:,} {visible(kind)}" for kind, count in self.ignored.items())
         yield from (f"truth      {visible(str(one.truth))}" for one in self.drives.values())
         yield f"to train   --data {visible(str(self.coco))} --images {self.images}"

@@ -28,7 +28,7 @@ from crosscue.replay.files.tree_text import spelled
 from crosscue.replay.files.whole_file import cannot_write, write_bytes
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits, LimitsGiven
 from crosscue.replay.progress import Progress, emit
-from crosscue.replay.safe_text import visible
+from crosscue.replay.safe_text import counted, visible
 from crosscue.results import Result
 from crosscue.verb import Option
 
@@ -70,7 +70,8 @@ class ExportedLabels(Result):
     def lines(self) -> Iterator[str]:
         """Yield counts, classes, what was left out, and the file to import."""
         title = LABEL_FORMATS[self.format].title
-        yield f"pictures   {self.pictures:,} with {self.boxes:,} boxes to correct, for {title}"
+        boxes = counted(self.boxes, "box", "boxes")
+        yield f"pictures   {self.pictures:,} with {boxes} to correct, for {title}"
         yield f"classes    {visible(', '.join(self.labels))}"
         yield from (f"left out   {count:,} {visible(why)}" for why, count in self.left_out.items())
         yield from (f"left out   {visible(str(error))}" for error in self.failed.values())

@@ -22,7 +22,7 @@ from crosscue.eval.scoring.runs import find_truth, judge_scene, remembered_truth
 from crosscue.replay.errors import CrosscueError, EmptyResultError, OutputError, UsageError
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
-from crosscue.replay.safe_text import visible
+from crosscue.replay.safe_text import counted, visible
 from crosscue.results import HIDDEN, Result, json_key, listing
 from crosscue.verb import Option, keywords
 
@@ -73,14 +73,14 @@ class Failures(Result):
 
     def lines(self) -> Iterator[str]:
         """Yield counts, causes, and the worst failures."""
-        yield f"failures   {self.found:,} in {self.runs:,} runs"
+        yield f"failures   {self.found:,} in {counted(self.runs, 'run')}"
         if self.without_truth:
             more = (
                 ""
                 if self.is_unlabelled
                 else ": of these, only flipped beliefs (--unlabelled: more)"
             )
-            yield f"no truth   {len(self.without_truth):,} runs{more}"
+            yield f"no truth   {counted(len(self.without_truth), 'run')}{more}"
         yield from (f"left out   {visible(str(error))}" for error in self.failed.values())
         if self.groups:
             yield from self._tables()

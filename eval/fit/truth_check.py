@@ -22,6 +22,7 @@ from crosscue.eval.scoring import truth as score_truth
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
+from crosscue.replay.safe_text import counted
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import Result
 
@@ -65,8 +66,10 @@ class TruthFit(Result):
     def lines(self) -> Iterator[str]:
         """Yield what the truth contains, and what of it was not checked."""
         yield f"fits       {self.seconds:.1f} s of truth"
-        yield f"holds      {self.approaches} approaches, {self.cues} statements about cues,"
-        yield f"           {self.objects} objects, {self.ranges} ranges, {self.poses} poses"
+        approaches = counted(self.approaches, "approach", "approaches")
+        yield f"holds      {approaches}, {counted(self.cues, 'statement')} about cues,"
+        objects, ranges = counted(self.objects, "object"), counted(self.ranges, "range")
+        yield f"           {objects}, {ranges}, {counted(self.poses, 'pose')}"
         if self.outside:
             text = "of them reach beyond the log, whose clock was set back"
             yield f"outside    {self.outside} {text}"

@@ -29,6 +29,7 @@ from crosscue.eval.scoring.change_points import (
 from crosscue.eval.scoring.places import group_drives
 from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import EmptyResultError, OutputError
+from crosscue.replay.safe_text import counted
 from crosscue.results import Result
 from crosscue.verb import Option
 
@@ -106,7 +107,9 @@ def draw_chart(one: MetricHistory, versions: Sequence[str]) -> Markup:
     )
     turns = [(change.at, "better" if one.is_better(change) else "worse") for change in one.changes]
     what = ", ".join(f"{verdict} from {versions[at]} on" for at, verdict in turns)
-    drawing = SvgChart(WIDTH, HEIGHT, one.path, f"{len(versions)} versions; {what or 'no change'}")
+    drawing = SvgChart(
+        WIDTH, HEIGHT, one.path, f"{counted(len(versions), 'version')}; {what or 'no change'}"
+    )
     _draw_axis(drawing, panel, one, versions)
     for at, verdict in turns:
         x = panel.x(at - 0.5)
@@ -118,7 +121,7 @@ def draw_chart(one: MetricHistory, versions: Sequence[str]) -> Markup:
         if math.isfinite(point.low):
             drawing.rule(x, panel.y(point.low), x, panel.y(point.high), "ends")
             between = f", 95 % {point.low:.4g} to {point.high:.4g}"
-        hint = f"{versions[at]}: {point.value:.4g}{between}; {point.drives} drives"
+        hint = f"{versions[at]}: {point.value:.4g}{between}; {counted(point.drives, 'drive')}"
         drawing.dot(x, panel.y(point.value), 3.5, "point", hint)
     return drawing.svg()
 
@@ -215,10 +218,10 @@ def _lines(found: History) -> Iterator[str]:
                 f"{found.versions[change.at]} on (p {change.p:.2g})"
             )
     for why, count in found.left_out.items():
-        yield f"left out   {count} runs {why}"
+        yield f"left out   {counted(count, 'run')} {why}"
     yield (
-        f"history    {len(found.metrics)} metrics over {len(found.versions)} "
-        f"{'versions' if found.by == 'version' else found.by + 's'}; {len(found.changed)} changed"
+        f"history    {counted(len(found.metrics), 'metric')} over "
+        f"{counted(len(found.versions), found.by)}; {len(found.changed)} changed"
     )
 
 

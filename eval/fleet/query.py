@@ -19,7 +19,7 @@ from crosscue.replay.errors import CrosscueError, OutputError, UsageError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_bytes, write_table, write_text
 from crosscue.replay.progress import Notice, emit
-from crosscue.replay.safe_text import table, terminal_width
+from crosscue.replay.safe_text import counted, table, terminal_width
 from crosscue.results import Result
 from crosscue.verb import Option
 
@@ -60,7 +60,7 @@ class QueryResult(Result):
     def lines(self) -> Iterator[str]:
         """Yield the rows as a table, or where they were written."""
         if self.output is not None:
-            yield f"{self.output}: {self.rows.num_rows} rows"
+            yield f"{self.output}: {counted(self.rows.num_rows, 'row')}"
             return
         # Cells are cut to fit a terminal, but not in a pipe and not in a schema.
         is_cut = sys.stdout.isatty() and not self.is_schema

@@ -14,7 +14,7 @@ from crosscue.replay.errors import LogError, OutputError, UsageError
 from crosscue.replay.ledger import Detail, Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.progress import Progress, emit
-from crosscue.replay.safe_text import terminal_width, visible, wrapped
+from crosscue.replay.safe_text import counted, terminal_width, visible, wrapped
 from crosscue.replay.seal.seal import seal_path
 from crosscue.replay.write.convert import LogWriter
 from crosscue.replay.write.mcap import Compression
@@ -118,7 +118,7 @@ class Converted(Result):
         ]
         count, size = self.written.total(), self.size_bytes / 1e6
         yield listing(HEAD, rows, 2)
-        yield f"{visible(str(self.path))}: {count} messages, {size:.1f} MB, read back"
+        yield f"{visible(str(self.path))}: {counted(count, 'message')}, {size:.1f} MB, read back"
 
     def messages(self) -> Iterator[str]:
         """Yield notices and damaged places."""
@@ -127,7 +127,7 @@ class Converted(Result):
         for line in (*self.notices[:SHOWN], *shown):
             yield wrapped(line, terminal_width())
         if len(shown) < len(places):
-            yield f"and {len(places) - len(shown)} more places"
+            yield f"and {counted(len(places) - len(shown), 'more place')}"
         if not self.ledger.is_whole and not self.salvage:
             yield (
                 "the log is damaged; its readable part was written; crosscue convert --salvage "

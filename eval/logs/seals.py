@@ -10,6 +10,7 @@ from typing import ClassVar, Final
 from crosscue.replay.errors import CrosscueError, LogError, UsageError
 from crosscue.replay.formats import format_of
 from crosscue.replay.progress import Progress, emit
+from crosscue.replay.safe_text import counted
 from crosscue.replay.seal.seal import (
     HASH,
     SUFFIX,
@@ -52,8 +53,8 @@ class Sealed(Result):
         """Yield one line on the seal."""
         what = "written" if self.is_new else "unchanged, the log matches it"
         yield (
-            f"{self.seal}: {what}; {self.files} files, {self.size_bytes} bytes, {HASH} of "
-            f"{self.blocks} blocks of 1 MiB"
+            f"{self.seal}: {what}; {counted(self.files, 'file')}, {self.size_bytes} bytes, "
+            f"{HASH} of {counted(self.blocks, 'block')} of 1 MiB"
         )
 
 
@@ -94,7 +95,8 @@ class SealCheck(Result):
     def lines(self) -> Iterator[str]:
         """Yield one line if the log matches, else one for each difference."""
         if self.is_whole:
-            yield f"{self.log}: all {self.blocks} blocks match the seal of {self.sealed_at}"
+            all_blocks = counted(self.blocks, "block matches", "blocks match")
+            yield f"{self.log}: {all_blocks} the seal of {self.sealed_at}, none differs"
         for sentence in self.files_changed:
             yield f"{self.log}: {sentence}"
         for one in self.spans[:SHOWN]:

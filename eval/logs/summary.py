@@ -26,7 +26,7 @@ from crosscue.replay.logs.log_summary import (
     span_sentence,
     summarise_log,
 )
-from crosscue.replay.safe_text import table, terminal_width, wrapped
+from crosscue.replay.safe_text import counted, table, terminal_width, wrapped
 from crosscue.replay.time.scan import DriveWatch
 from crosscue.replay.time.segments import SplitLimits, Timeline, gaps_text
 from crosscue.results import HIDDEN, Result
@@ -230,7 +230,7 @@ def _ids_in_words(bus: TopicSummary) -> str:
         for i in bus.can_ids
     )
     prefix = "most frequent: " if bus.can_id_count > len(bus.can_ids) else ""
-    return f"{bus.can_id_count} ids; {prefix}{named}"
+    return f"{counted(bus.can_id_count, 'id')}; {prefix}{named}"
 
 
 def _losses(summary: LogSummary, width: int) -> Iterator[str]:

@@ -19,7 +19,7 @@ from crosscue.eval.scoring.scene.belief import BeliefScore
 from crosscue.eval.scoring.scene.cues import CueScore
 from crosscue.eval.scoring.scene.ranges import RangeScore
 from crosscue.replay.columns import Int64s
-from crosscue.replay.safe_text import visible
+from crosscue.replay.safe_text import counted, visible
 
 from .scene_figures import interval
 
@@ -87,13 +87,14 @@ def _coverage(scores: PooledScores) -> list[str]:
     covered_s = sum(one.truth_covered_s for one in scores.drives)
     n = len(scores.drives)
     twice = sum(one.frames_ambiguous for one in scores.drives)
+    runs = "run covers" if n == 1 else "runs cover"
     lines = [
-        _line("drives", f"{n}: of {frames} frames the truth covers {reported}"),
-        _line("truth", f"{truth_s:.1f} s, of which the runs cover {covered_s:.1f} s"),
+        _line("drives", f"{n}: of {counted(frames, 'frame')} the truth covers {reported}"),
+        _line("truth", f"{truth_s:.1f} s, of which the {runs} {covered_s:.1f} s"),
     ]
     if twice:
         why = "a clock was set back, and their log time comes twice"
-        lines.append(_line("ambiguous", f"{twice} frames not scored: {why}"))
+        lines.append(_line("ambiguous", f"{counted(twice, 'frame')} not scored: {why}"))
     return lines
 
 
@@ -152,7 +153,7 @@ def _approaches(one: ApproachScore) -> list[str]:
     lines = [
         _line(
             "approaches",
-            f"{one.approaches} true, the runs have {one.matched}; extra "
+            f"{one.approaches} true, found {one.matched}; extra "
             f"{one.extra} ({one.extra_detected} believed), in pieces {one.splits}",
         ),
         _line("detected", _distance(one.detected, one.detected_m)),
@@ -183,7 +184,8 @@ def _spurious(one: ApproachScore) -> str:
         if result.why_spurious:
             reasons[result.why_spurious] = reasons.get(result.why_spurious, 0) + 1
     reported = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
-    return f"{one.spurious} detections as published do not count: {reported}"
+    detections = counted(one.spurious, "detection as published does", "detections as published do")
+    return f"{detections} not count: {reported}"
 
 
 def _distance(found: Proportion, distance: Mean) -> str:
@@ -276,7 +278,9 @@ def pose_summary(result: PoseScore) -> str:
 def poses_summary(poses: Sequence[PoseScore], places: Int64s) -> str:
     """Return the pose scores of several drives, with intervals over places; NEES if defined."""
     lost = sum(one.lost_at_m is not None for one in poses)
-    lines = [_line("pose", f"{len(poses)} drives, {lost} lost; means over drives (95 %)")]
+    lines = [
+        _line("pose", f"{counted(len(poses), 'drive')}, {lost} lost; means over drives (95 %)")
+    ]
     for name, unit, values in (
         ("APE, rms", " m", [one.ape["none"].translation_m.rmse for one in poses]),
         ("NEES of x, y", ", 2 is consistent", [one.nees_xy.mean for one in poses]),

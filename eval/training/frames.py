@@ -16,6 +16,7 @@ from crosscue.eval.training.inputs import check_place, training_layouts_of
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
+from crosscue.replay.safe_text import counted
 from crosscue.results import Result
 from crosscue.verb import Option
 
@@ -36,7 +37,7 @@ class TrainingFrames(Result):
 
     def lines(self) -> Iterator[str]:
         """Yield the numbers of pictures and objects."""
-        yield f"{self.coco}: {self.pictures} pictures, {self.objects} objects"
+        yield f"{self.coco}: {counted(self.pictures, 'picture')}, {counted(self.objects, 'object')}"
 
 
 def render_training_frames(

@@ -13,6 +13,7 @@ from crosscue.eval.training.inputs import Device, check_place
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.made_of import made_of
 from crosscue.replay.progress import Progress, emit
+from crosscue.replay.safe_text import counted
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option
 
@@ -258,7 +259,7 @@ def _measure(
 
 def _set_text(one: LabelledSet) -> str:
     """Return the numbers of pictures, of objects without a mask, and of what was left out."""
-    text, bare = f"{len(one.pictures)} pictures", one.objects - one.masks
+    text, bare = counted(len(one.pictures), "picture"), one.objects - one.masks
     if bare:
         text += f", {bare} of {one.objects} objects without a mask"
     left_out = ", ".join(f"{count} {why}" for why, count in sorted(one.left_out.items()))

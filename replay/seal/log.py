@@ -16,6 +16,7 @@ from crosscue.replay.base import EVERYTHING, Log, Selection, WrappedLog
 from crosscue.replay.columns import Block
 from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import CHANGED, DIFFERS, Ledger
+from crosscue.replay.safe_text import counted
 
 from .seal import HASH, Check, Seal, seal_over, seal_path
 from .touched import Blocks, Touched
@@ -124,13 +125,9 @@ def _report(check: Check, ledger: Ledger) -> None:
     spans = list(check.damaged())
     for span in spans:
         ledger.drop("", DIFFERS, None, f"{span.name}: bytes {span.start} to {span.stop}")
-    state = f"sealed at {seal.sealed_at} ({HASH})"
-    if check.checked < seal.blocks:
-        state += f": {check.checked} of {seal.blocks} blocks of 1 MiB were read and checked"
-    else:
-        state += f": all {seal.blocks} blocks of 1 MiB were checked"
+    state = f"sealed at {seal.sealed_at} ({HASH}): {check.checked} of {seal.blocks} blocks of 1 MiB"
     bad = "some differ" if spans else "none differs"
-    ledger.integrity = f"{ledger.integrity}; {state}, {bad}"
+    ledger.integrity = f"{ledger.integrity}; {state} were checked, {bad}"
 
 
 def sealed_sentence(log: Log) -> str:
@@ -139,4 +136,4 @@ def sealed_sentence(log: Log) -> str:
         return "not sealed"
     seal = log.seal
     by = "" if log.folders is None else f", by {log.folders.name} of the folder it is in"
-    return f"sealed at {seal.sealed_at} ({HASH}, {seal.blocks} blocks of 1 MiB{by})"
+    return f"sealed at {seal.sealed_at} ({HASH}, {counted(seal.blocks, 'block')} of 1 MiB{by})"

@@ -1,6 +1,7 @@
 """With ``--json`` every command prints exactly one strict JSON document."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,6 +11,7 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive as simulated
 from crosscue.eval import cli
+from crosscue.results import Result
 from support.coco import stop_signs
 from support.gap_drive import BEGIN, ROW, SIZE, Clock, write_drive
 from support.kitti_drive import raw_drive
@@ -80,6 +82,10 @@ MADE: Final[dict[str, tuple[str, int]]] = {
         0,
     ),
 }
+# A single thing in the plural: "1 drives". Verbs and units that end with s are none.
+ONE_OF_MANY: Final = re.compile(
+    r".*(?<![\w.,+-])(?<!of )1 (?!(?:is|has|was|as|ms|ns|us|s|means|differs)\b)[a-z]+s\b.*"
+)
 # Commands that are not run, and why.
 ELSEWHERE: Final[dict[str, str]] = {
     "demo": "simulates and replays for minutes",
@@ -113,18 +119,24 @@ def test_every_command_is_tested_or_excluded_with_reason() -> None:
 
 
 def test_json_of_reading_commands_is_one_strict_document(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    texts: list[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     log = write_drive(tmp_path, Clock(pause_s=(5.0, 9.0)))
     database_of(tmp_path / "marks.sqlite", np.array([[0.0, 1.0], [2.0, 3.0]]))
     _write_road(tmp_path / "road")
     places = {"LOG": str(log), "CAR": "car.toml", "TRUTH": "truth.json", "SQL": "from runs"}
-    _run(LINES, places, capsys)
+    _run(LINES, places, capsys, texts)
 
 
 def test_json_of_creating_commands_is_one_strict_document(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    texts: list[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     shorten(monkeypatch)
@@ -141,12 +153,30 @@ def test_json_of_creating_commands_is_one_strict_document(
         "ITS_TRUTH": str(compass.truth),
         "KITTI": str(raw_drive(tmp_path / "kitti")),
     }
-    _run(MADE, places, capsys)
+    _run(MADE, places, capsys, texts)
+
+
+@pytest.fixture(autouse=True)
+def texts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The text of every result that is printed as JSON."""
+    found: list[str] = []
+    as_dict = Result.as_dict
+
+    def kept(result: Result) -> Any:
+        found.append(repr(result))
+        return as_dict(result)
+
+    monkeypatch.setattr(Result, "as_dict", kept)
+    return found
 
 
 def _run(
-    lines: dict[str, tuple[str, int]], places: dict[str, str], capsys: pytest.CaptureFixture[str]
+    lines: dict[str, tuple[str, int]],
+    places: dict[str, str],
+    capsys: pytest.CaptureFixture[str],
+    texts: list[str],
 ) -> None:
+    """Run commands; one thing is named in the singular in what they print."""
     ended = {}
     for name, (line, status) in lines.items():
         words = [*name.split(), *(places.get(word, word) for word in line.split())]
@@ -157,6 +187,9 @@ def _run(
         if got != status:
             ended[name] = (got, printed.err)
     assert not ended
+    assert texts
+    found = [one for text in texts for one in ONE_OF_MANY.findall(text)]
+    assert "\n".join(found) == ""
 
 
 def _write_photos(folder: Path) -> None:

@@ -17,6 +17,7 @@ from crosscue.eval.runs.tables.columns import INDEXED, QUERIED, RUN, arrow_schem
 from crosscue.replay.errors import UnreadableRunError, UsageError
 from crosscue.replay.files import door
 from crosscue.replay.remote.address import is_remote
+from crosscue.replay.safe_text import counted
 
 from . import database
 from .index import Index, Runs, open_index
@@ -201,7 +202,7 @@ class Catalog:
         return RunsTable(table, places, self._places.filesystem)
 
     def __repr__(self) -> str:
-        counts = f"{len(self._listed('run'))} runs, {len(self.left_out)} left out"
+        counts = f"{counted(len(self._listed('run')), 'run')}, {len(self.left_out)} left out"
         return f"{self._places.name}: {counts}; tables: {', '.join(sorted(self._names))}"
 
 

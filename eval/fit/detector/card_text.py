@@ -102,7 +102,7 @@ def _evidence(fit: ClassFit, pictures: str, measured: str, aim: str) -> dict[str
     if measured:
         row["measured"] = measured
     row["note"] = (
-        f"{WRITTEN_BY}: {aim}; fitted to {fit.labels} {what} and {fit.detections} {found}, "
+        f"{WRITTEN_BY}: {aim}; fitted to {what} and {found}, "
         f"bound {fit.bound:.4f}; held out {held.right} of {held.of} right, recall "
         f"{held.right} of {held.labels}"
     )

@@ -23,6 +23,7 @@ from crosscue.detectors.catalog.class_scores import ClassScores, Isotonic, Platt
 from crosscue.detectors.training.operating_point import fit_isotonic, fit_platt
 from crosscue.eval.scoring.boxes.reliability import class_calibration
 from crosscue.eval.scoring.intervals import Interval, wilson
+from crosscue.replay.safe_text import counted
 
 CalibrationKind: TypeAlias = Literal["platt", "isotonic", "none"]
 # What is labelled: boxes, or whether a picture shows such an object.
@@ -34,10 +35,6 @@ MIN_LABELS: Final = 20
 # Min number of right and of wrong detections to calibrate scores.
 MIN_EACH: Final = 10
 
-_COUNTED: Final[dict[LabelUnit, tuple[str, str]]] = {
-    "boxes": ("boxes", "detections"),
-    "pictures": ("pictures with it", "pictures with a detection"),
-}
 TRIED: Final = 8
 
 
@@ -128,8 +125,20 @@ class ClassFit:
 
     @property
     def counted(self) -> tuple[str, str]:
-        """What ``labels`` and ``detections`` count, in words."""
-        return _COUNTED[self.unit]
+        """Numbers of labels and detections, with what they count."""
+        return _labels(self.labels, self.unit), _detections(self.detections, self.unit)
+
+
+def _labels(count: int, unit: LabelUnit) -> str:
+    if unit == "boxes":
+        return counted(count, "box", "boxes")
+    return counted(count, "picture with it", "pictures with it")
+
+
+def _detections(count: int, unit: LabelUnit) -> str:
+    if unit == "boxes":
+        return counted(count, "detection")
+    return counted(count, "picture with a detection", "pictures with a detection")
 
 
 def fit_class(
@@ -157,7 +166,7 @@ def fit_class(
     if not chosen_on.labels + held_out.labels:
         return ClassFit(name, members, 0, n, right, None, math.nan, None, (NOT_LABELLED,), unit)
     if chosen_on.labels < MIN_LABELS:
-        why = f"{chosen_on.labels} {_COUNTED[unit][0]}, {MIN_LABELS} needed: not fitted"
+        why = f"{_labels(chosen_on.labels, unit)}, {MIN_LABELS} needed: not fitted"
         return ClassFit(
             name, members, chosen_on.labels, n, right, None, math.nan, None, (why,), unit
         )

@@ -37,7 +37,7 @@ from crosscue.eval.scoring.boxes.matching import match
 from crosscue.replay.errors import FitError, UsageError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
-from crosscue.replay.safe_text import visible
+from crosscue.replay.safe_text import counted, visible
 from crosscue.replay.time.dates import is_date
 from crosscue.results import HIDDEN, Result, json_key
 from crosscue.verb import Option, keywords
@@ -100,8 +100,8 @@ class FittedDetector(Result):
     def lines(self) -> Iterator[str]:
         """Yield the numbers of pictures, and the fit of each class."""
         yield (
-            f"detector   {self.detector.name}, fitted to {self.fitted_to:,} images, "
-            f"{self.held_out:,} others held out"
+            f"detector   {self.detector.name}, fitted to {counted(self.fitted_to, 'image')}, "
+            f"{self.held_out:,} held out"
         )
         yield from (f"left out   {count:,} {why}" for why, count in self.left_out.items())
         for one in self.classes:
@@ -112,12 +112,9 @@ class FittedDetector(Result):
 
 def _class_lines(one: ClassFit, precision: float) -> list[str]:
     if one.notes == (NOT_LABELLED,):
-        return [f"{visible(one.name):10} {NOT_LABELLED}, {one.detections:,} detections"]
+        return [f"{visible(one.name):10} {NOT_LABELLED}, {counted(one.detections, 'detection')}"]
     what, found = one.counted
-    lines = [
-        f"{visible(one.name):10} {one.labels:,} {what}, {one.detections:,} {found}, "
-        f"{one.right:,} right"
-    ]
+    lines = [f"{visible(one.name):10} {what}, {found}, {one.right:,} right"]
     if one.scores is not None and one.scores.threshold is not None:
         lines.append(
             f"  threshold   {one.scores.threshold:g}: precision at least {one.bound:.3f} with "
@@ -144,7 +141,7 @@ def _class_lines(one: ClassFit, precision: float) -> list[str]:
         start = "" if has_threshold else "held out"
         lines.append(
             f"  {start:11} calibration error {held.error_before:.3f} before, "
-            f"{held.error_after:.3f} after, {held.detections:,} detections"
+            f"{held.error_after:.3f} after, {counted(held.detections, 'detection')}"
         )
     return lines + [f"  {note}" for note in one.notes]
 

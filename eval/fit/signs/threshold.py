@@ -23,6 +23,7 @@ from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, fraction
 from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.progress import Progress, emit
+from crosscue.replay.safe_text import counted
 from crosscue.results import HIDDEN, Result, json_key
 from crosscue.verb import Option, keywords
 
@@ -86,7 +87,7 @@ class SignFit(Result):
         """Yield the threshold, and precision and recall on both halves."""
         if self.threshold is None:
             signs = sum(part.signs for part in self.chosen_on)
-            yield f"no threshold is precise enough on {signs} signs"
+            yield f"no threshold is precise enough on {counted(signs, 'sign')}"
             return
         yield f"min_score = {self.threshold:g}"
         for name, on_others in (("chosen on", False), ("other frames", True)):

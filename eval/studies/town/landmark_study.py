@@ -31,6 +31,7 @@ from crosscue.eval.studies.pictures import COLOURS, figure, save_figure
 from crosscue.eval.studies.study import PageTable
 from crosscue.localization.town.drive import DriveOutcome
 from crosscue.localization.town.settings import TownDrive
+from crosscue.replay.safe_text import counted
 
 from .settings import LandmarkStudy
 
@@ -296,7 +297,7 @@ def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[PageTable, ...
             lambda c: (
                 ""
                 if math.isnan(c.gain_m)
-                else f"{c.gain_m / 1e3:.1f} ({len(c.gains_m)} cells; {c.beyond} beyond)"
+                else f"{c.gain_m / 1e3:.1f} ({counted(len(c.gains_m), 'cell')}; {c.beyond} beyond)"
             ),
         ),
         ("published", lambda _: "1 to 2"),

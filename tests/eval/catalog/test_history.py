@@ -74,7 +74,7 @@ def test_page_plots_each_metric_and_marks_its_changes(
     printed = capsys.readouterr().out
     assert re.search(rf"WORSE +{re.escape(RECALL)}: 0\.7\d+ -> 0\.6\d+ from model m2 on", printed)
     assert "2 metrics over 4 models; 1 changed" in printed
-    assert "left out   1 runs without a score" in printed
+    assert "left out   1 run without a score" in printed
     words = PageText()
     words.feed(page.read_text())
     assert f"{RECALL} m2 worse" in " ".join(words.text.split())

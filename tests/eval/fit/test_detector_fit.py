@@ -198,7 +198,7 @@ def test_class_without_labelled_box_is_not_labelled(tmp_path: Path) -> None:
     assert "0.000" not in line
     (scored,) = [one for one in found.scores if one.label == "truck"]
     assert np.isnan(scored.precision.value)
-    assert "truck      not labelled, 1 detections" in str(fitted)
+    assert "truck      not labelled, 1 detection" in str(fitted)
     (row,) = re.findall("<tr><td>truck</td>.*?</tr>", found.report.read_text(), re.DOTALL)
     assert "not labelled: 3 detections not judged" in row
     assert "<td>-" not in row
