@@ -87,7 +87,7 @@ class YoloV5Output(_CentersOutput):
         why = f"rows of {columns}: 5 and {columns - 5} classes"
         settings: dict[str, object] = {"kind": "yolov5"}
         settings |= {"heads": heads} if heads else {"name": output.name}
-        if rows is not None and rows == cells and not names:
+        if rows is not None and rows == cells:
             return Guess(
                 settings,
                 columns - 5,

@@ -192,3 +192,17 @@ def test_corners_are_not_taken_for_center_and_size(tmp_path: Path, size: Size) -
 
     with pytest.raises(VehicleError, match="on noise, the boxes are corners, taken for center and"):
         crosscue.draft_card(net, class_names=CLASSES)
+
+
+def test_decoded_yolox_with_names_gets_its_own_pixels(tmp_path: Path) -> None:
+    """LibreYOLO's YOLOX stores class names; a row for each cell is YOLOX's, not YOLOv5's."""
+    net = tmp_path / "net.onnx"
+    rows = np.zeros((1, len(cell_grid(SIZE, (8, 16, 32))[0]), 8), np.float32)
+    model = onnx.load_model_from_string(constant_model((1, 3, SIZE[1], SIZE[0]), {"output": rows}))
+    onnx.helper.set_model_props(model, {"names": str(list(CLASSES))})
+    net.write_bytes(model.SerializeToString())
+
+    (guess,) = [one for one in guesses(read_interface(net)) if one.settings["kind"] == "yolov5"]
+
+    assert guess.input is not None
+    assert (guess.input["colour"], guess.input.get("scale")) == ("bgr", None)
