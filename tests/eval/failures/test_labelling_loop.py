@@ -105,7 +105,7 @@ def test_corrected_boxes_are_imported_and_used_for_training_and_fitting(
     with watching(lines.append):
         trained = crosscue.train_mask_rcnn(small, tmp_path / "net.safetensors")
     assert trained.path.stat().st_size > 0
-    counts = [re.search(r"(\d+) pictures, \d+ of (\d+) objects", str(line)) for line in lines[:2]]
+    counts = [re.search(r"(\d+) pictures?, \d+ of (\d+) object", str(line)) for line in lines[:2]]
     assert [sum(int(one[n]) for one in counts if one) for n in (1, 2)] == [len(original)] * 2
 
 
