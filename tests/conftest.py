@@ -13,11 +13,13 @@ os.environ["OMP_WAIT_POLICY"] = "passive"
 for library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
     os.environ.setdefault(library, "1")
 
-# An example of a law may take any time. With CI set, hypothesis draws the same ones in every run.
+# An example of a law may take any time. Every run draws the same ones, so that a gate is red for
+# a change and not by chance. CROSSCUE_FRESH_EXAMPLES=1 draws others.
 settings.register_profile(
     "laws",
     settings.default,
     deadline=None,
+    derandomize="CROSSCUE_FRESH_EXAMPLES" not in os.environ,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 settings.load_profile("laws")
