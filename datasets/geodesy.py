@@ -131,6 +131,5 @@ def geodetic_to_enu(
 def _unit(
     opposite: NDArray[np.float64], adjacent: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return sine and cosine of the angle with these legs."""
     length = np.hypot(opposite, adjacent)
     return opposite / length, adjacent / length

@@ -135,7 +135,6 @@ class _Parser(argparse.ArgumentParser):
         return known_args, rest
 
     def error(self, message: str) -> NoReturn:
-        """Report wrong usage and exit."""
         end = "" if message.endswith("?") else ";"
         line = one_line(ValueError(f"crosscue: {message}{end} see {self.prog} --help"))
         self.exit(2, f"{visible(line)}\n")
@@ -172,7 +171,6 @@ class _PublicText(io.TextIOWrapper):
     """Standard error without secrets of URLs: libraries print there, too."""
 
     def write(self, text: str, /) -> int:
-        """Write."""
         return super().write(without_secrets(text))
 
 
@@ -180,7 +178,6 @@ class _Messages(io.FileIO):
     """Standard error: that nobody reads it, or its disk is full, must not stop the work."""
 
     def write(self, content: Buffer, /) -> int:
-        """Write, or forget what cannot be said."""
         try:
             return super().write(content)
         except OSError:
@@ -380,7 +377,6 @@ def _docstring_of(name: str) -> tuple[str, str]:
 
 
 def _overview(*, has_all: bool) -> str:
-    """Return the list of commands: those of ``FRONT`` in groups, and all others if requested."""
     front = {name for names in FRONT.values() for name in names}
     groups = dict(FRONT)
     if has_all:

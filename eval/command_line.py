@@ -204,8 +204,6 @@ def add_parameters(
 
 @dataclass(frozen=True, slots=True)
 class _Argument:
-    """One parameter as an argument of the command line."""
-
     name: str
     parameter: inspect.Parameter
     kind: Any
@@ -213,17 +211,14 @@ class _Argument:
 
     @property
     def default(self) -> Any:
-        """Its default; ``Parameter.empty`` if it has none."""
         return self.parameter.default
 
     @property
     def is_required(self) -> bool:
-        """True if it has no default."""
         return self.default is inspect.Parameter.empty
 
     @property
     def is_positional(self) -> bool:
-        """True if the command line has no name for it."""
         if self.parameter.kind is inspect.Parameter.VAR_POSITIONAL or self.option.is_positional:
             return True
         is_named = self.parameter.kind is inspect.Parameter.KEYWORD_ONLY or self.name == "output"
@@ -231,7 +226,6 @@ class _Argument:
 
     @property
     def flags(self) -> list[str]:
-        """Option strings; none for a positional."""
         if self.is_positional:
             return []
         plain = self.name.removeprefix("has_").replace("_", "-")
@@ -273,7 +267,6 @@ class _Argument:
         return METAVARS.get(self.name) or UNITS.get(unit) or TYPES[item]
 
     def help(self, text: str) -> str:
-        """Return its one line of help, with the default."""
         found = text.replace("``", "'").removesuffix(".")
         if found[:1].isupper() and not any(c.isupper() for c in found.split()[0][1:]):
             found = found[:1].lower() + found[1:]
@@ -302,7 +295,6 @@ def _option_of(annotation: Any) -> tuple[Option, Any]:
 
 
 def _items(kind: Any) -> tuple[Any, str | int | None]:
-    """Return the type of one word, and the number of words."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple and Ellipsis not in inner:
         return inner[0], len(inner)
@@ -312,7 +304,6 @@ def _items(kind: Any) -> tuple[Any, str | int | None]:
 
 
 def _is_list(kind: Any) -> bool:
-    """Return whether a type is a sequence of words."""
     origin = typing.get_origin(kind)
     return isinstance(origin, type) and issubclass(origin, Sequence)
 
@@ -332,7 +323,6 @@ def _converter(convert: Callable[[str], object]) -> Callable[[str], object]:
 
 
 def _hints(function: Callable[..., Any]) -> dict[str, Any]:
-    """Return the annotations of a function's or record's parameters."""
     if isinstance(function, type):
         return typing.get_type_hints(function, include_extras=True)
     plain = inspect.unwrap(function)
@@ -369,7 +359,6 @@ def types_of(function: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _returned(verb: Callable[..., Any]) -> type:
-    """Return the class of a verb's result."""
     plain = inspect.unwrap(verb)
     notes = {"return": plain.__annotations__["return"]}
     module = inspect.getmodule(plain)

@@ -68,7 +68,6 @@ def _parser_at(
 
 
 def _words(line: str) -> list[str]:
-    """Return the complete words before the cursor, without the word being typed."""
     done = line if line[-1:].isspace() else line.rpartition(" ")[0]
     try:
         return shlex.split(done)

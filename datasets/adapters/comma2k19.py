@@ -181,8 +181,6 @@ STREAMS: Final[dict[str, _Stream]] = {
 
 @dataclass(slots=True, eq=False)
 class _Source:
-    """One topic: its times, and a function that reads its rows."""
-
     topic: Topic
     t_ns: Int64s
     rows: Callable[[slice], Rows]

@@ -366,7 +366,6 @@ def _account(
     ledger: Ledger,
     selection: Selection,
 ) -> None:
-    """Count a group of packets for one topic."""
     n = len(packets)
     ledger.find(name, n)
     if not selection.wants(name):
@@ -382,7 +381,6 @@ def _account(
 
 
 def _packets(some: Sequence[Line]) -> Packets:
-    """Return the lines that are packets."""
     good = [
         (t_ns, row)
         for _, t_ns, raw in some
@@ -393,7 +391,6 @@ def _packets(some: Sequence[Line]) -> Packets:
 
 
 def _in_time_order(packets: Packets) -> Packets:
-    """Return packets with times, with each time once."""
     _, first = np.unique(packets.t_ns, return_index=True)
     first = first[packets.t_ns[first] >= 0]
     return Packets(packets.t_ns[first], packets.numbers[first])

@@ -269,7 +269,6 @@ def open_scene(path: Path, limits: Limits) -> NuscenesDrive:
 
 
 def _timed(root: Path, rows: Sequence[Row]) -> TimedFiles:
-    """Return existing pictures, and the times of missing ones."""
     places = [(root / str(row["filename"]), int(row["timestamp"]) * 1000) for row in rows]
     there = [(path, t_ns) for path, t_ns in places if path.is_file()]
     missing = [t_ns for path, t_ns in places if not path.is_file()]
@@ -337,7 +336,6 @@ def ego_poses(tables: SceneTables) -> EgoPoses:
 
 
 def _odometry(tables: SceneTables) -> HeldRows:
-    """Return forward speed and yaw rate, computed from the ego poses."""
     poses = ego_poses(tables)
     w, x, y, z = poses.wxyz.T
     heading = np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
@@ -375,8 +373,6 @@ def _vectors(**sizes: int) -> _Columns:
 
 
 class _Message(NamedTuple):
-    """Topic, type and columns of a CAN message."""
-
     topic: str
     type_name: str
     names: tuple[str, ...]

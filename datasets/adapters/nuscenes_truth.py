@@ -48,8 +48,6 @@ NEAREST_M: Final = 0.5
 
 
 class _Camera(NamedTuple):
-    """Camera of a key frame in the map."""
-
     map_r_camera: Rotation
     place_m: Floats
     map_r_car: Rotation
@@ -137,7 +135,6 @@ def _objects(tables: SceneTables) -> tuple[Objects, int]:
 def _labels(
     folder: Path, of_sample: Mapping[str, list[Row]], categories: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the label of each instance in the scene."""
     wanted = {str(row.get("instance_token")) for rows in of_sample.values() for row in rows}
     found = {}
     for row in RowsOf(checked(folder / "instance.json")):
@@ -149,7 +146,6 @@ def _labels(
 
 
 def _key_frames(tables: SceneTables) -> Iterator[tuple[Row, _Camera]]:
-    """Yield the front camera's key frames with the camera's pose."""
     rows = [row for row in tables.pictures.get(FRONT, ()) if row.get("is_key_frame")]
     calibration = tables.calibration(FRONT)
     if calibration is None:

@@ -54,8 +54,6 @@ Row = tuple[float, ...]
 
 
 class _Stream(NamedTuple):
-    """A topic with numbers: its type, and its columns."""
-
     type_name: str
     columns: tuple[str, ...]
 
@@ -209,11 +207,9 @@ class _OtherMessages:
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """None: they can be counted only."""
         return ()
 
     def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
-        """Account for them."""
         ledger.declare(OTHER, self.kinds.total())
         ledger.find(OTHER, self.kinds.total())
         for kind, count in sorted(self.kinds.items()):
@@ -324,7 +320,6 @@ def _bounded(file: BinaryIO, limits: Limits) -> Callable[[int], bytes]:
 
 
 def _failures() -> tuple[type[Exception], ...]:
-    """Return the exceptions that damaged files cause."""
     import zstandard
 
     return MessageError, EOFError, OSError, zstandard.ZstdError

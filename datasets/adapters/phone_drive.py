@@ -73,7 +73,6 @@ class _Stream(NamedTuple):
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """All columns of the file that the topic needs."""
         return (*self.more, *self.columns.values())
 
 
@@ -129,8 +128,6 @@ class PhoneDrive(CameraDrive):
 
 
 class _Lines(NamedTuple):
-    """Lines of a file that have a time, and the damaged lines."""
-
     t_ns: Int64s
     fields: list[dict[str, str]]
     losses: tuple[Loss, ...]
@@ -181,7 +178,6 @@ def _read(file: Path, wanted: set[str]) -> _Lines:
 
 
 def _held(name: str, stream: _Stream, lines: _Lines) -> HeldRows:
-    """Return a stream with a row for each line."""
     values = {one: _numbers(lines.fields, one) for one in stream.fields}
     good = np.isfinite(np.column_stack([*values.values()])).all(axis=1)
     bad = int((~good).sum())
@@ -198,7 +194,6 @@ def _held(name: str, stream: _Stream, lines: _Lines) -> HeldRows:
 
 
 def _fixes(lines: _Lines) -> HeldRows:
-    """Return the lines with new positions, at the wall-clock times of the positions."""
     fix_s = _numbers(lines.fields, FIX_TIME)
     is_new = np.isfinite(fix_s) & (np.diff(fix_s, prepend=-math.inf) > 0.0)
     rows = np.flatnonzero(is_new)

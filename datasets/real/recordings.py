@@ -234,7 +234,6 @@ def fetch(
 
 
 def _refuse_others(place: Path, known: Recording) -> None:
-    """Refuse a folder with files that are not those of the recording."""
     if place.exists() and not place.is_dir():
         raise OutputError(f"{place}: is a file; choose a new folder")
     files = {place / file.name: file for file in known.files}

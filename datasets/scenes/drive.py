@@ -228,8 +228,6 @@ def refuse_other_drive(folder: Path, settings: SceneSettings, imager: Imager = P
 
 
 class _Record:
-    """Recorder of a run's log, which collects the run's truth."""
-
     def __init__(
         self,
         layout: Layout,
@@ -252,7 +250,6 @@ class _Record:
         self._enter_ns = START_NS + round(world.approach.enter_s * 1e9)
 
     def blocks(self) -> Iterator[Block]:
-        """Yield all rows of the log, approximately in order of their times."""
         device = Device(self.world, np.random.default_rng([self.conditions.seed, 9]))
         others = [
             replace(block, topic=CAR_BUS) if block.topic == "/can" else block
@@ -300,7 +297,6 @@ class _Record:
             self._ranges.append(f"{t_ns},0,{to_start:.4f},{to_end:.4f}")
 
     def vehicle_text(self, *, is_calibrated: bool) -> str:
-        """Return the text of the vehicle file."""
         text = scene_vehicle_text(
             self.settings.camera,
             traffic=self.settings.traffic,

@@ -152,14 +152,11 @@ class _Errors:
         )
 
     def happens(self, key: int, t_s: float, chance: float) -> bool:
-        """Return whether a random event of the given probability occurs at a time."""
         return 0.5 * math.erfc(self(key, t_s) / math.sqrt(2.0)) < chance
 
 
 @dataclass(frozen=True, slots=True)
 class _FalseObject:
-    """An object that is mistaken for a sign."""
-
     category: Category
     at_m: tuple[float, float, float]
 
@@ -266,7 +263,6 @@ class FaultyLabels:
 
 
 def _beside(world: World, category: Category, rng: Generator) -> tuple[float, float, float]:
-    """Draw the position of an object that is mistaken for a sign."""
     half_m = world.layout.half_width_m
     x, side = float(rng.uniform(-45.0, 25.0)), float(rng.choice([-1.0, 1.0]))
     if category == "traffic_light":
@@ -314,7 +310,6 @@ def _ground_codes(
 
 
 def _stretched(mask: NDArray[np.bool_], factor: float) -> NDArray[np.bool_]:
-    """Return the mask with its height scaled, in complete rows."""
     high = max(round(len(mask) * factor), 1)
     rows = np.minimum((np.arange(high) * len(mask)) // high, len(mask) - 1)
     return mask[rows]

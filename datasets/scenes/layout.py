@@ -255,7 +255,6 @@ def mixed_layout(seed: int) -> Layout:
 
 
 def _curve(rng: np.random.Generator, side: Side) -> float:
-    """Draw a curvature with a radius of 130 to 250 m."""
     return (1.0 if side == "left" else -1.0) / float(rng.uniform(130.0, 250.0))
 
 

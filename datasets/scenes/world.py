@@ -148,8 +148,6 @@ class _Flow(NamedTuple):
 
 @dataclass(slots=True)
 class _Site:
-    """A world under construction."""
-
     layout: Layout
     atlas: Atlas
     lamps_on: bool
@@ -160,14 +158,12 @@ class _Site:
     taken: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def is_free(self, x: float, y: float, margin: float) -> bool:
-        """Return whether a position is outside all buildings and lots."""
         return all(
             not (x0 - margin < x < x1 + margin and y0 - margin < y < y1 + margin)
             for x0, x1, y0, y1 in self.taken
         )
 
     def add(self, thing: SceneObject) -> None:
-        """Add a labelled object, whose mesh is already in position."""
         number = len(self.things)
         later = None if thing.later is None else thing.later.owned_by(number)
         mesh = thing.mesh.owned_by(number)
@@ -183,7 +179,6 @@ class _Site:
         speed: float = 0.0,
         span_s: tuple[float, float] = ALWAYS,
     ) -> None:
-        """Add a car, which is at (x, y) at time zero."""
         moving = speed != 0.0
         mesh = car(look, lamps_on=self.lamps_on and moving)
         shape = look.shape
@@ -208,7 +203,6 @@ class _Site:
 
 
 def _along_curve(thing: SceneObject, layout: Layout) -> SceneObject:
-    """Move an object to its position along a curve; a moving object follows the curve."""
     if layout.curve_per_m == 0.0:
         return thing
     if not thing.is_fixed:
@@ -261,7 +255,6 @@ def _painted(site: _Site, light: Daylight) -> Ground:
 
 
 def _lot(site: _Site, fixed: Generator, varied: Generator) -> None:
-    """Add a parking lot next to the approach road, with cars seen from the side."""
     if not site.layout.has_lot:
         return
     side = float(fixed.choice([-1.0, 1.0]))
@@ -307,7 +300,6 @@ def _buildings(site: _Site, fixed: Generator, varied: Generator) -> None:
 def _row_along(
     site: _Site, fixed: Generator, varied: Generator, x0: float, x1: float, y: float, side: float
 ) -> None:
-    """Add buildings next to the road along x; the last one ends at ``x1``."""
     shop = site.layout.is_town
     at = x1
     while at > x0 + 8.0:
@@ -330,7 +322,6 @@ def _row_along(
 def _row_across(
     site: _Site, fixed: Generator, x: float, out: float, side: float, y0: float, y1: float
 ) -> None:
-    """Add buildings next to the crossroad."""
     shop = site.layout.is_town
     at = y0
     while at < y1 - 6.0:
@@ -435,7 +426,6 @@ def _poles(site: _Site, fixed: Generator) -> None:
 
 
 def _sign(site: _Site, category: Category, x: float, y: float, z: float, turn: float = 0.0) -> None:
-    """Add a sign on its own post, facing back along the approach road, or rotated."""
     face = sign_face(category, site.atlas)
     flat = face.corners.reshape(-1, 3)
     wide, high = (float(np.ptp(flat[:, k])) for k in (1, 2))
@@ -466,7 +456,6 @@ def _control(site: _Site, drive: ApproachMotion) -> None:
 
 
 def _lights(site: _Site, drive: ApproachMotion) -> None:
-    """Add two lights on an arm over the road and one on the pole, beyond the intersection."""
     layout = site.layout
     w, end, own = layout.half_width_m, layout.end_m, layout.own
     site.parts.append(mast(end, own * (w + 1.5), -own * 1.2))
@@ -543,7 +532,6 @@ def _traffic(site: _Site, conditions: Conditions, drive: ApproachMotion, varied:
 
 
 def _stream(site: _Site, flow: _Flow, drive: ApproachMotion, varied: Generator) -> None:
-    """Add cars that follow one another at random, without collisions with the ego vehicle."""
     role, heading, lane, rate_hz = flow
     length_s, at = len(drive.motion) / 100.0, -9.0
     speed = float(varied.uniform(8.0, 12.0))
@@ -566,7 +554,6 @@ def _stream(site: _Site, flow: _Flow, drive: ApproachMotion, varied: Generator) 
 
 
 def _outgoing(site: _Site, conditions: Conditions, varied: Generator) -> None:
-    """Add outgoing cars that left the intersection before the ego vehicle arrives."""
     x = site.layout.far_kerb_m + float(varied.uniform(6.0, 30.0))
     # All have one speed, so that no car passes through another.
     speed = float(varied.uniform(2.5, 5.0))

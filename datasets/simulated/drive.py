@@ -129,7 +129,6 @@ def integrated(
 
 
 def _road(settings: DriveSettings, rng: Generator) -> tuple[Floats, Floats]:
-    """Return curvature and speed limit for each metre of the route."""
     pieces: list[Floats] = []
     limits: list[Floats] = []
     radius_m = 9.0

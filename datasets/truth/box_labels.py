@@ -304,7 +304,6 @@ def _is_shown(word: str, where: str) -> bool:
 
 
 def _classes(pictures: Sequence[LabelPicture], class_names: Sequence[str]) -> tuple[str, ...]:
-    """Return all classes that are used or listed."""
     used = {box.label for one in pictures for box in one.boxes if box.label}
     return (*class_names, *sorted(used.difference(class_names)))
 

@@ -111,8 +111,6 @@ class XmlReader:
 
 @dataclass(slots=True)
 class _CvatReader(XmlReader):
-    """Parser of CVAT's file, with the contents read so far."""
-
     kind = "CVAT's XML 1.1"
     max_depth = 64
     _meta: dict[str, str] = field(default_factory=dict)
@@ -244,14 +242,12 @@ class _CvatReader(XmlReader):
         return value
 
     def annotations(self) -> Annotations:
-        """Return all annotations, once the file is read."""
         pictures = tuple(self._pictures) or self._video()
         used = {thing.label for picture in pictures for thing in picture.things}
         labels = tuple(dict.fromkeys([*self._labels, *sorted(used)]))
         return Annotations(self.where, labels, pictures, dict(self._ignored))
 
     def _video(self) -> tuple[Picture, ...]:
-        """Return all frames of the task as annotated pictures, including those without tracks."""
         size = (self._known("original_size/width"), self._known("original_size/height"))
         self._check_size(size)
         first = self._known("start_frame", 0)
@@ -272,7 +268,6 @@ class _CvatReader(XmlReader):
         )
 
     def _found(self, name: str) -> str | None:
-        """Return a value of the task or job, or of an element below it."""
         ends = (f"task/{name}", f"job/{name}", name)
         return next((self._meta[end] for end in ends if end in self._meta), None)
 
@@ -343,8 +338,6 @@ def read_voc(path: Path) -> tuple[str, tuple[int, int] | None, list[VocBox]]:
 
 @dataclass(slots=True)
 class _VocReader(XmlReader):
-    """Parser of a Pascal VOC file; values by their path below the root."""
-
     kind = "a Pascal VOC file"
     max_depth = 16
     is_voc: bool = False
@@ -369,7 +362,6 @@ class _VocReader(XmlReader):
         XmlReader.end(self, tag)
 
     def size(self) -> tuple[int, int] | None:
-        """Width and height, if the file specifies them."""
         found = [self.values.get(f"annotation/size/{side}", "") for side in ("width", "height")]
         if not all(one.isdecimal() and int(one) > 0 for one in found):
             return None

@@ -90,8 +90,6 @@ def read_openstreetmap(path: Path) -> MapExtract:
 
 @dataclass(slots=True)
 class _Reader(XmlReader):
-    """Parser of an extract."""
-
     kind = "OpenStreetMap's XML"
     max_depth = 16
     points: dict[str, tuple[float, float]] = field(default_factory=dict)

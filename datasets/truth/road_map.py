@@ -79,8 +79,6 @@ class Ahead:
 
 
 class _Edge(NamedTuple):
-    """Part of a road between two points."""
-
     to: str
     width_m: float
     is_out: bool
@@ -218,7 +216,6 @@ class RoadMap:
         return found
 
     def _near(self, xy_m: Floats) -> list[tuple[str, _Edge]]:
-        """Return the drivable edges near a track."""
         low, high = xy_m.min(axis=0) - OFF_M, xy_m.max(axis=0) + OFF_M
         found = []
         for at, edges in self._edges.items():

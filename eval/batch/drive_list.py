@@ -238,7 +238,6 @@ def _in_folder(folder: Path, *, each: bool) -> Iterator[_Found]:
 
 
 def _drives_below(folder: Path, depth: int) -> Iterator[_Found]:
-    """Yield the drives in a folder of drives."""
     recordings = _recordings(folder)
     formats = {_format(one) for one in recordings if one.is_file()}
     if len(formats) > 1:
@@ -271,7 +270,6 @@ def _is_drive(folder: Path) -> bool:
 
 
 def _recordings(folder: Path) -> list[Path]:
-    """Return the recordings directly in a folder."""
     found = [one for one in _entries(folder) if _format(one)]
     return [one for one in found if not one.joinpath(MANIFEST).exists()]
 

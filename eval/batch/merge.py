@@ -64,7 +64,6 @@ class _Drive:
 
     @property
     def seconds(self) -> float:
-        """Log time from the first to the last pose."""
         if self.first_ns is None or self.last_ns is None:
             return 0.0
         return (self.last_ns - self.first_ns) * 1e-9
@@ -184,7 +183,6 @@ def _settings_hash(manifest: DriveManifest) -> str:
 
 
 def _tables_hash(run: RunFolder) -> str:
-    """Return a hash of a run's tables."""
     digest = hashlib.sha256()
     for path in sorted(run.path.glob("*.parquet")):
         with os.fdopen(door.opened(path), "rb") as file:

@@ -328,8 +328,6 @@ class Processes:
 
 
 class _Worker(Worker):
-    """A process and its current job."""
-
     def __init__(self, work: Callable[[Job], Any], threads: int) -> None:
         super().__init__(_serve, threads)
         self._work = work
@@ -337,7 +335,6 @@ class _Worker(Worker):
         self.number = 0
 
     def begin(self, job: Job, number: int) -> None:
-        """Send a job to the process as attempt ``number``."""
         is_first = self.number == 0
         self.job, self.number = job, number
         try:
@@ -359,7 +356,6 @@ class _Worker(Worker):
 
 
 def _serve(pipe: Connection, threads: int) -> None:
-    """Process jobs from the pipe until it closes."""
     # Libraries read these when loaded; nothing numerical has been loaded here yet.
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
     work = pipe.recv()

@@ -72,7 +72,6 @@ class _Table:
             self.write()
 
     def write(self) -> None:
-        """Write the buffered rows."""
         if not self.held:
             return
         columns = _labelled(topic_columns(self.held), self.timeline, self.clock)

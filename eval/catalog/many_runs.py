@@ -32,7 +32,6 @@ class _Side(NamedTuple):
 
     @property
     def logs(self) -> set[str]:
-        """Identities of the drives."""
         return {one.log for one in self.parts}
 
 

@@ -148,12 +148,9 @@ class BatchSettings(ReplaySettings):
 
 @dataclass(frozen=True, slots=True)
 class _Work:
-    """Replay of one of many drives, in any process."""
-
     settings: BatchSettings
 
     def __call__(self, job: Job) -> Outcome:
-        """Replay the drive into its run folder."""
         settings = self.settings
         # The caller has already decided that an existing run may be replaced.
         ours = replace(settings, vehicle=settings.vehicle_of(job), overwrite=True)
@@ -302,7 +299,6 @@ def _several(drives: Sequence[Path | str] | Path | str) -> Sequence[Path | str]:
 
 
 def _merge(done: Sequence[JobOutcome[Outcome]], output: Path) -> None:
-    """Merge the tables of all runs in the folder, including those of earlier batches."""
     runs, failures = gathered([output])
     ended = {one.job.name: one.error for one in done}
     # A drive that failed now has no run, even if an earlier start left an interrupted one.

@@ -298,7 +298,6 @@ def choices_for(
 
 
 def _copied(folder: RunFolder, output: Path) -> RunFolder:
-    """Copy a run to a new folder, for another estimate."""
     if output.resolve().parent != folder.path.resolve().parent:
         # The manifest's paths of logs are relative to the folder.
         raise UsageError(f"{output}: expected a folder next to the run, {folder.path}")

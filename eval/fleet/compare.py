@@ -150,7 +150,6 @@ def _reported(
     before: Sequence[Path],
     after: Sequence[Path],
 ) -> compare.Comparison:
-    """Write the files that were asked for."""
     if junit is not None:
         write_text(Path(junit), cases_text(found.cases(), "compare", "comparison"))
     if output is not None:

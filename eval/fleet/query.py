@@ -126,7 +126,6 @@ def _lines(found: pa.Table, width: int) -> Iterator[str]:
 
 
 def _records(found: pa.Table) -> list[dict[str, Any]]:
-    """Return the rows as values that JSON can hold."""
     import pyarrow as pa
 
     maps = {one.name for one in found.schema if pa.types.is_map(one.type)}

@@ -394,7 +394,6 @@ class LogTopic:
         return replace(part, topics=frozenset({self.name}))
 
     def _rows(self, selection: Selection, ledgers: list[Ledger]) -> Iterator[Block]:
-        """Yield blocks of columns."""
         for block in self._blocks(selection, ledgers):
             if isinstance(block.rows, Images):
                 raise UsageError(f"{self.name}: contains pictures; use frames()")
@@ -542,7 +541,6 @@ def _narrowed(part: Selection, wanted: Selection) -> Selection:
 
 
 def _batches_of(log: OneLog, wanted: Selection) -> Iterator[tuple[str, pa.RecordBatch]]:
-    """Yield the batches of one log; at the end, warn about missing rows."""
     decoders: dict[str, Decoder] = {}
     for topic in log.topics:
         if wanted.wants(topic.name):
@@ -614,7 +612,6 @@ def _views(messages: Messages) -> pa.Array:
 
 
 def _payloads(rows: object) -> pa.Array:
-    """Return the payload of each CAN frame, in its actual length."""
     import pyarrow as pa
 
     assert isinstance(rows, CanFrames)
@@ -655,7 +652,6 @@ def _account(of: TopicAccount) -> dict[str, object]:
 
 
 def _warn(ledger: Ledger, topic: str) -> None:
-    """Warn about rows that are dropped or cannot be decoded."""
     warn_of(ledger, topic)
     for reason, count in sorted(ledger.topic(topic).skipped.items()):
         if reason not in NOT_ASKED:

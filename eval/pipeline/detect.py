@@ -214,8 +214,6 @@ def _finds_road(named: Sequence[Named]) -> bool:
 
 
 class _Pictures:
-    """The pictures of a drive, with their ledger and clock."""
-
     def __init__(self, drive: Drive, camera: tuple[int, Topic]) -> None:
         number, self.topic = camera
         self.ledger = Ledger(log_names(drive.logs)[number])
@@ -234,7 +232,6 @@ class _Pictures:
         )
 
     def spoil(self, t_ns: int, reason: str, why: str) -> None:
-        """Count the picture at a drive time as dropped."""
         log_ns = int(self._clock.log_times(np.array([t_ns]))[0])
         self.ledger.spoil(self.topic.name, reason, 1, why, log_ns)
 

@@ -127,7 +127,6 @@ def without_wheels(logs: Sequence[Log]) -> tuple[SignalPlan, list[WheelReader]]:
 
 
 def _no_wheels(block: Block) -> tuple[Samples, ...]:
-    """Find no wheel speeds in a block."""
     return ()
 
 

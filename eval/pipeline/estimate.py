@@ -249,7 +249,6 @@ class EstimateStage:
         )
 
     def _clock_of(self, signal: Signal) -> LogClock:
-        """Return the clock of the log that a signal comes from."""
         source = self._planned.source_of(signal)
         return self._drive.segments.clock(0 if source is None else source.log)
 
@@ -263,7 +262,6 @@ class EstimateStage:
             raise empty_result(what, self._drive.logs, self._drive.selection)
 
     def _account(self, scene: SceneSummary | None) -> Account:
-        """Return the account of the run, with the detect stage's part if it has run."""
         accounts, found = reading_of(self._ledgers), self.found
         if found is None or scene is None:
             return account(accounts, {}, estimating_of(self.pose, None))
@@ -314,7 +312,6 @@ class PoseTables:
 
 
 def _landmarks_used(landmarks: LandmarkDatabase, run: RunFolder) -> LandmarksUsed:
-    """Return the manifest's record of the landmark database."""
     return LandmarksUsed(
         database=run.relative(landmarks.path),
         landmarks=len(landmarks),
@@ -356,7 +353,6 @@ def _camera_skips(run: RunFolder, camera: str) -> pa.Table:
 
 
 def _sources(planned: SignalPlan, logs: Sequence[Log]) -> dict[str, str | None]:
-    """Return the log and topic of each signal."""
     names = log_names(logs)
     found = {signal: planned.source_of(signal) for signal in Signal}
     return {
@@ -366,7 +362,6 @@ def _sources(planned: SignalPlan, logs: Sequence[Log]) -> dict[str, str | None]:
 
 
 def _missing(planned: SignalPlan, *, has_speed: bool) -> list[str]:
-    """Return notices about missing signals; ``has_speed`` if the pictures give the speed."""
     names = {
         Signal.WHEEL_SPEEDS: "no wheel speeds, so no pose",
         Signal.MAGNETIC_FIELD: "no compass, so the heading drifts",

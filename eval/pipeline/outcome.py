@@ -187,7 +187,6 @@ def _detected(outcome: Outcome) -> list[str]:
 
 
 def _found(scene: SceneSummary) -> list[str]:
-    """Return the output lines on approaches and cues."""
     seen = [f"{cue} {count:,}" for cue, count in scene.positive.items()]
     lines = [f"approach {_approach(one)}" for one in scene.approaches]
     return [*lines, f"cues     {', '.join(seen) or 'none'} (frames each, of {scene.frames:,})"]

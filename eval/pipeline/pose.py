@@ -249,7 +249,6 @@ class PoseStage:
             self.positions.let_go(before_ns)
 
     def _close(self) -> Iterator[PoseColumns]:
-        """Yield the waiting rows at the end of a segment, where no more odometry follows."""
         if self._state is not None and self._last_ns is not None:
             yield from self._advance(SampleWindow(self._last_ns, self._last_ns, {}), None)
 
@@ -413,7 +412,6 @@ class PoseStage:
         return TurnSignal(found.t_ns, found.values, kind)
 
     def _fixes(self, window: SampleWindow) -> Fixes:
-        """Return a window's GNSS positions in the map frame."""
         found, origin = window.samples.get(Signal.POSITION), self.vehicle.start.map_origin
         if found is None or origin is None:
             return NO_FIXES
@@ -441,7 +439,6 @@ def _kind(turn: Signal | None) -> odometry.TurnKind | None:
 
 
 def _split(window: SampleWindow, at_ns: int) -> tuple[SampleWindow, SampleWindow]:
-    """Split a window at a time."""
     before: dict[Signal, Samples] = {}
     after: dict[Signal, Samples] = {}
     for signal, samples in window.samples.items():

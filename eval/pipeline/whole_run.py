@@ -98,7 +98,6 @@ def detect_drive(drive: Drive, run: RunFolder, detecting: Detecting) -> DetectOu
 def _input(
     run: RunFolder, drive: Drive, detecting: Detecting, landmarks: LandmarkDatabase | None = None
 ) -> dict[str, object]:
-    """Return the content of ``input.json``."""
     database = None if landmarks is None else str(landmarks.path.resolve())
     return input_of(run, drive, {**detecting.as_json(), "landmarks": database})
 
@@ -188,7 +187,6 @@ def estimate_run(
 
 
 def _refuse_other_time(run: RunFolder, manifest: DriveManifest, vehicle: Vehicle) -> None:
-    """Refuse other ``[time]`` settings than those with which the frames were detected."""
     wanted = vehicle.time.model_dump()
     there = wanted if manifest.detected is None else manifest.detected.settings.time.model_dump()
     for name, value in wanted.items():

@@ -269,7 +269,6 @@ def _faults(stamps: StampReport, name: str) -> Iterator[tuple[Kind, str]]:
 
 
 def _purposes(use: str) -> tuple[str, ...]:
-    """Return the purposes of a topic by what it is used for."""
     found = [set(purposes) for signal, (purposes, _, _) in NEEDS.items() if words_of(signal) in use]
     if use == "camera":
         found.append(set(SEEING))

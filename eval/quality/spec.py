@@ -97,7 +97,6 @@ def spec_faults(spec: LogSpec, summaries: Sequence[LogSummary]) -> Iterator[tupl
 
 
 def _measured(topic: TopicSummary) -> tuple[float | None, float | None, float | None]:
-    """Return rate, longest gap, and delay of the header stamps."""
     report = topic.clocks
     if report is None:
         return None, None, None
@@ -135,6 +134,5 @@ def write_spec(path: Path, summaries: Sequence[LogSummary]) -> None:
 
 
 def _rounded(value: float) -> str:
-    """Return a number with three digits, with a point as TOML's floats need."""
     digits = 2 - math.floor(math.log10(value))
     return str(float(round(value, digits)))

@@ -190,7 +190,6 @@ def refuse_files_of_user(path: Path) -> None:
 
 
 def _is_begun(run: RunFolder) -> bool:
-    """Return whether ``input.json`` is that of a run."""
     try:
         tree = json_tree(door.read(run.file(INPUT)))
         return bool(tree["format_version"] and tree["identity"] and tree["settings"])

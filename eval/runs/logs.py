@@ -176,7 +176,6 @@ def _stored(run: RunFolder, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _renamed(tree: object, names: Mapping[str, str]) -> Any:
-    """Return JSON values with other names of some files."""
     if isinstance(tree, Mapping):
         return {names.get(key, key): _renamed(value, names) for key, value in tree.items()}
     if isinstance(tree, list | tuple):

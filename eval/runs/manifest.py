@@ -235,8 +235,6 @@ class _Versioned(Record):
 
 
 class _Drive(_Versioned):
-    """Fields common to both stages of a drive."""
-
     logs: tuple[LogRow, ...]
     selection: Part
     clocks: tuple[dict[str, ClockRow], ...]
@@ -247,7 +245,6 @@ class _Drive(_Versioned):
 
     @property
     def timeline(self) -> Timeline:
-        """The drive's time segments."""
         return Timeline(self.time.segments, self.time.clocks)
 
 

@@ -249,7 +249,6 @@ _UNITS: Final = {
 
 
 def _named(signal: Signal, vehicle: Vehicle) -> tuple[str, ...]:
-    """Return the names of the CAN signals that the vehicle file assigns to a signal."""
     can = vehicle.can
     if signal is Signal.WHEEL_SPEEDS and can.wheel_speeds is not None:
         of = can.wheel_speeds
@@ -299,7 +298,6 @@ def _differ(wheels: Mapping[str, Series]) -> bool:
 
 
 def _of_wheels(wheels: Mapping[str, Series]) -> Iterator[str]:
-    """Yield contradictions of wheels that disagree with the others."""
     means = {
         name: float(np.abs(one.values).mean()) for name, one in wheels.items() if name in WHEELS
     }
@@ -351,7 +349,6 @@ def _picture(
 
 
 def _of_camera(shown: CameraPicture | None, log: Log, camera: Camera) -> Iterator[str]:
-    """Yield contradictions between the intrinsics and the pictures or the published values."""
     if shown is None:
         yield "camera: not one picture in the seconds examined"
         return

@@ -144,7 +144,6 @@ def draft_vehicle(log: WholeDriveGiven, settings: DraftSettings) -> VehicleDraft
 
 
 def _mounting(examined: Examined, given: CameraMounting) -> CameraMounting:
-    """Return the given mounting, completed by estimates from the pictures."""
     camera = first_camera(examined.logs)
     if camera is None:
         return given

@@ -61,15 +61,12 @@ class Ground:
 
 
 class _Canvas:
-    """A map with coordinates in metres."""
-
     def __init__(self) -> None:
         wide = round((X_M[1] - X_M[0]) * TEXELS_PER_M)
         high = round((Y_M[1] - Y_M[0]) * TEXELS_PER_M)
         self.map = np.zeros((high, wide, 4), np.uint8)
 
     def polygon(self, where: NDArray[np.generic], points: object, value: object) -> None:
-        """Fill a polygon with coordinates in metres."""
         import cv2
 
         xy = np.asarray(points, np.float64)
@@ -80,12 +77,10 @@ class _Canvas:
     def rectangle(
         self, where: NDArray[np.generic], x: Sequence[float], y: Sequence[float], value: object
     ) -> None:
-        """Fill a rectangle with coordinates in metres."""
         points = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
         self.polygon(where, points, value)
 
     def line(self, x: Sequence[float], y: Sequence[float], rgb: tuple[int, int, int]) -> None:
-        """Paint a rectangle on the road."""
         self.rectangle(self.map, x, y, (*rgb, 40))
 
 
@@ -200,7 +195,6 @@ def _joints(canvas: Map, walk: NDArray[np.bool_]) -> None:
 
 
 def _wear(canvas: _Canvas, layout: Layout, rng: Generator, is_road: NDArray[np.bool_]) -> None:
-    """Draw darker wheel tracks, repair patches and cracks."""
     import cv2
 
     dark: NDArray[np.uint8] = np.zeros(is_road.shape, np.uint8)
@@ -253,7 +247,6 @@ def _lines(canvas: _Canvas, layout: Layout) -> None:
 
 
 def _lines_along(canvas: _Canvas, layout: Layout) -> None:
-    """Draw the lines of a road without a crossroad."""
     for y in (-0.17, 0.17):
         canvas.line(X_M, (y - 0.055, y + 0.055), YELLOW)
     if layout.has_parking_lane:

@@ -119,7 +119,6 @@ def draw_triangles(
 
 
 def _to_eye(corner: Float32s, shift: Float32s, eye: Eye, seen: Float64s) -> None:
-    """Transform a corner to camera axes, and write it to the first three elements of ``seen``."""
     x = corner[0] + shift[0] - eye.at[0]
     y = corner[1] + shift[1] - eye.at[1]
     z = corner[2] + shift[2] - eye.at[2]
@@ -233,7 +232,6 @@ def _texture_level(triangle: Float64s, area: float, levels: Int64s) -> int:
 
 
 def _texel(u: float, v: float, place: Int64s) -> int:
-    """Return the position in the atlas of a repeated texture's colour."""
     wide, high = place[1], place[2]
     x = min(int((u - math.floor(u)) * wide), wide - 1)
     y = min(int((v - math.floor(v)) * high), high - 1)
@@ -469,7 +467,6 @@ def _ground(
 
 
 def _between(ground: Bytes, at: int, wide: int, k: int, fx: float, fy: float) -> float:
-    """Interpolate channel ``k`` bilinearly between four texels, the first at ``at``."""
     return float(
         (1 - fx) * (1 - fy) * ground[at, k]
         + fx * (1 - fy) * ground[at + 1, k]

@@ -182,7 +182,6 @@ def tube(a: Sequence[float], b: Sequence[float], radius_m: float, rgb: Rgb, side
 
 
 def _ring(along: Floats, radius_m: float, sides: int, *, is_level: bool) -> Floats:
-    """Return a closed ring around an axis, shape (sides + 1, 3)."""
     e1 = np.cross([0.0, 0.0, 1.0] if is_level else [1.0, 0.0, 0.0], along)
     e1 /= np.linalg.norm(e1)
     e2 = np.cross(along, e1)

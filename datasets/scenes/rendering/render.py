@@ -233,7 +233,6 @@ class Renderer:
         return shade
 
     def _finish(self, rgb: NDArray[np.uint8], view: CameraView, number: int) -> None:
-        """Apply rain, lens and sensor effects in place."""
         import cv2
 
         from .weather import drops, streaks

@@ -169,7 +169,6 @@ class Catalog:
         return pa.table({name: list(column) for name, column in zip(head, columns, strict=True)})
 
     def _listed(self, column: str) -> list[Any]:
-        """Return a column of the table ``runs`` as a list."""
         import pyarrow.dataset as ds
 
         runs = self._index.tables["runs"]

@@ -66,8 +66,6 @@ class Index:
 
 @dataclass(slots=True)
 class _Earlier:
-    """Content of an earlier index."""
-
     stamps: dict[str, tuple[int, ...]]
     left_out: dict[str, str]
     tables: dict[str, Any]

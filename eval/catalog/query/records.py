@@ -227,7 +227,6 @@ def _failure(content: bytes) -> dict[str, str]:
 
 
 def _failed_row(found: FoundRun, name: str, content: bytes, tags: Mapping[str, str]) -> Row | None:
-    """Return the row of a failed run, of which only the reason is known."""
     fields = _failure(content)
     if not fields:
         return None

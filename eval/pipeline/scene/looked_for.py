@@ -119,7 +119,6 @@ def _without_cue(one: DetectorRow, vehicle: Vehicle) -> list[str]:
 
 
 def _without_threshold(one: DetectorRow, vehicle: Vehicle) -> list[str]:
-    """Return a notice about labels without a threshold, fitted or set in the vehicle file."""
     cues, cars = vehicle.cues, vehicle.cars
     by_score = [(cars.labels, cars.score)]
     if cues.kind != "tracks":
@@ -136,7 +135,6 @@ def _without_threshold(one: DetectorRow, vehicle: Vehicle) -> list[str]:
 
 
 def _without_masks(one: DetectorRow, vehicle: Vehicle) -> list[str]:
-    """Return a notice about rules that use boxes where the dissertation uses masks."""
     cues, labels = vehicle.cues, {*one.boxes_only}
     rules = []
     if labels & {*cues.stop_sign_labels, *cues.traffic_light_labels}:

@@ -134,8 +134,6 @@ class MotionRanges:
 
 @dataclass(slots=True)
 class _Chain:
-    """Choice of the objects of one kind that define ranges."""
-
     vehicle: Vehicle
     cue: str
     counts: Counter[str]
@@ -157,7 +155,6 @@ class _Chain:
         return self._posteriors({Reference.END: end, Reference.START: start}, tracks)
 
     def objects(self, tracks: Sequence[ObjectTrack]) -> list[RangedObject]:
-        """Return the objects observed in the newest frame, by number."""
         marks = {choice.chosen: reference for reference, choice in self.choices.items()}
         return [
             RangedObject(
@@ -279,7 +276,6 @@ class _Choice:
     _held: _Held | None = None
 
     def go_on(self, motion: CarStep) -> None:
-        """Predict the held range to the next frame."""
         if self._held is not None:
             self._held.range_m -= motion.way_m or 0.0
             self._held.var_m2 += motion.var_m2
@@ -287,7 +283,6 @@ class _Choice:
                 self._held = None
 
     def __call__(self, tracks: Sequence[ObjectTrack]) -> ObjectTrack | None:
-        """Choose among the tracks that may mark the reference."""
         best = self._best(tracks)
         if best is None:
             return None

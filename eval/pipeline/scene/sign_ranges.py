@@ -43,7 +43,6 @@ class SignRanges:
         return tuple(one for row in range(len(MEASURED)) for one in self._of_cue(found, row))
 
     def _of_cue(self, found: Sequence[Detections], row: int) -> list[SignRange]:
-        """Return the ranges of one row of ``MEASURED``."""
         cue, reference = MEASURED[row]
         labels = self.vehicle.labels_of(cue)
         curve: RangeCurve | None = getattr(self.vehicle.ranges, cue.name)

@@ -286,7 +286,6 @@ class Scene:
         return before is None or not is_repeated(before.boxes, frame.boxes)
 
     def _restart(self, t_ns: int) -> None:
-        """Know nothing of what was before ``t_ns``."""
         self._approaches.restart()
         self._ego.restart(t_ns)
         self._cues.restart()

@@ -215,7 +215,6 @@ class TableSink:
             raise cannot_write(self._path, error) from None
 
     def _give_up(self) -> None:
-        """Remove the incomplete file."""
         with suppress(OSError):
             self._file.close()
         self._partial.drop()

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 
 def _skipped_rows(ledger: Ledger) -> list[dict[str, Any]]:
-    """Return the single skips and drops of one log."""
     return [asdict(detail) | {"log": ledger.log} for detail in ledger.details]
 
 
