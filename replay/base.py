@@ -3,8 +3,6 @@
 ``Log`` is the interface of an open recording of any format (``opening.open_log`` opens one).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,7 +75,6 @@ class Readable(Protocol):
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """Read the rows, as ``Log.read`` does."""
-        ...
 
 
 class Log(Protocol):
@@ -86,12 +83,10 @@ class Log(Protocol):
     @property
     def path(self) -> Path:
         """Path of the file or folder."""
-        ...
 
     @property
     def format(self) -> str:
         """Short name of the format, a key of ``FORMATS``."""
-        ...
 
     @property
     def topics(self) -> tuple[Topic, ...]:
@@ -100,7 +95,6 @@ class Log(Protocol):
         Some topics are discovered only while reading (a truncated file without a summary). The
         reader then adds them to the ledger, and later calls return them too.
         """
-        ...
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """Yield the log's rows in stored order, one block at a time, and account for each row.
@@ -116,11 +110,9 @@ class Log(Protocol):
         rows, and the log is not complete. (A seal locates damage to the MiB, not to the row; see
         ``sealed_log``.)
         """
-        ...
 
     def close(self) -> None:
         """Close the files."""
-        ...
 
     def __enter__(self) -> Self: ...
 
@@ -139,7 +131,6 @@ class HasUrl(Protocol):
     @property
     def url(self) -> str:
         """The URL, without user, password and query; see ``remote.address``."""
-        ...
 
 
 def origin(log: Log) -> Path | str:
@@ -161,7 +152,6 @@ class KnowsItsEnd(Protocol):
 
         ``Log.read`` reports them too, with more detail. Callers use only one of the two.
         """
-        ...
 
 
 def report_missing(log: Log, ledger: Ledger) -> None:
@@ -176,7 +166,6 @@ class KnowsItsStart(Protocol):
 
     def start_ns(self) -> int | None:
         """Return the log time of the first stored row; None if it has to be read."""
-        ...
 
 
 def start_ns(log: Log) -> int | None:

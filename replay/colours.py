@@ -3,8 +3,6 @@
 They are legible on white, on black and on photographs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

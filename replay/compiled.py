@@ -5,8 +5,6 @@ numbers and arrays. A replay calls them uncompiled. The Monte Carlo studies call
 compiles ``f`` and every crosscue function that it calls. Numba is imported only then.
 """
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 from collections.abc import Callable

@@ -4,8 +4,6 @@ A new format takes one module and one line in ``FORMATS``. The module defines a 
 signature ``(path, limits) -> Log`` and is imported on demand.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass

@@ -12,8 +12,6 @@ The extent of some losses is unknown (a truncated file without statistics). Such
 with the count None. The log is then incomplete, and the summary reports "at least".
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -40,12 +38,10 @@ class RowsOfTopic(Protocol):
     @property
     def topic(self) -> str:
         """Topic name."""
-        ...
 
     @property
     def log_ns(self) -> NDArray[np.int64]:
         """Log times in stored order."""
-        ...
 
     def __len__(self) -> int: ...
 
@@ -164,12 +160,7 @@ class Ledger:
         self._refuse(topic, count)
 
     def drop(
-        self,
-        topic: str,
-        reason: str,
-        count: int | None,
-        detail: str = "",
-        t_ns: int | None = None,
+        self, topic: str, reason: str, count: int | None, detail: str = "", t_ns: int | None = None
     ) -> None:
         """Count rows of the file that could not be read; ``count`` is None where unknown."""
         if count == 0:

@@ -1,7 +1,5 @@
 """Limits on declared sizes, above which a reader refuses a log."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Annotated, Final, TypeAlias

@@ -4,8 +4,6 @@ As warnings, they reach the command without a ledger in every signature. The com
 and exits with status 3.
 """
 
-from __future__ import annotations
-
 import inspect
 import warnings
 from collections.abc import Callable, Iterable, Iterator

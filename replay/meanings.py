@@ -4,8 +4,6 @@ Reading the source of every class takes longer than replaying a short drive, so 
 documentation do.
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 from itertools import pairwise

@@ -4,8 +4,6 @@ Workers are connected by pipes only. The standard library's pool shares semaphor
 its queues: workers of a killed parent would wait forever, or fail while starting.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

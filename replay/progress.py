@@ -4,8 +4,6 @@ Work calls ``emit``; the command line draws a line or prints the part, and ``wat
 to a function. Without a watcher, nothing happens. No signature contains a callback for it.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

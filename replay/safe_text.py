@@ -1,7 +1,5 @@
 """Tables and lines for a terminal, safe against control characters in a log's names."""
 
-from __future__ import annotations
-
 import shutil
 import unicodedata
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Versions of installed packages, for manifests, model cards and ``crosscue --version``."""
 
-from __future__ import annotations
-
 import platform
 import re
 from functools import cache

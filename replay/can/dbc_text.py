@@ -7,8 +7,6 @@ an unused entry) it returns None. cantools then reads the file or reports what i
 Both readers produce the same messages.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple

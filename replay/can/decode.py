@@ -5,8 +5,6 @@ decoded together with all frames of that message in the block. A frame that cann
 counted by identifier and reason, in the ledger and in ``BusDecoder.counts``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Final, TypeAlias
@@ -38,14 +36,7 @@ TOO_SHORT: Final = "frame shorter than its message"
 TOO_LONG: Final = "frame longer than its message"
 WRONG_FORMAT: Final = "CAN FD frame of a classic message"
 NO_BRANCH: Final = "multiplexer value without a branch"
-RARE_REASONS: Final = (
-    ERROR_FRAME,
-    REMOTE_FRAME,
-    UNKNOWN_ID,
-    WRONG_FORMAT,
-    TOO_SHORT,
-    TOO_LONG,
-)
+RARE_REASONS: Final = (ERROR_FRAME, REMOTE_FRAME, UNKNOWN_ID, WRONG_FORMAT, TOO_SHORT, TOO_LONG)
 # Key for all further identifiers once ``COUNTS_KEPT`` are counted separately.
 OTHERS: Final = (-1, False)
 COUNTS_KEPT: Final = 20_000

@@ -4,8 +4,6 @@ A value that its bits cannot hold is refused, never clipped, because a simulated
 plausible where it is wrong.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Final, TypeAlias
 

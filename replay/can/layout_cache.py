@@ -10,8 +10,6 @@ missing, so the cache never fails.
 cache.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence

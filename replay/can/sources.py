@@ -1,7 +1,5 @@
 """The text of a CAN database file: its encoding, its lines, and signs of truncation."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

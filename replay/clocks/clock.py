@@ -1,7 +1,5 @@
 """The three times of a row, and the times of rows on one of these clocks."""
 
-from __future__ import annotations
-
 from enum import Enum
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Describe faults of a log's clocks in plain English."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Final

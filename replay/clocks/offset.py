@@ -12,8 +12,6 @@ rows on either side. A slow drift is therefore not a jump, and neither is a stal
 queue empties within two seconds. Offset and drift are those of the longest interval without a jump.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 

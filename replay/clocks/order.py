@@ -8,8 +8,6 @@ half as much, as it does after late rows. Two resets within ``LOOK_AHEAD`` rows 
 Periods are computed from the sorted stamps between resets, so that late rows cause no gaps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Periods of a stream in bounded memory: quantiles from a histogram, and the exact longest ones."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

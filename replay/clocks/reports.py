@@ -16,8 +16,6 @@ A publish time that always equals the log time carries no information and is ign
 All times are int64 nanoseconds; differences are computed before any conversion to float.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@
 ledger.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Final, Protocol, cast
@@ -27,7 +25,6 @@ class Decoder(Protocol):
 
         Messages that do not fit are skipped in ``ledger`` with reason, count and time.
         """
-        ...
 
 
 # Factories by message encoding, as ``module:function``. Each maps a topic to a decoder or None.

@@ -1,7 +1,5 @@
 """Determine the coding of a picture from its first bytes, or from its label if they are unclear."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from crosscue.replay.columns import ImageCoding

@@ -1,7 +1,5 @@
 """Table of Foxglove's message types, independent of their encoding."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum

@@ -5,8 +5,6 @@ and the progress of an action on ``ACTION/_action/feedback``, as
 ``package/action/NAME_FeedbackMessage``. Recorders seldom store complete definitions of these types.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 from crosscue.replay.columns import Topic

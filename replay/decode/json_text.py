@@ -3,8 +3,6 @@
 JSON with duplicate keys, or with NaN or Infinity (which JSON does not define), is refused.
 """
 
-from __future__ import annotations
-
 from base64 import b64decode
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

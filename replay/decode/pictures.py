@@ -1,7 +1,5 @@
 """Combine single pictures from protobuf or JSON messages into columns."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -44,11 +42,7 @@ class PictureRow:
 
 
 def images_of(
-    block: Block,
-    buffer: Bytes,
-    picture: PictureKind,
-    rows: list[PictureRow | str],
-    ledger: Ledger,
+    block: Block, buffer: Bytes, picture: PictureKind, rows: list[PictureRow | str], ledger: Ledger
 ) -> Block:
     """Return a block of the pictures among ``rows``, and refuse the other rows.
 

@@ -4,8 +4,6 @@ Pictures are large and are located as ranges of the log by parsing only the oute
 other messages are rare and are parsed one by one with the protobuf package.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Final

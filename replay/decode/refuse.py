@@ -1,7 +1,5 @@
 """Account for messages that yield no row: damaged ones are dropped, unsupported ones skipped."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from crosscue.replay.columns import Block

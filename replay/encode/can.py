@@ -4,8 +4,6 @@
 topic ``<topic>/fd`` with the type ``crosscue_msgs/msg/CanFdFrame``.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Final

@@ -1,7 +1,5 @@
 """Copy many ranges of bytes between buffers, complete columns of messages at a time."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -3,8 +3,6 @@
 The text specifies the encoding of messages, without constants and comments.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Encode pictures as ROS 2 messages: compressed and raw pictures, and packets of video streams."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Output of encoders: CDR messages of one topic with the definition of their type."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Final, Protocol
@@ -52,7 +50,6 @@ class Encoder(Protocol):
 
     def __call__(self, block: Block, ledger: Ledger, /) -> list[Outgoing]:
         """Encode a block; other rows are skipped in ``ledger`` with reason and time."""
-        ...
 
 
 @cache

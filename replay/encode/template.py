@@ -4,8 +4,6 @@ Strings and sequence lengths are equal in all rows, so that every value has a fi
 template is written once and repeated, and the columns are then written into it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final

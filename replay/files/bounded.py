@@ -1,7 +1,5 @@
 """Read complete files up to a max size, because a device or a pipe may be endless."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import IO, Final

@@ -4,8 +4,6 @@
 is verified. The result is the same without it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib import import_module
 from typing import Final, cast

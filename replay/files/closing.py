@@ -1,7 +1,5 @@
 """Base class of what is open, and closed at the end of a ``with`` block."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from types import TracebackType
 from typing import Self

@@ -3,8 +3,6 @@
 A megabyte of PNG can decode to gigabytes, so the size is checked before decoding.
 """
 
-from __future__ import annotations
-
 import struct
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Identity of a log independent of its path; ``identity`` computes it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final

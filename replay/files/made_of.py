@@ -4,8 +4,6 @@ Code that continues or replaces a result compares these first, because other inp
 would mix two results or destroy one.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

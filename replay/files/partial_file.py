@@ -6,8 +6,6 @@ releases when the process exits for any reason. The next writer in that folder r
 that are not locked. A process number would not suffice, because the system reuses it.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """Find the time file of a folder of pictures or of a video."""
 
-from __future__ import annotations
-
 from pathlib import Path, PurePosixPath
 from typing import Final
 

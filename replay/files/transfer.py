@@ -4,8 +4,6 @@ An interrupted transfer continues where it stopped. The incomplete file is store
 in the same folder.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable
@@ -35,17 +33,14 @@ class KnownFile(Protocol):
     @property
     def name(self) -> str:
         """Name of the file."""
-        ...
 
     @property
     def size_bytes(self) -> int:
         """Size of the file."""
-        ...
 
     @property
     def sha256(self) -> str:
         """SHA-256 in hexadecimal."""
-        ...
 
 
 def is_there(file: KnownFile, place: Path) -> bool:

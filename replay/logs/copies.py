@@ -1,7 +1,5 @@
 """Rows that are stored twice: the stamp and the content of the row before."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Selection of a part of open logs: topics, and a time range in seconds after the first row."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Sequence

@@ -178,9 +178,7 @@ def quick_summary(log: Log) -> LogSummary:
 
 
 def summarise_log(
-    log: Log,
-    selection: Selection = EVERYTHING,
-    watch: Callable[[Block], None] = lambda block: None,
+    log: Log, selection: Selection = EVERYTHING, watch: Callable[[Block], None] = lambda block: None
 ) -> LogSummary:
     """Read a log, or a part of it, once and in bounded memory, and summarise it.
 
@@ -313,10 +311,7 @@ def _summary(
 
 
 def _topic_summary(
-    topic: Topic,
-    account: TopicAccount,
-    report: ClockReport | None,
-    can_ids: Mapping[str, _CanIds],
+    topic: Topic, account: TopicAccount, report: ClockReport | None, can_ids: Mapping[str, _CanIds]
 ) -> TopicSummary:
     role = role_of(topic)
     seen = can_ids.get(topic.name, _CanIds())

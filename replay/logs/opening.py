@@ -1,7 +1,5 @@
 """Open any log by its suffix, its folder's contents, or its URL."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module

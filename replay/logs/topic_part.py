@@ -1,7 +1,5 @@
 """Flat columns of the decoded rows of one topic, for tables, plots and notebooks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 A payload of up to 8 bytes is one 64-bit word, whose bit 0 is the lowest bit of byte 0.
 """
 
-from __future__ import annotations
-
 from typing import TypeAlias
 
 import numpy as np

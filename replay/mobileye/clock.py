@@ -15,8 +15,6 @@ The offset follows the fastest frames: downwards as fast as the order of images 
 by at most the drift of a crystal.
 """
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@ Both frames have x ahead and y to the left (ISO 8855, REP-103). A lane is the cu
 y(x) = c0 + c1 x + c2 x**2 + c3 x**3 from the reference point to the end of the view range.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import cos, sin
 from typing import Final, TypeAlias

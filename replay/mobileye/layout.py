@@ -1,7 +1,5 @@
 """Table of the messages and signals of a Mobileye 560 on CAN, stored in ``layout.toml``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -235,11 +233,7 @@ def _message(entry: dict[str, Any], earlier: Mapping[str, Message]) -> Message:
     variants = {int(k): str(v) for k, v in entry.pop("variants", {}).items()}
     lengths = tuple(entry.pop("lengths"))
     return Message(
-        ids=tuple(ids),
-        lengths=lengths,
-        fields=fields,
-        variants=MappingProxyType(variants),
-        **entry,
+        ids=tuple(ids), lengths=lengths, fields=fields, variants=MappingProxyType(variants), **entry
     )
 
 

@@ -1,7 +1,5 @@
 """Extract samples of a Mobileye's lanes and obstacles for estimators, from CAN or ROS."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 

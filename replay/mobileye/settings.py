@@ -1,7 +1,5 @@
 """Settings of the decoder of a Mobileye."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias
 

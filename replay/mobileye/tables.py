@@ -7,8 +7,6 @@ is the variant of a row, as an index in ``layout.VARIANTS``; -1 if it is unknown
 ``crosscue.replay.mobileye.layout.describe`` describes the other columns.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final, cast
 

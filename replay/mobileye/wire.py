@@ -5,8 +5,6 @@ Columns here are in SI units and left-positive, but relative to the device's ref
 int8 column. A flag is bool, or int8 if it may be missing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from math import pi
 from typing import Final

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from crosscue.replay.ledger import Ledger
 
 # Maximum number of buses of a log; more names are a sign of damage.
 BUSES_MAX: Final = 256
+TOO_MANY_BUSES: Final = "more buses than a log can have"
 
 # Number of payload bytes by DLC code (ISO 11898-1).
 FD_LENGTHS: Final = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64], np.int64)
@@ -42,6 +43,21 @@ def bus_number(spelled: str, names: dict[str, int]) -> int:
     if name not in names and len(names) >= BUSES_MAX:
         return -1
     return names.setdefault(name, len(names))
+
+
+def named_buses(rows: FrameRows, names: dict[str, int]) -> FrameRows:
+    """Replace channel numbers by indices in ``names``; rows of too many buses are left out."""
+    if not len(rows):
+        return rows
+    if rows.bus.min() >= 0 and rows.bus.max() < BUSES_MAX:
+        seen, codes = np.flatnonzero(np.bincount(rows.bus)), rows.bus
+        numbers = np.zeros(BUSES_MAX, np.int64)
+        numbers[seen] = [bus_number(str(channel), names) for channel in seen.tolist()]
+    else:
+        seen, codes = np.unique(rows.bus, return_inverse=True)
+        numbers = np.array([bus_number(str(channel), names) for channel in seen.tolist()])
+    named = replace(rows, bus=numbers.take(codes))
+    return named.take(named.bus >= 0) if bool((numbers < 0).any()) else named
 
 
 def bus_topic(name: str, declared: int | None = None) -> Topic:
@@ -78,19 +94,13 @@ class FrameRows:
 
 
 _NONE: Final = np.zeros(0, np.int64)
-_NO_FLAGS: Final = np.zeros(0, np.bool_)
-_NO_BYTES: Final = np.zeros(0, np.uint8)
+_NO_FLAGS, _NO_BYTES = np.zeros(0, np.bool_), np.zeros((0, 8), np.uint8)
 NO_ROWS: Final = FrameRows(
     _NONE,
     _NONE,
     _NONE,
     CanFrames(
-        np.zeros(0, np.uint32),
-        _NO_FLAGS,
-        _NO_BYTES,
-        _NO_BYTES,
-        np.zeros((0, 8), np.uint8),
-        _NO_FLAGS,
+        _NONE.astype(np.uint32), _NO_FLAGS, _NO_BYTES[:, 0], _NO_BYTES[:, 0], _NO_BYTES, _NO_FLAGS
     ),
 )
 
@@ -102,21 +112,17 @@ def merge_rows(all_rows: Sequence[FrameRows]) -> FrameRows:
         return some[0]
     parts = [rows.frames for rows in some]
     width = max(one.data.shape[1] for one in parts)
-    is_tx = [one.is_tx for one in parts if one.is_tx is not None]
-    frames = CanFrames(
-        np.concatenate([one.arbitration_id for one in parts]),
-        np.concatenate([one.is_extended for one in parts]),
-        np.concatenate([one.kind for one in parts]),
-        np.concatenate([one.length for one in parts]),
-        np.concatenate([widened(one.data, width) for one in parts]),
-        np.concatenate([one.is_fd for one in parts]),
-        np.concatenate(is_tx) if len(is_tx) == len(parts) else None,
-    )
+    parts = [replace(one, data=widened(one.data, width)) for one in parts]
+    joined: dict[str, NDArray[Any]] = {}
+    for name in (column.name for column in fields(CanFrames)):
+        columns = [getattr(one, name) for one in parts]
+        if all(column is not None for column in columns):
+            joined[name] = np.concatenate(columns)
     rows = FrameRows(
         np.concatenate([rows.place for rows in some]),
         np.concatenate([rows.bus for rows in some]),
         np.concatenate([rows.log_ns for rows in some]),
-        frames,
+        CanFrames(**joined),
     )
     return rows.take(np.argsort(rows.place, kind="stable"))
 
@@ -155,7 +161,7 @@ def _next_by_time(stream: Iterator[FrameRows], before: FrameRows | None = None) 
                 place = np.maximum.accumulate(place)
             if before is not None and place[0] < before.place[-1]:
                 place = np.maximum(place, before.place[-1])
-            return FrameRows(place, rows.bus, rows.log_ns, rows.frames)
+            return replace(rows, place=place)
     return None
 
 
@@ -189,12 +195,4 @@ def narrowed(frames: CanFrames) -> CanFrames:
     """Reduce the payload to eight columns if no frame is CAN FD."""
     if frames.data.shape[1] == 8 or bool(frames.is_fd.any()):
         return frames
-    return CanFrames(
-        frames.arbitration_id,
-        frames.is_extended,
-        frames.kind,
-        frames.length,
-        np.ascontiguousarray(frames.data[:, :8]),
-        frames.is_fd,
-        frames.is_tx,
-    )
+    return replace(frames, data=np.ascontiguousarray(frames.data[:, :8]))

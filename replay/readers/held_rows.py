@@ -1,7 +1,5 @@
 """Drives of data sets: cameras, and numeric streams that are kept in memory."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -78,15 +76,12 @@ class Numbers(Protocol):
     @property
     def topics(self) -> tuple[Topic, ...]:
         """Topics of the streams."""
-        ...
 
     def read(self, ledger: Ledger, selection: Selection) -> Iterator[Block]:
         """Yield the selected rows and account for them."""
-        ...
 
     def report_missing(self, ledger: Ledger) -> None:
         """Report missing rows; see ``KnowsItsEnd``."""
-        ...
 
 
 class CameraDrive(Closing):

@@ -1,7 +1,5 @@
 """Division of messages of several topics in one buffer into blocks of one topic."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Base reader of text files with one row of numbers per line; a format adds the line parser."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice

@@ -19,8 +19,6 @@ If the times were not recorded, a single line ``rate_hz: 15`` specifies the fram
 Times are computed with integers and fractions, never with floats.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

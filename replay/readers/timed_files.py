@@ -10,8 +10,6 @@ Files and times are paired by the first of these rules that applies:
 Whenever the counts differ, a notice is added.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ Protocols and credentials are those of fsspec. An object's suffix is that of its
 unknown one is refused before anything is fetched.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import os

@@ -8,8 +8,6 @@ is retried a few times, but one that the store does not answer in time is not. A
 an object whose size or version has changed, is an error.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 import time

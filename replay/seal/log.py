@@ -6,8 +6,6 @@ the log is incomplete. Withholding the rows would turn one wrong byte into the l
 correct rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, Protocol, runtime_checkable
@@ -31,7 +29,6 @@ class Touching(Protocol):
     @property
     def touched(self) -> Touched:
         """Record of the blocks that were read."""
-        ...
 
 
 def with_seal(path: Path, opened: Callable[[], Log], *, is_part: bool = False) -> Log:

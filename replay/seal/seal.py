@@ -8,8 +8,6 @@ The seal of a folder covers all of its files, except hidden files and seals. The
 covers the files that its reader opens next to it: SQLite's journals, or a video's time file.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping

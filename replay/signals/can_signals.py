@@ -1,7 +1,5 @@
 """Read a vehicle's signals from the frames of one bus, as named in the vehicle file."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Collection, Iterator
 from functools import lru_cache

@@ -43,11 +43,9 @@ class MobileyeReader(Protocol):
 
     def __call__(self, block: Block, /) -> Iterator[Samples]:
         """Yield the samples of a block."""
-        ...
 
     def flush(self) -> Iterator[Samples]:
         """Yield the samples held back as incomplete; to be called once, at the log's end."""
-        ...
 
 
 def _no_pictures(block: Block) -> None:

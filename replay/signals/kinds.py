@@ -80,16 +80,7 @@ class SignalPlan:
 
 # Columns of obstacles. A row with only ``burst`` starts the burst of an image, even without
 # obstacles.
-OBSTACLE_COLUMNS: Final = (
-    "burst",
-    "x_m",
-    "y_m",
-    "vx_mps",
-    "type",
-    "status",
-    "valid",
-    "age_frames",
-)
+OBSTACLE_COLUMNS: Final = ("burst", "x_m", "y_m", "vx_mps", "type", "status", "valid", "age_frames")
 # Columns of lanes; ``c0_m`` and ``x_end_m`` are NaN on a side without a marking.
 LANE_COLUMNS: Final = (
     "side",

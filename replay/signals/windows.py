@@ -5,8 +5,6 @@ has passed its end, or the source's log is ahead of it by the horizon. Later row
 reported.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
@@ -39,15 +37,12 @@ class Extracting(Protocol):
     @property
     def ledger(self) -> Ledger:
         """Ledger that records skipped rows."""
-        ...
 
     def __call__(self, block: Block) -> Iterator[Samples]:
         """Yield the samples of one block."""
-        ...
 
     def finish(self) -> Iterator[tuple[str, Samples]]:
         """Yield the samples held back until the log's end, with their topics."""
-        ...
 
 
 @dataclass(slots=True)

@@ -1,7 +1,5 @@
 """Log times as dates."""
 
-from __future__ import annotations
-
 from typing import Final
 
 _YEAR_2000_NS: Final = 946_684_800_000_000_000

@@ -4,8 +4,6 @@ The scan reads the topics that will be used and decodes only the wheel speeds. I
 grow with the log: it keeps set-backs, strays, and gaps in the wheel speeds.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -10,8 +10,6 @@ stamps are unchanged, and the time between them is a gap.
 ``TimedLog`` yields a log's blocks in drive time, so that later stages never see a set-back.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -12,8 +12,6 @@ Smaller backward steps are disorder. The first rows after a set-back are decisiv
 within the last ``ROWS_TO_BELIEVE`` rows of a log is treated as late rows.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Camera section of the vehicle file: mounting, and intrinsics for one image size."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Final
 

@@ -1,7 +1,5 @@
 """The type of a row in the table of cues, for built-in cues and plug-ins."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -4,8 +4,6 @@ Detectors, belief, truth, scores, reports and recordings iterate over ``CUES``. 
 row in this table and a function for its ``rule``. The simulator also has a function for each cue.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

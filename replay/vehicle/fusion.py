@@ -9,8 +9,6 @@ figure differently, or who add a cue or a feature, change a line of the file:
     lanes_past = { use = false }                              # a disabled cue
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Final, Literal, Self

@@ -1,7 +1,5 @@
 """The vehicle file's section on Mobileye cues past the intersection."""
 
-from __future__ import annotations
-
 from .section import NotNegative, Positive, Section
 
 

@@ -1,7 +1,5 @@
 """The vehicle file's sections for the pose: odometry, GNSS and the start of a drive."""
 
-from __future__ import annotations
-
 import math
 from itertools import product
 from typing import Final, Literal, Self, TypeAlias

@@ -1,7 +1,5 @@
 """Roles of topics by their message types."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from enum import Enum
 from typing import Final

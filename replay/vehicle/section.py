@@ -1,7 +1,5 @@
 """Base class of the sections of a vehicle file."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field

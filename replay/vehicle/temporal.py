@@ -1,7 +1,5 @@
 """The vehicle file's section on the belief over time, for ``crosscue.fusion.temporal``."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Annotated, Self
 

@@ -1,7 +1,5 @@
 """The vehicle file's ``[time]``: splitting of drives, and limits on motion across a gap."""
 
-from __future__ import annotations
-
 from crosscue.replay.time.segments import SplitLimits
 
 from .section import NotNegative, Positive, Section

@@ -8,8 +8,6 @@ default is written to the manifest.
 This module also exports the table of cues that the file is checked against.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self

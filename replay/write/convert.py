@@ -1,7 +1,5 @@
 """Write the blocks of any log as one MCAP file with ROS 2 types, and account for every row."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -177,7 +175,6 @@ class Walking(Protocol):
         self, block: Block, messages: Messages, ledger: Ledger
     ) -> tuple[object, NDArray[np.intp]]:
         """Return the fields of the messages that fit, and their row numbers in the block."""
-        ...
 
 
 @dataclass(slots=True)

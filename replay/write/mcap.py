@@ -5,8 +5,6 @@ yield the same bytes with the same version of mcap. During writing the file has 
 the same folder, and it is renamed once everything is on the disk.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

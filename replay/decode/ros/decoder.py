@@ -1,7 +1,5 @@
 """Decode ROS 2 CDR and ROS 1 messages, a block at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -49,12 +47,7 @@ class RosDecoder:
         rows = self.kind.build(fields)
         picked = block if len(kept) == len(block) else block.take(kept)
         return Block(
-            picked.topic,
-            picked.log_ns,
-            rows,
-            picked.publish_ns,
-            header_ns(fields),
-            picked.sequence,
+            picked.topic, picked.log_ns, rows, picked.publish_ns, header_ns(fields), picked.sequence
         )
 
     def walked(self, block: Block, messages: Messages, ledger: Ledger) -> tuple[FieldColumns, Rows]:

@@ -4,8 +4,6 @@ A definition comes from the log and is not trusted. Its size is checked first, a
 generated from it.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Paths of the components of a vector or a quaternion in a ROS message."""
 
-from __future__ import annotations
-
 
 def xyz(columns: str, path: str) -> dict[str, str]:
     """Map columns to the fields of a vector's components; ``columns`` has {} for the axis."""

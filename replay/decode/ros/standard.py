@@ -4,8 +4,6 @@ All other types become tables of all their numbers with dotted names (``pose.pos
 ``<name>.length`` for every sequence.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias

@@ -1,7 +1,5 @@
 """Spelling of message types."""
 
-from __future__ import annotations
-
 
 def ros2_spelling(type_name: str) -> str:
     """Convert ``sensor_msgs/Imu`` to ``sensor_msgs/msg/Imu``; leave other names unchanged."""

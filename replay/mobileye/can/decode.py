@@ -4,8 +4,6 @@ Obstacles are joined by burst and slot, lanes from their two halves; see ``burst
 cannot be joined or decoded are reported in the ledger under the bus's name, with their log time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 
@@ -51,10 +49,7 @@ CUT_AT_END: Final = "incomplete obstacle at the end of the log"
 NOT_COME: Final = "obstacle frames announced by a status frame but missing"
 _EVENTS_TOLD: Final = 50
 _OBSTACLE_PARTS: Final = ("obstacle_a", "obstacle_b", "obstacle_c")
-_LANE_PARTS: Final = {
-    "lanes": ("lane_a", "lane_b"),
-    "next_lanes": ("next_lane_a", "next_lane_b"),
-}
+_LANE_PARTS: Final = {"lanes": ("lane_a", "lane_b"), "next_lanes": ("next_lane_a", "next_lane_b")}
 REPEATED_STATUS: Final = "repeated status frame"
 # Known protocol versions with status frames of 6 bytes.
 KNOWN_PROTOCOLS: Final = (1, 3)

@@ -4,8 +4,6 @@ Values are rounded to the wire's steps. The layout table specifies the treatment
 field's range: most fields refuse them, some clip them, and an obstacle too far away is not sent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Final, NamedTuple
 
@@ -36,10 +34,7 @@ FRAME_NS: Final = 250_000
 LATENCY_NS: Final = 80 * MS
 
 _OBSTACLE_PARTS: Final = ("obstacle_a", "obstacle_b", "obstacle_c")
-_LANE_PARTS: Final = {
-    "lanes": ("lane_a", "lane_b"),
-    "next_lanes": ("next_lane_a", "next_lane_b"),
-}
+_LANE_PARTS: Final = {"lanes": ("lane_a", "lane_b"), "next_lanes": ("next_lane_a", "next_lane_b")}
 
 
 class _Sent(NamedTuple):

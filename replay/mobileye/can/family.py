@@ -4,8 +4,6 @@ The family is decided by a set bit that only one family defines. If bits of both
 one log, it is undecided.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -20,8 +20,6 @@ Each obstacle message is complete, so a missing status message does not drop it:
 time and burst -1. Tables other than status and obstacles always have burst -1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Determine the sign of lanes in ROS messages from the sides of the left and the right lane."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -7,8 +7,6 @@ occurrences of ``LOBJ`` are found at once. Objects are examined one by one only 
 occurrences do not form a chain (a payload that contains ``LOBJ``, or damage).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -347,10 +345,7 @@ def _fd64(record: NDArray[np.void], of: _Objects) -> _Parsed:
 
 
 def _fits_code(
-    code: NDArray[np.uint8],
-    length: Int64s,
-    is_fd: NDArray[np.bool_],
-    kind: NDArray[np.int64],
+    code: NDArray[np.uint8], length: Int64s, is_fd: NDArray[np.bool_], kind: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
     """Return whether each payload length is consistent with its length code."""
     promised = FD_LENGTHS[code & 15]

@@ -5,8 +5,6 @@ verified before its contents are used. The header's object count is compared wit
 objects found. The start time is local time without a time zone; it is read as UTC, with a notice.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
@@ -25,11 +23,12 @@ from crosscue.replay.files.closing import Closing
 from crosscue.replay.ledger import NOT_ASKED_TIME, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import (
+    TOO_MANY_BUSES,
     FrameRows,
     blocks_by_bus,
-    bus_number,
     bus_topic,
     keep_memory,
+    named_buses,
 )
 from crosscue.replay.readers.can_text.digits import NANOS, within_range
 from crosscue.replay.seal.touched import Touched, open_noted
@@ -253,19 +252,10 @@ class _Pass:
         if is_end and len(stream) - chain.rest >= len(MAGIC):
             self.tally.damage("last object is cut", place)
         start_ns = self._header.start_ns or 0
-        return self._named(parse_frames(stream, chain.start, start_ns, self.tally, place))
-
-    def _named(self, rows: FrameRows) -> FrameRows:
-        if not len(rows):
-            return rows
-        channels, codes = np.unique(rows.bus, return_inverse=True)
-        bus = np.array(
-            [bus_number(str(channel), self._names) for channel in channels.tolist()], np.int64
-        )
-        named = FrameRows(rows.place, bus[codes], rows.log_ns, rows.frames)
-        if bool((bus < 0).any()):
-            self.tally.damage("more buses than a log can have", "")
-            return named.take(named.bus >= 0)
+        rows = parse_frames(stream, chain.start, start_ns, self.tally, place)
+        named = named_buses(rows, self._names)
+        if len(named) < len(rows):
+            self.tally.damage(TOO_MANY_BUSES, "")
         return named
 
     def _contents(self, file: BufferedReader) -> Iterator[tuple[bytes | None, str]]:

@@ -5,8 +5,6 @@ object with a time. Examining a container therefore takes one small read instead
 decompression.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Mapping

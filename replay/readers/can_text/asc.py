@@ -14,10 +14,7 @@ The format has no checksum. Each line contains its length, so a truncated line i
 ``End TriggerBlock`` shows that the writer finished the file.
 """
 
-from __future__ import annotations
-
 import re
-from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -31,6 +28,9 @@ from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import FD_LENGTHS
 
 from .dialect import (
+    BAD_IDENTIFIER,
+    BAD_LENGTH,
+    NOT_UNDERSTOOD,
     DamagedLine,
     Dialect,
     Fast,
@@ -97,7 +97,6 @@ _SECOND: Final = re.compile(r"\d[.,]\d{1,9}\s+(?:CANFD\s+)?\S+\s(?:.*\s)?[RT]x\s
 _STEP_MAX_NS: Final = 86_400 * NANOS
 _IDENTIFIER: Final = re.compile(r"([0-9A-Fa-f]{1,10})([xX]?)")
 _TWO_HEX: Final = re.compile(r"[0-9A-Fa-f]{2}")
-NOT_UNDERSTOOD: Final = "line not understood"
 NOT_ENDED: Final = "no 'End TriggerBlock': the log may be cut"
 _BEGIN_WORDS, _END_WORDS = b"begin triggerblock", b"end triggerblock"
 _CANFD: Final = np.uint64(int.from_bytes(b"CANFD", "little"))
@@ -171,27 +170,11 @@ class Asc(Dialect):
             return comment(text)
         return self._header(text)
 
-    def last(self, line: bytes) -> Outcome:
-        """Accept the line if it has as many bytes as its length states."""
-        outcome = self.slow(line)
-        may_be_cut = isinstance(outcome, ParsedFrame) and (
-            self._base == 10 or outcome.kind == REMOTE
-        )
-        if outcome is None or may_be_cut or isinstance(outcome, Other):
-            return DamagedLine("last line has no line end, may be cut") if line.strip() else None
-        return outcome
-
-    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, HeaderLine]]) -> Int64s:
-        """Add the date, and sum up times that are relative to the previous line."""
-        out = np.empty_like(t_ns)
-        begin = 0
-        for i, mark in marks:
-            end = int(place.searchsorted(i))
-            out[begin:end] = self._stretch(t_ns[begin:end])
-            begin = end
-            self._note(mark)
-        out[begin:] = self._stretch(t_ns[begin:])
-        return out
+    def is_complete(self, outcome: Outcome) -> bool:
+        """Return whether the line has as many bytes as its length states, or is a mark."""
+        if isinstance(outcome, ParsedFrame):
+            return self._base == 16 and outcome.kind != REMOTE
+        return outcome is not None and not isinstance(outcome, Other)
 
     def unended(self, head: bytes, tail: bytes) -> str:
         """Check for an ``End TriggerBlock`` after the last start of a block."""
@@ -218,14 +201,16 @@ class Asc(Dialect):
         elif not self._block and not self._has_events:
             ledger.drop("", "a header without any frame: the log may be cut", None)
 
-    def _stretch(self, t_ns: Int64s) -> Int64s:
+    def log_times(self, t_ns: Int64s) -> Int64s:
+        """Add the date, and sum up times that are relative to the previous line."""
         self._has_events |= len(t_ns) > 0
         if self._is_relative and len(t_ns):
             t_ns = np.minimum(np.cumsum(t_ns) + self._last_ns, TIME_MAX_NS)
             self._last_ns = int(t_ns[-1])
         return t_ns + self._start_ns
 
-    def _note(self, mark: HeaderLine) -> None:
+    def note(self, mark: HeaderLine) -> None:
+        """Set the start of the times after a date, and whether a block is open."""
         if mark.tag:
             self._block = mark.tag
         if mark.origin_ns is None:
@@ -275,7 +260,7 @@ class Asc(Dialect):
         rest = words[4:]
         found = self._identifier(words[1])
         if found is None:
-            return DamagedLine("identifier out of range")
+            return DamagedLine(BAD_IDENTIFIER)
         if letter.lower() == "r":
             return _checked(ParsedFrame(bus, t_ns, *found, REMOTE, 0))
         if letter.lower() != "d" or not rest or not _is_code(rest[0], self._base):
@@ -283,7 +268,7 @@ class Asc(Dialect):
         length = min(int(rest[0], self._base), 8)
         payload = self._payload(rest[1:], length)
         if payload is None:
-            return DamagedLine("length differs from the number of bytes")
+            return DamagedLine(BAD_LENGTH)
         return _checked(ParsedFrame(bus, t_ns, *found, DATA, length, payload))
 
     def _fd_frame(self, t_ns: int, words: list[str]) -> Outcome:
@@ -292,7 +277,7 @@ class Asc(Dialect):
         found = self._identifier(words[2])
         rest = words[3:] if words[3] in ("0", "1") else words[4:]
         if found is None:
-            return DamagedLine("identifier out of range")
+            return DamagedLine(BAD_IDENTIFIER)
         if len(rest) < 4 or {rest[0], rest[1]} - {"0", "1"} or not _is_code(rest[2], self._base):
             return DamagedLine(NOT_UNDERSTOOD)
         code = int(rest[2], self._base)
@@ -301,7 +286,7 @@ class Asc(Dialect):
         length = int(FD_LENGTHS[code])
         payload = self._payload(rest[4:], length, is_last=False)
         if rest[3] != str(length) or payload is None:
-            return DamagedLine("length differs from the number of bytes")
+            return DamagedLine(BAD_LENGTH)
         return _checked(ParsedFrame(words[0], t_ns, *found, DATA, length, payload, True))
 
     def _identifier(self, word: str) -> tuple[int, bool] | None:

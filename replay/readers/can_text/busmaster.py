@@ -4,10 +4,7 @@ Times are times of day, which restart at midnight. The date and the time mode ar
 file states no time zone, so its clock is read as UTC, with a notice.
 """
 
-from __future__ import annotations
-
 import re
-from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Final
 
@@ -16,7 +13,17 @@ import numpy as np
 from crosscue.replay.columns import DATA, REMOTE, Int64s
 from crosscue.replay.ledger import Ledger
 
-from .dialect import DamagedLine, Dialect, Fast, HeaderLine, Other, Outcome, ParsedFrame
+from .dialect import (
+    BAD_IDENTIFIER,
+    BAD_LENGTH,
+    DamagedLine,
+    Dialect,
+    Fast,
+    HeaderLine,
+    Other,
+    Outcome,
+    ParsedFrame,
+)
 from .digits import NANOS, TIME_MAX_NS, Bools, decimal, within_range
 from .lines import Lines, clean_lines, next_fields, skip_gap
 from .spaced import NOTHING_FAST, Spaced, is_direction, payload_stop, spaced_frames
@@ -53,8 +60,8 @@ class Busmaster(Dialect):
         self._last_ns: int | None = None
         self._is_dated = False
         found = _START.search(head)
-        if found and (start_ns := _start_of(found)) is not None:
-            self._begin(start_ns)
+        if found:
+            self.note(HeaderLine(_start_of(found)))
 
     def fast(self, lines: Lines) -> Fast:
         """Parse data frames in hexadecimal."""
@@ -89,25 +96,9 @@ class Busmaster(Dialect):
             return Other("error or warning, no frame")
         return DamagedLine("line is not a BUSMASTER frame") if line else None
 
-    def last(self, line: bytes) -> Outcome:
-        """Accept the line if it has as many bytes as its length states, in hexadecimal."""
-        outcome = self.slow(line)
-        if isinstance(outcome, ParsedFrame) and outcome.kind == DATA and self._base == 16:
-            return outcome
-        return DamagedLine("last line has no line end, may be cut") if line.strip() else None
-
-    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, HeaderLine]]) -> Int64s:
-        """Add the date and a day at every midnight, or sum up relative times."""
-        out = t_ns.copy()
-        begin = 0
-        for i, mark in marks:
-            if mark.origin_ns is not None:
-                end = int(place.searchsorted(i))
-                out[begin:end] = self._session(t_ns[begin:end])
-                self._begin(mark.origin_ns)
-                begin = end
-        out[begin:] = self._session(t_ns[begin:])
-        return out
+    def is_complete(self, outcome: Outcome) -> bool:
+        """Return whether the line has as many bytes as its length states, in hexadecimal."""
+        return isinstance(outcome, ParsedFrame) and outcome.kind == DATA and self._base == 16
 
     def finish(self, ledger: Ledger) -> None:
         """Report the basis of the clock."""
@@ -116,7 +107,8 @@ class Busmaster(Dialect):
         else:
             ledger.notice("the log states no start date before 2116; times count from 1970-01-01")
 
-    def _session(self, t_ns: Int64s) -> Int64s:
+    def log_times(self, t_ns: Int64s) -> Int64s:
+        """Add the date and a day at every midnight, or sum up relative times."""
         if not len(t_ns):
             return t_ns
         if self._is_relative:
@@ -135,9 +127,12 @@ class Busmaster(Dialect):
         self._day_ns += int(days[-1]) * DAY_NS
         return out
 
-    def _begin(self, start_ns: int) -> None:
+    def note(self, mark: HeaderLine) -> None:
+        """Start again at the date of a new session."""
+        if mark.origin_ns is None:
+            return
+        start_ns = self._start_ns = mark.origin_ns
         self._is_dated = True
-        self._start_ns = start_ns
         self._day_ns = start_ns - start_ns % DAY_NS
         self._last_ns = None
 
@@ -158,9 +153,9 @@ class Busmaster(Dialect):
             return DamagedLine("number out of range")
         is_extended, is_remote = found[8] == b"x", bool(found[9])
         if identifier > (0x1FFFFFFF if is_extended else 0x7FF):
-            return DamagedLine("identifier out of range")
+            return DamagedLine(BAD_IDENTIFIER)
         if len(payload) != (0 if is_remote else int(found[10])) or len(payload) > 8:
-            return DamagedLine("length differs from the number of bytes")
+            return DamagedLine(BAD_LENGTH)
         kind = REMOTE if is_remote else DATA
         bus = found[6].decode("ascii")
         return ParsedFrame(bus, t_ns, identifier, is_extended, kind, len(payload), payload)

@@ -9,8 +9,6 @@ The format has no checksum, no count and no length in its lines. A last line wit
 therefore dropped, and so is a line followed by one with an invalid start: both may be truncated.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +24,8 @@ from crosscue.replay.readers.can_rows import IS_FD_LENGTH
 
 from .busmaster import BUSMASTER_HEAD, Busmaster
 from .dialect import (
+    BAD_IDENTIFIER,
+    BAD_LENGTH,
     DamagedLine,
     Dialect,
     Fast,
@@ -162,10 +162,6 @@ class Candump(Dialect):
             return None
         return DamagedLine(NOT_A_FRAME, taints=not line.startswith(b"("))
 
-    def last(self, line: bytes) -> Outcome:
-        """Reject the line, because a truncated payload cannot be detected."""
-        return DamagedLine("last line has no line end, may be cut") if line.strip() else None
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Shaped:
@@ -278,7 +274,7 @@ def _frame_of_screen_line(found: re.Match[bytes]) -> Outcome:
     if t_ns is None or not IS_INTERFACE.fullmatch(bus):
         return DamagedLine(OUT_OF_RANGE if t_ns is None else NOT_A_FRAME)
     if kind == DATA and int(length) != len(payload):
-        return DamagedLine("length differs from the number of bytes")
+        return DamagedLine(BAD_LENGTH)
     return _frame(bus, t_ns, found[4], kind, payload, is_fd=len(length) == 2)
 
 
@@ -288,7 +284,7 @@ def _frame(
     identifier = int(id_text, 16)
     is_long = len(id_text) == 8
     if identifier > (0x3FFFFFFF if is_long else 0x7FF):
-        return DamagedLine("identifier out of range")
+        return DamagedLine(BAD_IDENTIFIER)
     if len(payload) > 64 or not (IS_FD_LENGTH[len(payload)] if is_fd else len(payload) <= 8):
         return DamagedLine("invalid number of payload bytes")
     is_error = bool(identifier & ERROR_FLAG)

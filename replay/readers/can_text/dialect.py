@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Final, NamedTuple, TypeAlias
 
@@ -25,6 +25,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import (
     NO_ROWS,
+    TOO_MANY_BUSES,
     FrameRows,
     blocks_by_bus,
     bus_name,
@@ -41,6 +42,10 @@ from .lines import Lines, Overlong, Tail, read_lines
 HEAD_BYTES: Final = 64 << 10
 # Maximum length of a line that is parsed by ``slow``.
 LINE_MAX: Final = 8192
+MAY_BE_CUT: Final = "last line has no line end, may be cut"
+NOT_UNDERSTOOD: Final = "line not understood"
+BAD_LENGTH: Final = "length differs from the number of bytes"
+BAD_IDENTIFIER: Final = "identifier out of range"
 _CONTROL: Final = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 _EXCERPT: Final = 60
 _DOS_END: Final = b"\x1a"
@@ -143,9 +148,16 @@ class Dialect(ABC):
     def slow(self, line: bytes) -> Outcome:
         """Parse a line that does not follow the common pattern."""
 
-    @abstractmethod
     def last(self, line: bytes) -> Outcome:
         """Parse a last line without a line end, which may be truncated."""
+        outcome = self.slow(line)
+        if self.is_complete(outcome):
+            return outcome
+        return DamagedLine(MAY_BE_CUT) if line.strip() else None
+
+    def is_complete(self, outcome: Outcome) -> bool:
+        """Return whether the contents of a last line show that it is not truncated."""
+        return False
 
     def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, HeaderLine]]) -> Int64s:
         """Convert the times in the lines to log times.
@@ -155,8 +167,23 @@ class Dialect(ABC):
             t_ns: Times in the lines.
             marks: Marks of this chunk with their lines.
         """
-        del place, marks
+        out = np.empty_like(t_ns)
+        begin = 0
+        for i, mark in marks:
+            end = int(place.searchsorted(i))
+            out[begin:end] = self.log_times(t_ns[begin:end])
+            begin = end
+            self.note(mark)
+        out[begin:] = self.log_times(t_ns[begin:])
+        return out
+
+    def log_times(self, t_ns: Int64s) -> Int64s:
+        """Convert the times of lines between two marks to log times."""
         return t_ns
+
+    def note(self, mark: HeaderLine) -> None:
+        """Apply a mark to the lines that follow it."""
+        del mark
 
     def check(self, chunk: ChunkResult) -> Int64s:
         """Check a chunk against the format's own counters.
@@ -277,7 +304,7 @@ class _ChunkParser:
         odd = _SlowLines()
         outcome = self.dialect.last(tail.text) if len(tail.text) <= LINE_MAX else None
         if outcome is None and tail.text.strip():
-            outcome = DamagedLine("last line has no line end, may be cut")
+            outcome = DamagedLine(MAY_BE_CUT)
         if outcome is None or isinstance(outcome, ParsedFrame):
             detail = f"line {tail.number} has no line end"
             self._ledger.drop("", "file may be cut after its last frame", None, detail)
@@ -325,7 +352,7 @@ class _ChunkParser:
                 code = bus_number(outcome.bus, self._names)
                 if code < 0:
                     odd.damaged.append(i)
-                    self._drop("", "more buses than a log can have", number, line)
+                    self._drop("", TOO_MANY_BUSES, number, line)
                 else:
                     odd.frames.append((i, code, outcome))
             case Other():
@@ -376,7 +403,7 @@ class _ChunkParser:
         order = np.argsort(place, kind="stable") if odd.times else slice(None)
         log_ns = np.empty_like(t_ns)
         log_ns[order] = self.dialect.clock(place[order], t_ns[order], odd.marks)
-        return FrameRows(rows.place, rows.bus, log_ns[: len(rows)], rows.frames)
+        return replace(rows, log_ns=log_ns[: len(rows)])
 
     def _renamed(self, fast: Fast) -> FrameRows:
         rows = fast.rows
@@ -390,7 +417,7 @@ class _ChunkParser:
             [bus_number(name, self._names) if used else -1 for name, used in named], np.int64
         )
         bus = codes[rows.bus]
-        renamed = FrameRows(rows.place, bus, rows.log_ns, rows.frames)
+        renamed = replace(rows, bus=bus)
         return renamed.take(bus >= 0) if bool((bus < 0).any()) else renamed
 
 

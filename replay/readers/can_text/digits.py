@@ -8,8 +8,6 @@ point is used, so decimal times are exact.
 The buffer must have ``FRONT`` bytes before the first field and ``BACK`` bytes after the last.
 """
 
-from __future__ import annotations
-
 from typing import Final, TypeAlias
 
 import numpy as np

@@ -6,8 +6,6 @@ does not follow its predecessor's and its two neighbors' numbers leave exactly o
 them.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames whose bytes are separated by blanks, as in ASC, TRC and BUSMASTER logs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final

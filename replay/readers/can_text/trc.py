@@ -8,10 +8,7 @@ detected. Each line contains its message number, so missing lines are detected, 
 last line.
 """
 
-from __future__ import annotations
-
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -25,6 +22,9 @@ from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import FD_LENGTHS, IS_FD_LENGTH
 
 from .dialect import (
+    BAD_IDENTIFIER,
+    BAD_LENGTH,
+    NOT_UNDERSTOOD,
     ChunkResult,
     DamagedLine,
     Dialect,
@@ -42,12 +42,7 @@ from .lines import Lines, WordRanges, clean_lines, next_fields, skip_gap
 from .message_numbers import MessageNumbers
 from .spaced import NOTHING_FAST, Spaced, is_bus_name, is_direction, payload_stop, spaced_frames
 
-_COLUMNS_OF: Final = {
-    "1.0": "NOIlD",
-    "1.1": "NOTIlD",
-    "1.2": "NOBTIlD",
-    "1.3": "NOBTIRlD",
-}
+_COLUMNS_OF: Final = {"1.0": "NOIlD", "1.1": "NOTIlD", "1.2": "NOBTIlD", "1.3": "NOBTIRlD"}
 _KNOWN_COLUMNS: Final = frozenset("NOTBIdRLlDASsZP")
 _NEEDED_COLUMNS: Final = ("O", "T", "I", "D")
 _VERSION: Final = re.compile(rb";\$FILEVERSION=(\d+\.\d+)\s*")
@@ -63,7 +58,6 @@ _NO_FRAME_TYPES: Final = ("WARNG", "ST", "EC", "EV", "BUS", "BUSST", "ERRCT", "E
 # Days from 30 December 1899 to 1 January 1970.
 _EPOCH_DAYS: Final = 25_569
 _DAY_NS: Final = 86_400 * NANOS
-NOT_UNDERSTOOD: Final = "line not understood"
 
 
 def open_trc(path: Path, limits: Limits) -> Log:
@@ -169,24 +163,18 @@ class Trc(Dialect):
             return outcome._replace(number=int(by["N"].rstrip(")")))
         return outcome
 
-    def last(self, line: bytes) -> Outcome:
-        """Accept the line if it has as many bytes as its length states."""
-        outcome = self.slow(line)
-        if isinstance(outcome, ParsedFrame | DamagedLine):
-            return outcome
-        return DamagedLine("last line has no line end, may be cut") if line.strip() else None
+    def is_complete(self, outcome: Outcome) -> bool:
+        """Return whether the line has as many bytes as its length states."""
+        return isinstance(outcome, ParsedFrame | DamagedLine)
 
-    def clock(self, place: Int64s, t_ns: Int64s, marks: Sequence[tuple[int, HeaderLine]]) -> Int64s:
-        """Add the last start time before each line."""
-        out = np.empty_like(t_ns)
-        begin = 0
-        for i, mark in marks:
-            if mark.origin_ns is not None:
-                end = int(place.searchsorted(i))
-                out[begin:end] = t_ns[begin:end] + self._start_ns
-                begin, self._start_ns, self._is_dated = end, mark.origin_ns, True
-        out[begin:] = t_ns[begin:] + self._start_ns
-        return out
+    def log_times(self, t_ns: Int64s) -> Int64s:
+        """Add the last start time."""
+        return t_ns + self._start_ns
+
+    def note(self, mark: HeaderLine) -> None:
+        """Set the start time of the lines that follow."""
+        if mark.origin_ns is not None:
+            self._start_ns, self._is_dated = mark.origin_ns, True
 
     def check(self, chunk: ChunkResult) -> Int64s:
         """Check the message numbers of each recording in the file."""
@@ -277,7 +265,7 @@ class Trc(Dialect):
             return DamagedLine(NOT_UNDERSTOOD)
         identifier = int(id_text, 16)
         if identifier > (0x1FFFFFFF if is_extended else 0x7FF):
-            return DamagedLine("identifier out of range")
+            return DamagedLine(BAD_IDENTIFIER)
         if is_remote:
             is_bare = not rest or rest == ["RTR"]
             remote = ParsedFrame(bus, t_ns, identifier, is_extended, REMOTE, 0)
@@ -285,7 +273,7 @@ class Trc(Dialect):
         is_fd = type_ in _DATA_TYPES[1:]
         length = _length(by, is_fd)
         if length is None or len(rest) != length or not all(_PAIR.fullmatch(w) for w in rest):
-            return DamagedLine("length differs from the number of bytes")
+            return DamagedLine(BAD_LENGTH)
         kind = ERROR if is_error else DATA
         payload = bytes(int(word, 16) for word in rest)
         return ParsedFrame(bus, t_ns, identifier, is_extended, kind, length, payload, is_fd)

@@ -1,7 +1,5 @@
 """Damage checks of encoded images, by checksums, lengths and end markers, without decoding."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from typing import Final

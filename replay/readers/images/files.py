@@ -1,7 +1,5 @@
 """The image files of one camera, read into blocks and accounted for."""
 
-from __future__ import annotations
-
 import stat
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Random access to a file's bytes by reading, so that a shrinking file causes only a short read."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

@@ -5,8 +5,6 @@ name is used with different types or encodings, the first one keeps the name. Th
 separate topics ``name#2``, ``name#3`` and so on, with a notice.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -16,7 +14,7 @@ from crosscue.replay.columns import Topic
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.chunks.rows import Definition
 
-from .records import CHANNEL, Channel, Schema, read_channel, read_schema
+from .records import Channel, Op, Schema, read_channel, read_schema
 
 # Topic of messages whose channel is not declared.
 UNKNOWN: Final = ""
@@ -119,7 +117,7 @@ class Declarations:
         """
         if (found.opcode, found.content) in self._seen:
             return False
-        if found.opcode == CHANNEL:
+        if found.opcode == Op.CHANNEL:
             channel = read_channel(found.content)
             return self._channels.get(channel.id, channel) != channel
         schema = read_schema(found.content)
@@ -135,7 +133,7 @@ class Declarations:
         if key in self._seen:
             return
         self._names.clear()
-        if found.opcode == CHANNEL:
+        if found.opcode == Op.CHANNEL:
             channel = read_channel(found.content)
             if self._channels.get(channel.id, channel) != channel:
                 self.redefined.add(channel.id)

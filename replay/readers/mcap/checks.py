@@ -1,7 +1,5 @@
 """Counts of the checks of one pass, and their report."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from crosscue.replay.ledger import Ledger

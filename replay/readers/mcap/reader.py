@@ -13,8 +13,6 @@ at the next verified chunk or at the next plausible consecutive records.
 available and is replaced by the log time, as the format specifies.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """One pass over an MCAP recording: blocks, and the account of every message."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -210,14 +208,7 @@ class SegmentPass:
     def _walk(self) -> Walk:
         segment = self._segment
         known = segment.known_chunks(self._file, self._limits)
-        return Walk(
-            self._file,
-            segment.begin,
-            segment.end,
-            known,
-            self._limits,
-            self._plausible(),
-        )
+        return Walk(self._file, segment.begin, segment.end, known, self._limits, self._plausible())
 
     def _plausible(self) -> Plausible:
         """Return the criteria for messages after damaged bytes."""

@@ -5,8 +5,6 @@ UTF-8, invalid bytes are replaced by ``\xNN``, so that it can be printed. Record
 their fields (the format may be extended); a record shorter than its fields is broken.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -20,21 +18,26 @@ from crosscue.replay.errors import LogFormatError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 
-HEADER: Final = 0x01
-FOOTER: Final = 0x02
-SCHEMA: Final = 0x03
-CHANNEL: Final = 0x04
-MESSAGE: Final = 0x05
-CHUNK: Final = 0x06
-MESSAGE_INDEX: Final = 0x07
-CHUNK_INDEX: Final = 0x08
-ATTACHMENT: Final = 0x09
-ATTACHMENT_INDEX: Final = 0x0A
-STATISTICS: Final = 0x0B
-METADATA: Final = 0x0C
-METADATA_INDEX: Final = 0x0D
-SUMMARY_OFFSET: Final = 0x0E
-DATA_END: Final = 0x0F
+
+class Op:
+    """Operation codes of records."""
+
+    HEADER: Final = 0x01
+    FOOTER: Final = 0x02
+    SCHEMA: Final = 0x03
+    CHANNEL: Final = 0x04
+    MESSAGE: Final = 0x05
+    CHUNK: Final = 0x06
+    MESSAGE_INDEX: Final = 0x07
+    CHUNK_INDEX: Final = 0x08
+    ATTACHMENT: Final = 0x09
+    ATTACHMENT_INDEX: Final = 0x0A
+    STATISTICS: Final = 0x0B
+    METADATA: Final = 0x0C
+    METADATA_INDEX: Final = 0x0D
+    SUMMARY_OFFSET: Final = 0x0E
+    DATA_END: Final = 0x0F
+
 
 # Header of every record: operation code and length of the content.
 PREFIX: Final = struct.Struct("<BQ")

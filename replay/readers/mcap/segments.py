@@ -4,8 +4,6 @@ A file is one segment, or several if recordings were joined with ``cat``. The fo
 the file locates the summary. If it does not, the file is searched from its start.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,21 +22,14 @@ from crosscue.replay.readers.mcap.damage.find import find_bytes, verified_head
 from .bytes import PIECE, ByteFile
 from .channels import Declarations, TopicBook
 from .records import (
-    CHANNEL,
-    CHUNK,
-    CHUNK_INDEX,
-    DATA_END,
     DATA_END_SIZE,
-    FOOTER,
     FOOTER_SIZE,
-    HEADER,
     MAGIC,
     PREFIX,
-    SCHEMA,
-    STATISTICS,
     BrokenRecordError,
     Channel,
     ChunkIndex,
+    Op,
     Schema,
     Statistics,
     read_channel,
@@ -50,7 +41,7 @@ from .walk import End, How, LooseRecords, UnreadChunk, Walk
 
 MAX_HEADER: Final = 1 << 16
 NO_CHUNKS: Final = parse_chunk_indexes(b"", (), (), 0)
-DATA_END_PREFIX: Final = PREFIX.pack(DATA_END, DATA_END_SIZE - PREFIX.size)
+DATA_END_PREFIX: Final = PREFIX.pack(Op.DATA_END, DATA_END_SIZE - PREFIX.size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +169,7 @@ def _by_footer(file: ByteFile, limits: Limits) -> RecordingSegment | None:
         return None
     raw = bytes(file.peek(footer_at, FOOTER_SIZE + len(MAGIC)))
     opcode, length = PREFIX.unpack_from(raw)
-    if (opcode, length) != (FOOTER, FOOTER_SIZE - PREFIX.size) or not raw.endswith(MAGIC):
+    if (opcode, length) != (Op.FOOTER, FOOTER_SIZE - PREFIX.size) or not raw.endswith(MAGIC):
         return None
     footer = read_footer(raw[PREFIX.size : FOOTER_SIZE])
     data_end_at = footer.summary_at - DATA_END_SIZE
@@ -200,7 +191,7 @@ def _data_end(file: ByteFile, at: int) -> int | None:
     if len(raw) < DATA_END_SIZE:
         return None
     opcode, length = PREFIX.unpack_from(raw)
-    if (opcode, length) != (DATA_END, DATA_END_SIZE - PREFIX.size):
+    if (opcode, length) != (Op.DATA_END, DATA_END_SIZE - PREFIX.size):
         return None
     return int.from_bytes(raw[PREFIX.size :], "little")
 
@@ -217,7 +208,7 @@ def _begin(file: ByteFile, base: int) -> int:
         return at
     opcode, length = PREFIX.unpack(raw)
     after = at + PREFIX.size + length
-    return after if opcode == HEADER and length <= MAX_HEADER and after <= file.size else at
+    return after if opcode == Op.HEADER and length <= MAX_HEADER and after <= file.size else at
 
 
 def _read_summary(
@@ -252,15 +243,15 @@ def _parse_summary(records: bytes, base: int) -> Summary:
         content = view[at + PREFIX.size : at + PREFIX.size + length]
         if len(content) < length or not opcode:
             raise BrokenRecordError("the summary's records have wrong lengths")
-        if opcode == SCHEMA:
+        if opcode == Op.SCHEMA:
             schema = read_schema(content)
             schemas[schema.id] = schema
-        elif opcode == CHANNEL:
+        elif opcode == Op.CHANNEL:
             channel = read_channel(content)
             channels[channel.id] = channel
-        elif opcode == STATISTICS:
+        elif opcode == Op.STATISTICS:
             statistics = read_statistics(content)
-        elif opcode == CHUNK_INDEX:
+        elif opcode == Op.CHUNK_INDEX:
             size = PREFIX.size + length
             run = run_of(records, at, size)
             begins += range(at + PREFIX.size, at + run * size, size)
@@ -278,7 +269,7 @@ def _confirmed(
     confirmed: dict[int, ChunkIndex] = {}
     for at, index in chunks.items():
         raw = file.peek(at, PREFIX.size)
-        is_chunk = bytes(raw) == PREFIX.pack(CHUNK, max(index.length - PREFIX.size, 0))
+        is_chunk = bytes(raw) == PREFIX.pack(Op.CHUNK, max(index.length - PREFIX.size, 0))
         if is_chunk or verified_head(file, index, limits) is not None:
             confirmed[at] = replace(index, index_length=0)
     return confirmed
@@ -390,7 +381,7 @@ def _close(
         if bytes(file.peek(file.size - len(MAGIC), len(MAGIC))) != MAGIC:
             return replace(segment, after="the file ends inside its summary"), None
         notice = "the file is damaged inside its summary, which is not used"
-        following = find_bytes(file, summary_at, file.size, MAGIC + bytes([HEADER]))
+        following = find_bytes(file, summary_at, file.size, MAGIC + bytes([Op.HEADER]))
         hidden = None if following else find_bytes(file, summary_at, file.size, DATA_END_PREFIX)
         left = f"another recording, damaged at its start, ends at byte {hidden}"
         return replace(segment, notices=(notice,), after=left if hidden else ""), following
@@ -419,7 +410,7 @@ def _footer_after(file: ByteFile, at: int) -> int | None:
         if len(raw) < PREFIX.size:
             return None
         opcode, length = PREFIX.unpack(raw)
-        if opcode == FOOTER:
+        if opcode == Op.FOOTER:
             return (
                 at
                 if length == FOOTER_SIZE - PREFIX.size and at + FOOTER_SIZE <= file.size

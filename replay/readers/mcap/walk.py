@@ -6,8 +6,6 @@ chunk in the summary's index; without an index, at the next chunk that its check
 consecutive records (``damage.resync``).
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -29,29 +27,20 @@ from crosscue.replay.readers.mcap.damage.resync import McapResync, Plausible, is
 
 from .bytes import ByteFile
 from .records import (
-    ATTACHMENT,
-    CHANNEL,
-    CHUNK,
     CHUNK_FIXED,
     COMPRESSIONS,
-    DATA_END,
     DATA_END_SIZE,
-    FOOTER,
     FOOTER_SIZE,
-    HEADER,
     INDEX_ENTRY,
     MAGIC,
-    MESSAGE,
     MESSAGE_FIXED,
     MESSAGE_HEAD,
-    MESSAGE_INDEX,
-    METADATA,
     PREFIX,
-    SCHEMA,
     BrokenRecordError,
     ChunkHead,
     ChunkIndex,
     MessageIndex,
+    Op,
     check_metadata,
     read_chunk_head,
     read_message_index,
@@ -59,7 +48,7 @@ from .records import (
 
 # Maximum number of bytes outside chunks read at once, unless one record is larger.
 RUN_BYTES: Final = 4 << 20
-STOPS_A_RUN: Final = ~opcodes(SCHEMA, CHANNEL, MESSAGE)
+STOPS_A_RUN: Final = ~opcodes(Op.SCHEMA, Op.CHANNEL, Op.MESSAGE)
 # Maximum size of records that are checked completely (metadata and similar).
 SMALL: Final = 1 << 20
 
@@ -239,19 +228,19 @@ class Walk:
         opcode, length = PREFIX.unpack(head)
         after, bound = at + PREFIX.size + length, self._bound(at)
         if not self._has_end and self._is_end(opcode, length):
-            return End(at, How.DATA_END if opcode == DATA_END else How.FOOTER)
-        if opcode == CHUNK:
+            return End(at, How.DATA_END if opcode == Op.DATA_END else How.FOOTER)
+        if opcode == Op.CHUNK:
             return self._chunk(None)
         if after > bound:
             return self._overlong(opcode, length, bound)
-        if opcode in (SCHEMA, CHANNEL, MESSAGE):
+        if opcode in (Op.SCHEMA, Op.CHANNEL, Op.MESSAGE):
             return self._run(opcode, length, bound)
         return self._other(opcode, length)
 
     def _is_end(self, opcode: int, length: int) -> bool:
-        if opcode == DATA_END:
+        if opcode == Op.DATA_END:
             return length == DATA_END_SIZE - PREFIX.size
-        if opcode != FOOTER or length != FOOTER_SIZE - PREFIX.size:
+        if opcode != Op.FOOTER or length != FOOTER_SIZE - PREFIX.size:
             return False
         return bytes(self._file.peek(self._at + FOOTER_SIZE, len(MAGIC))) == MAGIC
 
@@ -300,17 +289,17 @@ class Walk:
 
     def _other(self, opcode: int, length: int) -> Item | None:
         at, after = self._at, self._at + PREFIX.size + length
-        if opcode == ATTACHMENT:
+        if opcode == Op.ATTACHMENT:
             crc_at = self._attachment_crc_at(after)
             crc = int.from_bytes(self._file.peek(crc_at, 4), "little")
             item: Item | None = Attachment(at, crc_at, crc)
-        elif opcode == MESSAGE_INDEX:
+        elif opcode == Op.MESSAGE_INDEX:
             item = Stray(at, read_message_index(self._whole(length)))
-        elif opcode == METADATA:
+        elif opcode == Op.METADATA:
             if length <= SMALL:
                 check_metadata(self._whole(length))
             item = None
-        elif opcode in (0, HEADER, FOOTER, DATA_END):
+        elif opcode in (0, Op.HEADER, Op.FOOTER, Op.DATA_END):
             raise BrokenRecordError(f"a record of kind {opcode:#04x} is not allowed here")
         elif (hidden := self._hidden_chunk(opcode, length)) is not None:
             return hidden
@@ -358,7 +347,7 @@ class Walk:
 
     def _run(self, opcode: int, length: int, bound: int) -> Item:
         at, size = self._at, PREFIX.size + length
-        if opcode == MESSAGE and length < MESSAGE_FIXED:
+        if opcode == Op.MESSAGE and length < MESSAGE_FIXED:
             raise BrokenRecordError(f"a message record of {length} bytes")
         if size > max(self._limits.message_bytes, SMALL) + MESSAGE_HEAD.itemsize:
             self._at = at + size
@@ -402,7 +391,7 @@ class Walk:
         return np.frombuffer(near, dtype=np.uint8)[: bound - at]
 
     def _oversized(self, at: int, opcode: int, length: int) -> Item:
-        if opcode != MESSAGE:
+        if opcode != Op.MESSAGE:
             return Ignored(at, opcode)
         head = np.frombuffer(self._file.peek(at, MESSAGE_HEAD.itemsize), dtype=MESSAGE_HEAD)[0]
         return Oversized(at, length - MESSAGE_FIXED, int(head["channel"]), int(head["log"]))
@@ -418,7 +407,7 @@ class Walk:
             head = read_chunk_head(raw[PREFIX.size :])
         except BrokenRecordError as error:
             head, why = None, str(error)
-        if index is not None and is_doubtful(opcode == CHUNK, head, index):
+        if index is not None and is_doubtful(opcode == Op.CHUNK, head, index):
             repaired = verified_head(self._file, index, self._limits)
             if repaired is not None:
                 return self._repaired(index, repaired, bound)
@@ -427,7 +416,7 @@ class Walk:
         body_at = at + PREFIX.size + head.body_at
         inner_end = body_at + head.body_size
         fault = ""
-        if opcode != CHUNK:
+        if opcode != Op.CHUNK:
             fault = f"its record has the kind {opcode:#04x}"
         elif head.compression not in COMPRESSIONS:
             fault = f"compression {head.compression!r} is unknown (known: none, lz4, zstd)"
@@ -484,7 +473,7 @@ class Walk:
                 break
             opcode, length = PREFIX.unpack(head)
             after = at + PREFIX.size + length
-            if opcode != MESSAGE_INDEX or after > bound:
+            if opcode != Op.MESSAGE_INDEX or after > bound:
                 break
             self._at = at
             try:
@@ -515,4 +504,4 @@ def _differences(head: ChunkHead, index: ChunkIndex, length: int) -> str:
     )
 
 
-_KINDS: Final = frozenset(range(HEADER, DATA_END + 1))
+_KINDS: Final = frozenset(range(Op.HEADER, Op.DATA_END + 1))

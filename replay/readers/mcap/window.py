@@ -9,8 +9,6 @@ A wrong time then violates this order, or belongs to a chunk next to the selecte
 neighbors are therefore read too.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

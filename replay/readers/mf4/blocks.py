@@ -4,8 +4,6 @@ The library asammdf is not used because it trusts a damaged file's sizes and off
 terabytes, and reports a truncated data block as a shorter one.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable, Iterator

@@ -5,9 +5,7 @@ Formulas and texts are not evaluated. A topic's rows are yielded group by group,
 Attachments are never opened. Compressed blocks have a checksum, which is verified.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -23,8 +21,8 @@ from crosscue.replay.files.closing import Closing
 from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import (
-    BUSES_MAX,
     NO_ROWS,
+    TOO_MANY_BUSES,
     FrameRows,
     blocks_by_bus,
     bus_number,
@@ -32,6 +30,7 @@ from crosscue.replay.readers.can_rows import (
     keep_memory,
     merge_rows,
     merged_by_time,
+    named_buses,
 )
 from crosscue.replay.seal.touched import Touched
 
@@ -77,6 +76,11 @@ class _Source:
     topic: str
     refusal: str
     declared: int | None
+
+    @property
+    def has_frames(self) -> bool:
+        """True if its records are CAN frames that can be read."""
+        return self.can is not None and not self.refusal
 
 
 @dataclass(slots=True, eq=False)
@@ -126,10 +130,10 @@ class Mf4Log(Closing):
         self._file = path.open("rb")
         note = partial(self.touched.add, path)
         self._blocks = Blocks(self._file, path.stat().st_size, limits, note)
-        self._buses: dict[str, int] = {}
+        self.buses: dict[str, int] = {}
         self._broken = ""
         try:
-            self._header = self._blocks.header(str(path))
+            self.header = self._blocks.header(str(path))
             self._stored = tuple(self._found())
             if self._broken and not self._stored:
                 raise LogFormatError(f"{path}: no channel group can be read: {self._broken}")
@@ -146,7 +150,7 @@ class Mf4Log(Closing):
             for s in self._sources()
             if s.topic
         )
-        return tuple(bus_topic(name) for name in self._buses) + tables
+        return tuple(bus_topic(name) for name in self.buses) + tables
 
     def close(self) -> None:
         """Close the file."""
@@ -156,16 +160,10 @@ class Mf4Log(Closing):
         """Yield all rows, group by group; see ``Log.read``."""
         for topic in self.topics:
             ledger.declare(topic.name, topic.declared)
-        self._say(ledger)
+        if self.header.is_local:
+            ledger.notice("the log states no time zone; its start time is read as UTC")
         accounts = {source: _Account() for source in self._sources()}
-        for stored in self._stored:
-            if stored.unsorted:
-                yield from self._mixed(stored, stored.unsorted, accounts, ledger, selection)
-        yield from self._by_time(accounts, ledger, selection)
-        for stored in self._stored:
-            for source in () if stored.unsorted else stored.sources:
-                if source.can is None or source.refusal:
-                    yield from self._alone(stored, source, accounts[source], ledger, selection)
+        yield from _Pass(self, accounts, ledger, selection).blocks(self._stored)
         for source, account in accounts.items():
             _settle(source, account, ledger)
         self._close_account(accounts.values(), ledger)
@@ -182,42 +180,131 @@ class Mf4Log(Closing):
                     size = source.group.record_bytes
                     there = stored.stream.size // size if size else 0
                     _settle(source, _Account(met=min(there, source.declared or 0)), ledger)
-        if not self._header.is_finalized:
+        if not self.header.is_finalized:
             ledger.notice("not finalized by the logger; only reading it can detect a cut")
 
     def _sources(self) -> Iterator[_Source]:
         return (source for stored in self._stored for source in stored.sources)
 
-    def _say(self, ledger: Ledger) -> None:
-        if self._header.is_local:
-            ledger.notice("the log states no time zone; its start time is read as UTC")
-
     def _close_account(self, accounts: Collection[_Account], ledger: Ledger) -> None:
         met = sum(account.met for account in accounts)
-        if not self._header.is_finalized:
+        if not self.header.is_finalized:
             ledger.notice(
                 f"not finalized by the logger; {met} records recovered from the data block"
             )
         if self._broken:
             ledger.drop("", "structure damaged", None, self._broken)
-        for name in self._buses:
+        for name in self.buses:
             ledger.topic(name)
         ledger.integrity = (
             "checksums of compressed blocks verified; MDF has none for the rest of the file"
         )
-        if not self._header.is_finalized and any(one.declared is None for one in self._sources()):
+        if not self.header.is_finalized and any(one.declared is None for one in self._sources()):
             ledger.integrity += "; not finalized: a cut between two records cannot be detected"
         if unread := sum(account.unread for account in accounts):
             ledger.integrity += f"; {unread} of {met} records, of other times, were not read"
 
-    def _mixed(
+    def _peek(self) -> None:
+        for stored in self._stored:
+            for source in stored.sources:
+                if source.can is None or source.refusal:
+                    continue
+                if stored.unsorted:
+                    piece = stored.unsorted.piece(0)
+                    some = stored.unsorted.rows(0, source.index) if piece else None
+                else:
+                    records = sorted_records(stored.stream, source.group, 0, _PEEK_ROWS)
+                    some = next(records, None)
+                if some is not None:
+                    for channel in np.unique(source.can.buses(some)).tolist():
+                        bus_number(str(channel), self.buses)
+
+    def _found(self) -> Iterator[_Stored]:
+        names: dict[str, NDArray[np.generic]] = {}
+        try:
+            for data in self._blocks.data_groups(self.header.first_group, self.header.unfinished):
+                stream = LinkedData(self._blocks, data.data, self.header.unfinished)
+                unsorted = None
+                if data.id_bytes:
+                    unsorted = UnsortedData(stream, data, self._limits.message_bytes)
+                sources = tuple(self._sources_of(data, stream, names))
+                values = {
+                    source.index: self._values(source.can.variable, data, unsorted)
+                    for source in sources
+                    if source.can and source.can.variable
+                }
+                yield _Stored(stream, unsorted, sources, values)
+        except BrokenBlockError as broken:
+            self._broken = str(broken)
+
+    def _values(
+        self, channel: Mf4Channel, data: DataGroup, unsorted: UnsortedData | None
+    ) -> VariableValues:
+        for k, group in enumerate(data.groups):
+            if unsorted and group.flags & VLSD_GROUP and group.at == channel.data:
+                by_order = bool(self.header.unfinished & VARIABLE_OFFSETS)
+                return GroupValues(unsorted, k, by_order)
+        return StoredValues(LinkedData(self._blocks, channel.data, self.header.unfinished))
+
+    def _sources_of(
+        self, data: DataGroup, stream: LinkedData, names: dict[str, NDArray[np.generic]]
+    ) -> Iterator[_Source]:
+        for k, group in enumerate(data.groups):
+            is_empty = stream.size < group.record_bytes + data.id_bytes and not stream.broken
+            if not group.flags & VLSD_GROUP and (self._declared(group) or not is_empty):
+                yield self._source(k, data, group, names)
+
+    def _declared(self, group: ChannelGroup) -> int | None:
+        return None if self.header.unfinished & CYCLE_COUNTERS else group.records
+
+    def _source(
         self,
-        stored: _Stored,
-        data: UnsortedData,
+        index: int,
+        data: DataGroup,
+        group: ChannelGroup,
+        names: dict[str, NDArray[np.generic]],
+    ) -> _Source:
+        masters = [c for c in group.channels if c.type in (MASTER, VIRTUAL_MASTER)]
+        master = next((c for c in masters if c.sync == TIME), None)
+        can = can_layout(group)
+        refusal = _refusal(group, master, can)
+        topic = ""
+        # A group of mixed data that declares no records may still have some.
+        if can is None and not refusal:
+            topic = _free(group.name or "group", names)
+            names[topic] = np.zeros(0)
+        return _Source(index, group, master, can, topic, refusal, self._declared(group))
+
+
+class _Pass:
+    """One pass over the records of all groups."""
+
+    def __init__(
+        self,
+        log: Mf4Log,
         accounts: Mapping[_Source, _Account],
         ledger: Ledger,
         selection: Selection,
-    ) -> Iterator[Block]:
+    ) -> None:
+        self._log, self._accounts, self._ledger, self._selection = log, accounts, ledger, selection
+
+    def blocks(self, groups: Sequence[_Stored]) -> Iterator[Block]:
+        """Yield the rows of unsorted data, then all other frames by time, then other rows."""
+        for stored in groups:
+            if stored.unsorted:
+                yield from self._mixed(stored, stored.unsorted)
+        alone = [(one, source) for one in groups if not one.unsorted for source in one.sources]
+        frames = [self._alone_frames(*pair) for pair in alone if pair[1].has_frames]
+        for rows in merged_by_time(frames):
+            yield from self._by_bus(rows)
+        for stored, source in alone:
+            if not source.has_frames:
+                yield from self._alone(stored, source)
+
+    def _by_bus(self, rows: FrameRows) -> Iterator[Block]:
+        yield from blocks_by_bus(rows, tuple(self._log.buses), self._ledger, self._selection)
+
+    def _mixed(self, stored: _Stored, data: UnsortedData) -> Iterator[Block]:
         """Yield the records of unsorted data piece by piece, with frames in stored order."""
         last = None
         for k, piece in data.pieces():
@@ -227,120 +314,73 @@ class Mf4Log(Closing):
             for source in stored.sources:
                 if not present[source.index]:
                     continue
-                accounts[source].met += int(present[source.index])
-                if source.refusal or not source.can:
-                    records = data.rows(k, source.index)
-                    yield from self._other(source, records, ledger, selection)
+                self._accounts[source].met += int(present[source.index])
+                records = data.rows(k, source.index)
+                if source.has_frames:
+                    frames.append(self._frames(stored, source, records))
+                elif self._is_left_out(source, len(records.rows)):
+                    continue
                 else:
-                    frames.append(self._frames(stored, source, data.rows(k, source.index), ledger))
+                    yield from self._table(source, records)
             if frames:
-                yield from self._handed_on(merge_rows(frames), ledger, selection)
+                yield from self._by_bus(merge_rows(frames))
         if last is not None and last.damage:
-            self._drop_rest(stored, last, accounts, ledger)
+            self._drop_rest(stored, last)
 
-    def _drop_rest(
-        self,
-        stored: _Stored,
-        last: Walked,
-        accounts: Mapping[_Source, _Account],
-        ledger: Ledger,
-    ) -> None:
+    def _drop_rest(self, stored: _Stored, last: Walked) -> None:
         """Account for the records in a damaged end of unsorted data."""
         if all(source.declared is not None for source in stored.sources):
             for source in stored.sources:
-                missing = max((source.declared or 0) - accounts[source].met, 0)
-                accounts[source].dropped += missing
-                ledger.drop(source.topic, "damaged data", missing, last.damage)
+                account = self._accounts[source]
+                missing = max((source.declared or 0) - account.met, 0)
+                account.dropped += missing
+                self._ledger.drop(source.topic, "damaged data", missing, last.damage)
         elif last.cut < 0:
             is_cut = last.damage == LAST_CUT
-            ledger.drop("", "damaged data", 1 if is_cut else None, last.damage)
-        elif not self._is_missed(stored, last.cut):
-            ledger.drop("", "damaged data", 1, last.damage)
-
-    def _is_missed(self, stored: _Stored, group: int) -> bool:
-        """Return whether a frame was already dropped because its payload is truncated."""
-        return any(
-            isinstance(one, GroupValues) and one.group == group and one.first_missed is not None
+            self._ledger.drop("", "damaged data", 1 if is_cut else None, last.damage)
+        elif not any(
+            isinstance(one, GroupValues) and one.group == last.cut and one.first_missed is not None
             for one in stored.values.values()
-        )
+        ):  # else a frame was already dropped because its payload is truncated
+            self._ledger.drop("", "damaged data", 1, last.damage)
 
-    def _by_time(
-        self, accounts: Mapping[_Source, _Account], ledger: Ledger, selection: Selection
-    ) -> Iterator[Block]:
-        """Yield the frames of all groups with separate data streams, merged by time."""
-        streams = [
-            self._alone_frames(stored, source, accounts[source], ledger, selection)
-            for stored in self._stored
-            if not stored.unsorted
-            for source in stored.sources
-            if source.can and not source.refusal
-        ]
-        for rows in merged_by_time(streams):
-            yield from self._handed_on(rows, ledger, selection)
+    def _alone_frames(self, stored: _Stored, source: _Source) -> Iterator[FrameRows]:
+        for records in self._records(stored, source):
+            yield self._frames(stored, source, records)
 
-    def _alone_frames(
-        self,
-        stored: _Stored,
-        source: _Source,
-        account: _Account,
-        ledger: Ledger,
-        selection: Selection,
-    ) -> Iterator[FrameRows]:
-        for records in self._records(stored, source, account, ledger, selection):
-            yield self._frames(stored, source, records, ledger)
-
-    def _alone(
-        self,
-        stored: _Stored,
-        source: _Source,
-        account: _Account,
-        ledger: Ledger,
-        selection: Selection,
-    ) -> Iterator[Block]:
+    def _alone(self, stored: _Stored, source: _Source) -> Iterator[Block]:
         """Yield the rows of a group without frames that has a separate data stream."""
-        if source.refusal or not selection.wants(source.topic):
-            size = source.group.record_bytes
-            there = stored.stream.size // size if size else 0
-            count = there if source.declared is None else source.declared
-            account.met += count
-            self._leave_out(source, count, ledger)
+        size = source.group.record_bytes
+        there = stored.stream.size // size if size else 0
+        count = there if source.declared is None else source.declared
+        if self._is_left_out(source, count):
+            self._accounts[source].met += count
             return
-        for records in self._records(stored, source, account, ledger, selection):
-            yield from self._table(source, records, ledger, selection)
+        for records in self._records(stored, source):
+            yield from self._table(source, records)
 
-    def _other(
-        self, source: _Source, records: Records, ledger: Ledger, selection: Selection
-    ) -> Iterator[Block]:
-        if source.refusal or not selection.wants(source.topic):
-            self._leave_out(source, len(records.rows), ledger)
-        else:
-            yield from self._table(source, records, ledger, selection)
-
-    def _leave_out(self, source: _Source, count: int, ledger: Ledger) -> None:
-        """Account for rows that are unsupported or not selected."""
+    def _is_left_out(self, source: _Source, count: int) -> bool:
+        """Return whether a group is unsupported or not selected, and account for its rows then."""
+        if not source.refusal and self._selection.wants(source.topic):
+            return False
         if source.refusal and source.can and source.can.is_needed:
-            ledger.drop("", source.refusal, count, source.group.name)
-            return
-        ledger.find(source.topic, count)
-        reason = source.refusal or NOT_ASKED_TOPIC
-        ledger.skip(source.topic, reason, count, source.group.name)
+            self._ledger.drop("", source.refusal, count, source.group.name)
+        else:
+            self._ledger.find(source.topic, count)
+            reason = source.refusal or NOT_ASKED_TOPIC
+            self._ledger.skip(source.topic, reason, count, source.group.name)
+        return True
 
-    def _records(
-        self,
-        stored: _Stored,
-        source: _Source,
-        account: _Account,
-        ledger: Ledger,
-        selection: Selection,
-    ) -> Iterator[Records]:
+    def _records(self, stored: _Stored, source: _Source) -> Iterator[Records]:
         """Yield records of sorted data, and account for unreadable ones."""
-        first, stop = self._span(stored, source, selection)
+        account = self._accounts[source]
+        first, stop = self._span(stored, source)
         if stop is not None:
             unread = stored.stream.size // source.group.record_bytes - (stop - first)
             account.met += unread
             account.unread += unread
-            ledger.find(source.topic, unread)
-            ledger.skip(source.topic, NOT_ASKED_TIME, unread)
+            self._ledger.find(source.topic, unread)
+            self._ledger.skip(source.topic, NOT_ASKED_TIME, unread)
         for records in sorted_records(stored.stream, source.group, first, stop):
             if not records.damage:
                 account.met += len(records.rows)
@@ -351,17 +391,15 @@ class Mf4Log(Closing):
                 count = min(count, max(source.declared - account.met - account.dropped, 0))
             account.dropped += count
             if count or records.dropped == 0:
-                ledger.drop(source.topic, "damaged data", count or None, records.damage)
+                self._ledger.drop(source.topic, "damaged data", count or None, records.damage)
 
-    def _span(
-        self, stored: _Stored, source: _Source, selection: Selection
-    ) -> tuple[int, int | None]:
+    def _span(self, stored: _Stored, source: _Source) -> tuple[int, int | None]:
         """Return the range of records that may be selected; stop is None for all.
 
         The first records of chunks are found by bisection, because times ascend in MDF.
         """
-        size, start_ns, end_ns = source.group.record_bytes, selection.start_ns, selection.end_ns
-        if not size or not selection.is_timed or stored.stream.broken:
+        size, asked = source.group.record_bytes, self._selection
+        if not size or not asked.is_timed or stored.stream.broken:
             return 0, None
         total = stored.stream.size // size
         rows = max(_CHUNK_BYTES // size, 1)
@@ -381,8 +419,11 @@ class Mf4Log(Closing):
         try:
             if count < 2 or time_ns(count - 1) < time_ns(0):
                 return 0, None
-            first = 0 if start_ns is None else max(_first_from(start_ns, count, time_ns) - 1, 0)
-            stop = count if end_ns is None else _first_from(end_ns, count, time_ns)
+            first, stop = 0, count
+            if asked.start_ns is not None:
+                first = max(_first_from(asked.start_ns, count, time_ns) - 1, 0)
+            if asked.end_ns is not None:
+                stop = _first_from(asked.end_ns, count, time_ns)
         except _UnreadableError:
             return 0, None
         return first * rows, max(min(stop * rows, total), first * rows)
@@ -391,14 +432,12 @@ class Mf4Log(Closing):
         assert source.master is not None
         since = times_ns(source.master, raw(source.master, words))
         if since is not None:
-            since += self._header.start_ns
+            since += self._log.header.start_ns
         return since
 
-    def _frames(
-        self, stored: _Stored, source: _Source, records: Records, ledger: Ledger
-    ) -> FrameRows:
+    def _frames(self, stored: _Stored, source: _Source, records: Records) -> FrameRows:
         assert source.can is not None
-        words = Words(records.rows, records.first)
+        ledger, words = self._ledger, Words(records.rows, records.first)
         log_ns = self._times(source, words)
         if log_ns is None:
             ledger.drop("", "time out of range", len(words), source.group.name)
@@ -409,64 +448,28 @@ class Mf4Log(Closing):
         ledger.drop("", "payload cut or damaged", found.unreadable, detail)
         ledger.find("", found.invalid)
         ledger.skip("", "marked as invalid by the logger", found.invalid, detail)
-        return self._named(found.rows, ledger)
-
-    def _handed_on(self, rows: FrameRows, ledger: Ledger, selection: Selection) -> Iterator[Block]:
-        yield from blocks_by_bus(rows, tuple(self._buses), ledger, selection)
-
-    def _named(self, rows: FrameRows, ledger: Ledger) -> FrameRows:
-        """Replace channel numbers by indices of bus names."""
-        if not len(rows):
-            return rows
-        low, high = int(rows.bus.min()), int(rows.bus.max())
-        if low == high:
-            channels, codes = rows.bus[:1], None
-        elif low >= 0 and high < BUSES_MAX:
-            is_there = np.zeros(BUSES_MAX, np.bool_)
-            is_there[rows.bus] = True
-            channels, codes = np.flatnonzero(is_there), None
-        else:
-            channels, codes = np.unique(rows.bus, return_inverse=True)
-        numbers = np.array([bus_number(str(c), self._buses) for c in channels.tolist()], np.int64)
-        if low == high:
-            bus = np.full(len(rows), numbers[0])
-        elif codes is None:
-            table = np.zeros(BUSES_MAX, np.int64)
-            table[channels] = numbers
-            bus = table.take(rows.bus)
-        else:
-            bus = numbers[codes]
-        named = FrameRows(rows.place, bus, rows.log_ns, rows.frames)
-        if numbers.min() < 0:
-            is_known = named.bus >= 0
-            extra = len(rows) - int(np.count_nonzero(is_known))
-            ledger.drop("", "more buses than a log can have", extra)
-            return named.take(is_known)
+        named = named_buses(found.rows, self._log.buses)
+        ledger.drop("", TOO_MANY_BUSES, len(found.rows) - len(named))
         return named
 
-    def _table(
-        self, source: _Source, records: Records, ledger: Ledger, selection: Selection
-    ) -> Iterator[Block]:
-        log_ns = self._times(source, Words(records.rows, records.first))
+    def _table(self, source: _Source, records: Records) -> Iterator[Block]:
+        words = Words(records.rows, records.first)
+        log_ns = self._times(source, words)
         if log_ns is None:
-            ledger.drop(
-                source.topic,
-                "time out of range",
-                len(records.rows),
-                f"from record {records.first} on",
-            )
+            detail = f"from record {records.first} on"
+            self._ledger.drop(source.topic, "time out of range", len(words), detail)
             return
-        kept = selection.account(source.topic, log_ns, ledger)
+        kept = self._selection.account(source.topic, log_ns, self._ledger)
         if kept is not None and not bool(kept.any()):
             return
-        table = self._columns(source, Words(records.rows, records.first), ledger)
+        table = self._columns(source, words)
         if kept is not None:
             log_ns, table = log_ns[kept], table.take(kept)
         for k in range(0, len(log_ns), BLOCK_ROWS):
             part = slice(k, k + BLOCK_ROWS)
             yield Block(source.topic, log_ns[part], table.take(part))
 
-    def _columns(self, source: _Source, words: Words, ledger: Ledger) -> Table:
+    def _columns(self, source: _Source, words: Words) -> Table:
         columns: dict[str, NDArray[np.generic]] = {}
         units: dict[str, str] = {}
         left_out, unconverted = [], []
@@ -491,82 +494,10 @@ class Mf4Log(Closing):
             (unconverted, "have an unsupported conversion; raw values are used"),
         ):
             if names:
-                some = ", ".join(names[:_NAMES_SHOWN]) + (
-                    ", ..." if len(names) > _NAMES_SHOWN else ""
-                )
-                ledger.notice(f"{source.topic}: {len(names)} channels {what}: {some}")
+                some = ", ".join(names[:_NAMES_SHOWN])
+                some += ", ..." if len(names) > _NAMES_SHOWN else ""
+                self._ledger.notice(f"{source.topic}: {len(names)} channels {what}: {some}")
         return Table(columns, units)
-
-    def _peek(self) -> None:
-        for stored in self._stored:
-            for source in stored.sources:
-                if source.can is None or source.refusal:
-                    continue
-                if stored.unsorted:
-                    piece = stored.unsorted.piece(0)
-                    some = stored.unsorted.rows(0, source.index) if piece else None
-                else:
-                    records = sorted_records(stored.stream, source.group, 0, _PEEK_ROWS)
-                    some = next(records, None)
-                if some is not None:
-                    for channel in np.unique(source.can.buses(some)).tolist():
-                        bus_number(str(channel), self._buses)
-
-    def _found(self) -> Iterator[_Stored]:
-        names: dict[str, NDArray[np.generic]] = {}
-        try:
-            for data in self._blocks.data_groups(self._header.first_group, self._header.unfinished):
-                stream = LinkedData(self._blocks, data.data, self._header.unfinished)
-                unsorted = None
-                if data.id_bytes:
-                    unsorted = UnsortedData(stream, data, self._limits.message_bytes)
-                sources = tuple(self._sources_of(data, stream, names))
-                values = {
-                    source.index: self._values(source.can.variable, data, unsorted)
-                    for source in sources
-                    if source.can and source.can.variable
-                }
-                yield _Stored(stream, unsorted, sources, values)
-        except BrokenBlockError as broken:
-            self._broken = str(broken)
-
-    def _values(
-        self, channel: Mf4Channel, data: DataGroup, unsorted: UnsortedData | None
-    ) -> VariableValues:
-        for k, group in enumerate(data.groups):
-            if unsorted and group.flags & VLSD_GROUP and group.at == channel.data:
-                by_order = bool(self._header.unfinished & VARIABLE_OFFSETS)
-                return GroupValues(unsorted, k, by_order)
-        return StoredValues(LinkedData(self._blocks, channel.data, self._header.unfinished))
-
-    def _sources_of(
-        self, data: DataGroup, stream: LinkedData, names: dict[str, NDArray[np.generic]]
-    ) -> Iterator[_Source]:
-        for k, group in enumerate(data.groups):
-            is_empty = stream.size < group.record_bytes + data.id_bytes and not stream.broken
-            if not group.flags & VLSD_GROUP and (self._declared(group) or not is_empty):
-                yield self._source(k, data, group, names)
-
-    def _declared(self, group: ChannelGroup) -> int | None:
-        return None if self._header.unfinished & CYCLE_COUNTERS else group.records
-
-    def _source(
-        self,
-        index: int,
-        data: DataGroup,
-        group: ChannelGroup,
-        names: dict[str, NDArray[np.generic]],
-    ) -> _Source:
-        masters = [c for c in group.channels if c.type in (MASTER, VIRTUAL_MASTER)]
-        master = next((c for c in masters if c.sync == TIME), None)
-        can = can_layout(group)
-        refusal = _refusal(group, master, can)
-        topic = ""
-        # A group of mixed data that declares no records may still have some.
-        if can is None and not refusal:
-            topic = _free(group.name or "group", names)
-            names[topic] = np.zeros(0)
-        return _Source(index, group, master, can, topic, refusal, self._declared(group))
 
 
 def _first_from(t_ns: int, count: int, time_ns: Callable[[int], int]) -> int:

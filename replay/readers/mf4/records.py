@@ -5,8 +5,6 @@ of several groups, each after its group's identifier. Some of them are variable-
 belong to a record of another group.
 """
 
-from __future__ import annotations
-
 import struct
 import sys
 from collections.abc import Iterator, Sequence

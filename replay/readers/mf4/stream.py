@@ -1,7 +1,5 @@
 """Random access to the data of an MDF 4 data link as one stream of bytes."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from dataclasses import dataclass
 from typing import Final, cast

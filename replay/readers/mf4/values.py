@@ -1,7 +1,5 @@
 """Values of MDF 4 channels, computed from columns of records."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

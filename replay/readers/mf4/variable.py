@@ -1,7 +1,5 @@
 """Variable-length values, which MDF 4 stores separately from the records that refer to them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final, Protocol, TypeAlias
 
@@ -34,7 +32,6 @@ class VariableValues(Protocol):
             Shape (N, width): first bytes of the values, undefined after their ends. Shape (N,):
             lengths of the values, -1 for missing or unreadable ones.
         """
-        ...
 
 
 class StoredValues:

@@ -1,7 +1,5 @@
 """One pass over a ROS 1 bag: blocks, and the account of every message."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field

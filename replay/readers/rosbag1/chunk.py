@@ -367,11 +367,7 @@ def _run_of_messages(raw: bytes, at: int, steps: _Steps, max_count: int) -> tupl
     good = len(places) if heads.fits.all() else int(np.argmin(heads.fits))
     part = slice(0, good)
     steps.add(
-        offsets[part],
-        heads.conn[part],
-        heads.log_ns[part],
-        offsets[part] + _HEAD,
-        heads.stop[part],
+        offsets[part], heads.conn[part], heads.log_ns[part], offsets[part] + _HEAD, heads.stop[part]
     )
     return good, int(heads.stop[good - 1])
 
@@ -382,13 +378,7 @@ def _one_record(raw: bytes, at: int, steps: _Steps, largest: int) -> int | None:
     if record is None or record.end > len(raw):
         return None
     if record.op == MESSAGE:
-        columns = (
-            at,
-            record.u32(b"conn"),
-            record.time_ns(b"time"),
-            record.body,
-            record.end,
-        )
+        columns = (at, record.u32(b"conn"), record.time_ns(b"time"), record.body, record.end)
         steps.add(*(np.array([value], dtype=np.int64) for value in columns))
         return record.end
     if record.op != CONNECTION:

@@ -1,7 +1,5 @@
 """Contents of a ROS 1 bag, from its index section or from a walk over its records."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Final

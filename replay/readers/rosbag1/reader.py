@@ -5,8 +5,6 @@ number of messages in a damaged chunk. Bags of a killed recorder (without an ind
 ``.bag.active`` files are read in the same manner.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

@@ -5,8 +5,6 @@ A record is ``<u32 header length> <header> <u32 body length> <body>``. A header 
 not fit or lacks a required field.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Sequence

@@ -6,22 +6,11 @@ After damage, reading resumes at the next indexed chunk, or at earlier consecuti
 plausible by their kinds, sizes, connections and times.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Sequence
 from typing import Final
 
-from .records import (
-    BAG_HEADER,
-    CHUNK,
-    CHUNK_INFO,
-    INDEX,
-    MESSAGE,
-    BagFile,
-    BagRecord,
-    record_at,
-)
+from .records import BAG_HEADER, CHUNK, CHUNK_INFO, INDEX, MESSAGE, BagFile, BagRecord, record_at
 
 # Number of consecutive plausible records that are accepted, or fewer up to the file's end.
 IN_A_ROW: Final = 3

@@ -6,8 +6,6 @@ selected chunks are examined too. A wrong time then violates the order, or belon
 chunk that contradicts it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -46,12 +44,7 @@ class BagWindow:
         return [edge for edge, asked in zip(edges, self.is_asked, strict=True) if asked]
 
     def units(
-        self,
-        file: BagFile,
-        limits: Limits,
-        connections: Collection[int],
-        *,
-        is_read: bool = True,
+        self, file: BagFile, limits: Limits, connections: Collection[int], *, is_read: bool = True
     ) -> Iterator[ChunkUnit | BagRecord | BytesBetween]:
         """Yield the units of the chunks that are read, or of the others, in stored order."""
         known = [info.at for info in self.infos]

@@ -5,8 +5,6 @@ index against the rows, the types and the order of the rows, and the file's leng
 file, common rows are read directly from the pages. All other rows are read through SQLite.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path

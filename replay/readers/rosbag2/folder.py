@@ -5,8 +5,6 @@ declared counts. If it counts more rows than the files have, the difference is d
 have more rows, a notice is added.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace

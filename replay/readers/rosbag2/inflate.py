@@ -1,7 +1,5 @@
 """Decompression of messages that rosbag2 compressed individually with zstd."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Merging of the blocks of storage files with overlapping times, by topic and time."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Contents of a ROS 2 bag folder's ``metadata.yaml``, which is a hint only."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath

@@ -1,7 +1,5 @@
 """Storage files of a ROS 2 bag folder: discovery, opening and decompression."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -6,8 +6,6 @@
 * The path is percent-encoded in the URI, so that ``run%41.db3`` opens the file of that name.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sqlite3

@@ -1,7 +1,5 @@
 """Tables of a ROS 2 SQLite bag other than the messages: topics, definitions and time index."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache

@@ -5,8 +5,6 @@ frame, so SQLite stops at the first frame that does not match. Section 4 of SQLi
 description defines the layout and the checksum.
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 from pathlib import Path

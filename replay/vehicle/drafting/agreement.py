@@ -5,8 +5,6 @@ ground, the steering wheel and the difference of the rear wheels. Each compariso
 expected error of its reference. A contradicting signal is never proposed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

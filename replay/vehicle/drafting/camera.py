@@ -1,7 +1,5 @@
 """The camera section of a drafted vehicle file, and the sections that no log can fill."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
@@ -64,7 +62,6 @@ class KnowsItsCameras(Protocol):
         Raises:
             LogFormatError: They are published but cannot be read.
         """
-        ...
 
 
 MEASURE: Final = {

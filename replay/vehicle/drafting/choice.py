@@ -1,7 +1,5 @@
 """Choice of the signals for a drafted vehicle file: the best signals without contradictions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -269,9 +269,7 @@ def _has_speed(block: Block) -> bool:
 
 
 def _series(
-    columns: Mapping[tuple[str, str], _Columns],
-    roles: Iterable[Role | None],
-    wanted: Sequence[str],
+    columns: Mapping[tuple[str, str], _Columns], roles: Iterable[Role | None], wanted: Sequence[str]
 ) -> Iterable[Series]:
     names = {"" if role is None else role.name for role in roles}
     for (topic, part), found in columns.items():

@@ -1,7 +1,5 @@
 """Conversion of rows to blocks, with an account of every message."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from typing import Final, TypeAlias

@@ -4,8 +4,6 @@ Objects for single chunks are created only on demand, so that opening a log and 
 it take the same time for logs of any length.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from threading import local
-from typing import TYPE_CHECKING, Final, TypeAlias, cast
+from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from crosscue.replay.columns import Bytes
 from crosscue.replay.files.checksum import crc32
 from crosscue.replay.readers.mcap.records import BrokenRecordError, ChunkHead
 
 if TYPE_CHECKING:
     import zstandard
 
-Bytes: TypeAlias = NDArray[np.uint8]
-
 # Values of zstandard and lz4 for frames that do not declare their size.
 UNKNOWN_SIZES: Final = (-1, 0)
-LZ4_STEP: Final = 256 << 10
+# Small steps keep what precedes damage. The lz4 library also allocates memory for each.
+STEP: Final = 256 << 10
 
 
 def inflate_chunk(body: Bytes, head: ChunkHead, room: Bytes) -> Bytes:
@@ -39,49 +38,50 @@ def inflate_chunk(body: Bytes, head: ChunkHead, room: Bytes) -> Bytes:
     """
     if len(body) != head.body_size:
         raise BrokenRecordError(f"holds {len(body)} of {head.body_size} bytes")
-    records = _WHOLE[head.compression](body, head.size, room) if len(body) else body
+    records = body
+    if head.compression and len(body):
+        done, fault = _FILL[head.compression](body, head.size, room)
+        if done > head.size:
+            fault = f"decompresses to more than the {head.size} bytes it declares"
+        if fault:
+            raise BrokenRecordError(fault)
+        records = room[:done]
     if len(records) != head.size:
         raise BrokenRecordError(f"decompressed to {len(records)} bytes, declared {head.size}")
+    return _verified(records, head)
+
+
+def inflate_prefix(body: Bytes, head: ChunkHead) -> Bytes:
+    """Decompress the start of a truncated chunk; at most ``head.size`` unverified bytes."""
+    if not head.compression or not len(body):
+        return body[: head.size]
+    room = np.empty(head.size + 1, dtype=np.uint8)
+    done, _ = _FILL[head.compression](body, head.size, room)
+    records = room[: min(done, head.size)]
+    return _verified(records, head) if len(records) == head.size else records
+
+
+def _verified(records: Bytes, head: ChunkHead) -> Bytes:
     if head.crc and crc32(records.data) != head.crc:
         raise BrokenRecordError("does not match its checksum")
     return records
 
 
-def inflate_prefix(body: Bytes, head: ChunkHead) -> Bytes:
-    """Decompress the start of a truncated chunk; at most ``head.size`` unverified bytes."""
-    if head.compression == "" or not len(body):
-        return body[: head.size]
-    give = _zstd_prefix if head.compression == "zstd" else _lz4_prefix
-    records = give(body, head.size)
-    if len(records) == head.size and head.crc and crc32(records.data) != head.crc:
-        raise BrokenRecordError("does not match its checksum")
-    return records
-
-
-def _plain(body: Bytes, size: int, records: Bytes) -> Bytes:
-    return body
-
-
-def _zstd(body: Bytes, size: int, records: Bytes) -> Bytes:
+def _fill_zstd(body: Bytes, size: int, room: Bytes) -> tuple[int, str]:
+    """Decompress up to one byte more than ``size``; return the number, and what ended it early."""
     import zstandard
 
+    done = 0
     try:
         declared = zstandard.frame_content_size(body.data)
         if declared > size:
-            raise BrokenRecordError(f"its zstd frame declares {declared} bytes, the chunk {size}")
-        # The buffer is one byte too large, so that oversized frames are detected.
-        done = 0
+            return 0, f"its zstd frame declares {declared} bytes, the chunk {size}"
         with _decompressor().stream_reader(body.data, read_across_frames=True) as stream:
-            while done <= size:
-                step = stream.readinto(records.data[done : size + 1])
-                if not step:
-                    break
+            while step := stream.readinto(room.data[done : min(done + STEP, size + 1)]):
                 done += step
     except zstandard.ZstdError as error:
-        raise BrokenRecordError(f"zstd: {error}") from None
-    if done > size:
-        raise BrokenRecordError(f"decompresses to more than the {size} bytes it declares")
-    return records[:done]
+        return done, f"zstd: {error}"
+    return done, ""
 
 
 _of_thread: Final = local()
@@ -96,7 +96,7 @@ def _decompressor() -> zstandard.ZstdDecompressor:
     return cast("zstandard.ZstdDecompressor", _of_thread.zstd)
 
 
-def _lz4(body: Bytes, size: int, records: Bytes) -> Bytes:
+def _fill_lz4(body: Bytes, size: int, room: Bytes) -> tuple[int, str]:
     import lz4.frame
 
     done, used, is_done = 0, 0, False
@@ -104,62 +104,21 @@ def _lz4(body: Bytes, size: int, records: Bytes) -> Bytes:
     try:
         declared = lz4.frame.get_frame_info(view)["content_size"]
         if declared not in (*UNKNOWN_SIZES, size):
-            raise BrokenRecordError(f"its lz4 frame declares {declared} bytes, the chunk {size}")
-        while not is_done:
-            # Small steps, because the library allocates memory each time, which is slow if large.
+            return 0, f"its lz4 frame declares {declared} bytes, the chunk {size}"
+        while not is_done and done <= size:
             step, taken, is_done = lz4.frame.decompress_chunk(
-                context, view[used:], max_length=min(size - done, LZ4_STEP) or 1
+                context, view[used:], max_length=min(size + 1 - done, STEP)
             )
             if not step and not taken:
                 break
-            if len(step) > size - done:
-                raise BrokenRecordError(f"decompresses to more than the {size} bytes it declares")
-            records[done : done + len(step)] = np.frombuffer(step, dtype=np.uint8)
+            room[done : done + len(step)] = np.frombuffer(step, dtype=np.uint8)
             done, used = done + len(step), used + taken
     except (RuntimeError, ValueError, EOFError) as error:
-        raise BrokenRecordError(f"lz4: {error}") from None
-    if not is_done:
-        raise BrokenRecordError(f"its lz4 frame does not end after {done} bytes")
-    return records[:done]
+        return done, f"lz4: {error}"
+    return done, "" if is_done else f"its lz4 frame does not end after {done} bytes"
 
 
-def _zstd_prefix(body: Bytes, size: int) -> Bytes:
-    import zstandard
-
-    records, done = np.empty(size, dtype=np.uint8), 0
-    with zstandard.ZstdDecompressor().stream_reader(body.data, read_across_frames=True) as stream:
-        try:
-            while done < size:
-                step = stream.readinto(records.data[done : done + (128 << 10)])
-                if not step:
-                    break
-                done += step
-        except zstandard.ZstdError:
-            pass  # keep the part before the damage
-    return records[:done]
-
-
-def _lz4_prefix(body: Bytes, size: int) -> Bytes:
-    import lz4.frame
-
-    stream = lz4.frame.LZ4FrameDecompressor()
-    got: list[bytes] = []
-    left, piece = size, body.tobytes()
-    try:
-        while left > 0:
-            step = stream.decompress(piece, max_length=min(left, 4 << 20))
-            got.append(step)
-            left -= len(step)
-            piece = b""
-            if stream.eof or not step:
-                break
-    except (RuntimeError, ValueError, EOFError):
-        pass  # keep the part before the damage
-    return np.frombuffer(b"".join(got), dtype=np.uint8)
-
-
-_WHOLE: Final[dict[str, Callable[[Bytes, int, Bytes], Bytes]]] = {
-    "": _plain,
-    "lz4": _lz4,
-    "zstd": _zstd,
+_FILL: Final[dict[str, Callable[[Bytes, int, Bytes], tuple[int, str]]]] = {
+    "lz4": _fill_lz4,
+    "zstd": _fill_zstd,
 }

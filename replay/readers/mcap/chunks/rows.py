@@ -18,20 +18,12 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes, Int64s
 from crosscue.replay.readers.mcap.records import (
-    ATTACHMENT,
-    CHANNEL,
-    CHUNK,
-    DATA_END,
-    FOOTER,
-    HEADER,
-    MESSAGE,
     MESSAGE_FIXED,
     MESSAGE_HEAD,
-    MESSAGE_INDEX,
     PREFIX,
-    SCHEMA,
     BrokenRecordError,
     MessageIndex,
+    Op,
     heads_at,
 )
 
@@ -117,9 +109,7 @@ def opcodes(*codes: int) -> NDArray[np.bool_]:
     return table
 
 
-NEVER_IN_A_CHUNK: Final = opcodes(
-    HEADER, FOOTER, CHUNK, MESSAGE_INDEX, ATTACHMENT, DATA_END, 0x08, 0x0A, 0x0B, 0x0C, 0x0D, 0x0E
-)
+NEVER_IN_A_CHUNK: Final = opcodes(Op.HEADER, Op.FOOTER, *range(Op.CHUNK, Op.DATA_END + 1))
 
 
 def rows_by_index(
@@ -156,7 +146,7 @@ def rows_by_index(
     stop = offset + head.size
     stop += PREFIX.size
     if (
-        np.count_nonzero(head.opcode != MESSAGE)
+        np.count_nonzero(head.opcode != Op.MESSAGE)
         or np.count_nonzero(head.number != number)
         or np.count_nonzero(head.log != log)
         or np.minimum.reduce(head.size) < MESSAGE_FIXED
@@ -239,7 +229,7 @@ def rows_by_scan(buffer: NDArray[np.uint8], stop_at: NDArray[np.bool_], max_reco
     begins, end, codes = _scan(buffer, stop_at, max_records + 1)
     if len(begins) > max_records:
         raise BrokenRecordError(f"holds more than {max_records} records")
-    is_message = codes == MESSAGE
+    is_message = codes == Op.MESSAGE
     offset = begins[is_message]
     ends = np.append(begins, end)[1:]
     after = ends[is_message]
@@ -289,7 +279,7 @@ def _scan(buffer: Bytes, stop_at: NDArray[np.bool_], max_records: int) -> tuple[
 def _definitions(
     buffer: Bytes, begins: Int64s, ends: Int64s, codes: Bytes, end: int
 ) -> tuple[list[Definition], int]:
-    wanted = ((codes == SCHEMA) | (codes == CHANNEL)) & (begins < end)
+    wanted = ((codes == Op.SCHEMA) | (codes == Op.CHANNEL)) & (begins < end)
     at = np.flatnonzero(wanted)
     if len(at) > MAX_DEFINITIONS:
         raise BrokenRecordError(f"holds more than {MAX_DEFINITIONS} schemas and channels")
@@ -299,7 +289,7 @@ def _definitions(
             begins[at].tolist(), ends[at].tolist(), codes[at].tolist(), strict=True
         )
     ]
-    messages = int(((codes == MESSAGE) & (begins < end)).sum())
+    messages = int(((codes == Op.MESSAGE) & (begins < end)).sum())
     return definitions, int((begins < end).sum()) - messages - len(definitions)
 
 
@@ -312,9 +302,9 @@ def _others(buffer: NDArray[np.uint8], begin: int, end: int) -> tuple[list[Defin
             return None
         opcode, length = PREFIX.unpack_from(view, at)
         after = at + PREFIX.size + length
-        if after > end or opcode in (0, MESSAGE) or NEVER_IN_A_CHUNK[opcode]:
+        if after > end or opcode in (0, Op.MESSAGE) or NEVER_IN_A_CHUNK[opcode]:
             return None
-        if opcode in (SCHEMA, CHANNEL):
+        if opcode in (Op.SCHEMA, Op.CHANNEL):
             found.append(Definition(at, opcode, bytes(view[at + PREFIX.size : after])))
         else:
             ignored += 1

@@ -6,8 +6,6 @@ declared time range. The search ends where another recording starts, so that the
 recording are not accepted.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np
@@ -18,16 +16,15 @@ from crosscue.replay.readers.mcap.bytes import PIECE, ByteFile
 from crosscue.replay.readers.mcap.chunks.inflate import inflate_chunk
 from crosscue.replay.readers.mcap.chunks.rows import NEVER_IN_A_CHUNK, rows_by_scan
 from crosscue.replay.readers.mcap.records import (
-    CHUNK,
     CHUNK_FIXED,
     COMPRESSIONS,
-    HEADER,
     MAGIC,
     MAX_HEAD,
     PREFIX,
     BrokenRecordError,
     ChunkHead,
     ChunkIndex,
+    Op,
     read_chunk_head,
 )
 
@@ -65,7 +62,7 @@ def find_chunk(
     Returns:
         The offset, and True for a chunk or False for a recording; None if neither is found.
     """
-    begins = MAGIC + bytes([HEADER])
+    begins = MAGIC + bytes([Op.HEADER])
     other = find_bytes(file, since, min(at + len(begins), until), begins)
     tries, piece = 0, FIRST_PIECE
     while other is None and at < until:
@@ -85,7 +82,7 @@ def find_chunk(
 def _candidates(window: Bytes, limit_at: int) -> list[int]:
     """Return offsets up to ``limit_at`` at which a chunk of plausible length may start."""
     first = window[: max(min(limit_at, len(window) - PREFIX.size - CHUNK_FIXED), 0)]
-    at = np.flatnonzero(first == CHUNK)
+    at = np.flatnonzero(first == Op.CHUNK)
     for byte in (6, 7, 8):  # no chunk has a length of 2^40 bytes
         at = at[window[at + byte] == 0]
     for byte in (1, 2, 3):  # nor a compression name of 256 characters

@@ -6,8 +6,6 @@ channel is known and its log time is within the recording. A schema or channel i
 fields fill the record exactly, or are legible (``is_definition``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -17,22 +15,16 @@ from numpy.typing import NDArray
 from crosscue.replay.readers.mcap.bytes import ByteFile
 from crosscue.replay.readers.mcap.chunks.rows import Definition, Rows
 from crosscue.replay.readers.mcap.records import (
-    ATTACHMENT,
-    CHANNEL,
-    CHUNK,
     COMPRESSIONS,
-    DATA_END,
     DATA_END_SIZE,
     MAX_HEAD,
-    MESSAGE,
     MESSAGE_FIXED,
     MESSAGE_HEAD,
-    METADATA,
     PREFIX,
-    SCHEMA,
     BrokenRecordError,
     FieldParser,
     Heads,
+    Op,
     check_metadata,
     heads_at,
     read_chunk_head,
@@ -67,7 +59,7 @@ class Plausible:
 
     def declare(self, found: Definition) -> None:
         """Learn the number of a channel."""
-        if found.opcode == CHANNEL and len(found.content) >= 2:
+        if found.opcode == Op.CHANNEL and len(found.content) >= 2:
             self._channels[int.from_bytes(found.content[:2], "little")] = True
 
     def learn(self, rows: Rows) -> None:
@@ -193,7 +185,7 @@ class McapResync:
         Returns:
             Index of the message, and the offset in the buffer of the first of these records.
         """
-        found = self._messages(rows.buffer, _kinds(rows.buffer, rows.end, MESSAGE, MESSAGE))
+        found = self._messages(rows.buffer, _kinds(rows.buffer, rows.end, Op.MESSAGE, Op.MESSAGE))
         found = found[~np.isin(found, rows.offset)]
         holder = np.searchsorted(rows.offset, found) - 1
         for begin, i in zip(found.tolist(), holder.tolist(), strict=True):
@@ -217,12 +209,12 @@ class McapResync:
         if self._has_end:
             return False
         raw = bytes(self._file.peek(at, PREFIX.size))
-        return raw == PREFIX.pack(DATA_END, DATA_END_SIZE - PREFIX.size)
+        return raw == PREFIX.pack(Op.DATA_END, DATA_END_SIZE - PREFIX.size)
 
     def _candidates(self, window: NDArray[np.uint8], limit_at: int) -> list[int]:
         """Return offsets below ``limit_at`` at which a message, schema or channel may start."""
-        at = _kinds(window, limit_at, SCHEMA, MESSAGE)
-        is_message = window[at] == MESSAGE
+        at = _kinds(window, limit_at, Op.SCHEMA, Op.MESSAGE)
+        is_message = window[at] == Op.MESSAGE
         found = np.concatenate((self._messages(window, at[is_message]), at[~is_message]))
         found.sort()
         offsets: list[int] = found.tolist()
@@ -244,20 +236,19 @@ class McapResync:
         after: int = at + PREFIX.size + length
         if after > self._end:
             return None
-        is_plausible = (
-            self.is_message(at, length) if opcode == MESSAGE else self._is_other(at, opcode, length)
-        )
-        return after if is_plausible else None
+        is_message = opcode == Op.MESSAGE
+        is_good = self.is_message(at, length) if is_message else self._is_other(at, opcode, length)
+        return after if is_good else None
 
     def _is_other(self, at: int, opcode: int, length: int) -> bool:
-        if opcode == CHUNK:
+        if opcode == Op.CHUNK:
             return self._is_chunk(at, length)
-        if opcode == ATTACHMENT:
+        if opcode == Op.ATTACHMENT:
             return length >= 36
-        if opcode not in (SCHEMA, CHANNEL, METADATA) or length > MAX_DEFINITION:
+        if opcode not in (Op.SCHEMA, Op.CHANNEL, Op.METADATA) or length > MAX_DEFINITION:
             return False
         content = self._file.read(at + PREFIX.size, length).tobytes()
-        if opcode != METADATA:
+        if opcode != Op.METADATA:
             return is_definition(Definition(at, opcode, content))
         try:
             check_metadata(content)
@@ -292,11 +283,11 @@ def is_definition(found: Definition) -> bool:
     fields = FieldParser(found.content)
     try:
         number = fields.number(2)
-        if found.opcode == CHANNEL:
+        if found.opcode == Op.CHANNEL:
             fields.take(2)
         name, encoding = (bytes(fields.take(fields.number(4))) for _ in range(2))
         fields.take(fields.number(4))
-        if found.opcode == SCHEMA and not number:
+        if found.opcode == Op.SCHEMA and not number:
             return False
         if fields.at == len(found.content):
             return True
