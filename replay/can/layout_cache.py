@@ -14,6 +14,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import fields
 from functools import cache, cached_property
 from hashlib import blake2b
 from importlib.util import find_spec
@@ -33,6 +34,7 @@ VARIABLE: Final = "CROSSCUE_DBC_CACHE"
 _ENTRY_BYTES: Final = 256 * MIB
 _ENTRIES_KEPT: Final = 64
 _HEAD: Final = b"crosscue CAN layout "
+_HEAD_FIELDS: Final = tuple(one.name for one in fields(CanMessage) if one.name != "signals")
 _MADE_BY: Final = ("database.py", "dbc_text.py", "layout.py", "layout_cache.py", "sources.py")
 
 
@@ -81,7 +83,7 @@ class LayoutEntry:
             first, *lines = body.split(b"\n")
             found = json_tree(first)
             rows = zip(found["messages"], lines, strict=True)
-            return [_message(line, *row) for row, line in rows], list(found["notices"])
+            return [_message(line, row) for row, line in rows], list(found["notices"])
         except (ValueError, KeyError, TypeError, IndexError):
             return None
 
@@ -170,42 +172,19 @@ class _StoredSignals(Sequence[CanSignal]):
 
 
 def _head(message: CanMessage) -> list[Any]:
-    return [
-        message.name,
-        message.arbitration_id,
-        message.is_extended,
-        message.length,
-        message.is_fd,
-        message.topic,
-        message.problem,
-        message.source,
-    ]
+    return [getattr(message, name) for name in _HEAD_FIELDS]
 
 
 def _signals(message: CanMessage) -> list[Any]:
-    return [
-        [
-            s.name,
-            s.start,
-            s.length,
-            s.is_big_endian,
-            s.is_signed,
-            s.is_float,
-            s.scale,
-            s.offset,
-            s.unit,
-            s.minimum,
-            s.maximum,
-            list(s.choices.items()),
-            s.is_multiplexer,
-            s.multiplexer,
-            sorted(s.branches),
-        ]
-        for s in message.signals
-    ]
+    names = [one.name for one in fields(CanSignal)]
+    return [[_stored(getattr(signal, name)) for name in names] for signal in message.signals]
 
 
-def _message(
-    line: bytes, name: str, arbitration_id: int, is_extended: bool, length: int, *rest: Any
-) -> CanMessage:
-    return CanMessage(name, arbitration_id, is_extended, length, _StoredSignals(line), *rest)
+def _stored(value: object) -> object:
+    if isinstance(value, Mapping):
+        return list(value.items())
+    return sorted(value) if isinstance(value, frozenset) else value
+
+
+def _message(line: bytes, row: Sequence[Any]) -> CanMessage:
+    return CanMessage(signals=_StoredSignals(line), **dict(zip(_HEAD_FIELDS, row, strict=True)))

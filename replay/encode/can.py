@@ -9,6 +9,7 @@ from functools import cache
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.replay.columns import ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames
 from crosscue.replay.decode.ros.plan import ParsingPlan
@@ -59,22 +60,21 @@ def can_messages(block: Block, frames: CanFrames, ledger: Ledger) -> list[Outgoi
     return out
 
 
+def _values(block: Block, frames: CanFrames) -> dict[str, NDArray[np.generic]]:
+    return {
+        "header.stamp": stamps(block),
+        "id": frames.arbitration_id,
+        "is_rtr": frames.kind == REMOTE,
+        "is_extended": frames.is_extended,
+        "is_error": frames.kind == ERROR,
+    }
+
+
 def _classic(block: Block, frames: CanFrames) -> Outgoing:
     kind, plan = standard_type("can_msgs/msg/Frame")
-    rows = filled(
-        plan,
-        template_of(plan, {"header.frame_id": block.topic}),
-        len(block),
-        {
-            "header.stamp": stamps(block),
-            "id": frames.arbitration_id,
-            "is_rtr": frames.kind == REMOTE,
-            "is_extended": frames.is_extended,
-            "is_error": frames.kind == ERROR,
-            "dlc": frames.length,
-            "data": frames.data[:, :8],
-        },
-    )
+    values = {**_values(block, frames), "dlc": frames.length, "data": frames.data[:, :8]}
+    template = template_of(plan, {"header.frame_id": block.topic})
+    rows = filled(plan, template, len(block), values)
     return Outgoing(kind, with_rows(block, rows))
 
 
@@ -88,14 +88,7 @@ def _fd(block: Block, frames: CanFrames) -> list[Outgoing]:
             plan,
             template_of(plan, {"header.frame_id": block.topic}, {"data": length}),
             len(part),
-            {
-                "header.stamp": stamps(part),
-                "id": some.arbitration_id,
-                "is_rtr": some.kind == REMOTE,
-                "is_extended": some.is_extended,
-                "is_error": some.kind == ERROR,
-                "is_fd": some.is_fd,
-            },
+            {**_values(part, some), "is_fd": some.is_fd},
             {"data": some.data[:, :length]} if length else {},
         )
         named = replace(with_rows(part, rows), topic=block.topic + FD_SUFFIX)

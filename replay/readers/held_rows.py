@@ -143,6 +143,3 @@ class CameraDrive(Closing):
             camera.report_missing(ledger)
         for numbers in self._numbers:
             numbers.report_missing(ledger)
-
-    def close(self) -> None:
-        """Do nothing, because no file stays open."""

@@ -76,9 +76,6 @@ class TextLog(Closing):
         columns = {name: table[:, i].copy() for i, name in enumerate(self.columns)}
         return Block(self.topic, np.array(t_ns, np.int64), Table(columns))
 
-    def close(self) -> None:
-        """Do nothing, because no file stays open."""
-
 
 def _lines(file: TextIO) -> Iterator[str | None]:
     """Yield every line that is not empty, with None for lines longer than ``MAX_LINE``."""

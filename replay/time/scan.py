@@ -336,23 +336,21 @@ def _segments(
         for number, epoch in enumerate(clock.epochs[1:], start=1):
             if any(abs(other.begins_ns - epoch.begins_ns) <= SAME_NS for other in found[1:]):
                 continue
-            first_ns, last_ns = one.first_ns[number], one.last_ns[number]
-            event = one.events[number - 1]
-            found.append(
-                TimeSegment(
-                    0,
-                    epoch.begins_ns,
-                    first_ns + epoch.shift_ns,
-                    last_ns + epoch.shift_ns,
-                    first_ns,
-                    last_ns,
-                    Cause.SET_BACK,
-                    by_ns=event.after_ns - event.before_ns,
-                    breaks_odometry=False,
-                )
-            )
+            run = _Run(0, one.first_ns[number], one.last_ns[number])
+            found.append(replace(_set_back(one, number, run, epoch), breaks_odometry=False))
     found.sort(key=lambda segment: segment.begins_ns)
     return tuple(replace(segment, number=number) for number, segment in enumerate(found))
+
+
+def _segment(begins_ns: int, run: _Run, epoch: Epoch, cause: Cause) -> TimeSegment:
+    first_ns, last_ns = run.first_ns + epoch.shift_ns, run.last_ns + epoch.shift_ns
+    return TimeSegment(0, begins_ns, first_ns, last_ns, run.first_ns, run.last_ns, cause)
+
+
+def _set_back(one: _Aligned, number: int, run: _Run, epoch: Epoch) -> TimeSegment:
+    event = one.events[number - 1]
+    segment = _segment(epoch.begins_ns, run, epoch, Cause.SET_BACK)
+    return replace(segment, by_ns=event.after_ns - event.before_ns)
 
 
 def _in_epochs(one: _Aligned, topic: str, runs: Sequence[_Run]) -> Iterator[tuple[int, _Run]]:
@@ -380,40 +378,16 @@ def _of_wheels(
         epoch = clock.epochs[number]
         first_ns, last_ns = run.first_ns + epoch.shift_ns, run.last_ns + epoch.shift_ns
         if not found:
-            found.append(
-                TimeSegment(0, BEGINNING, first_ns, last_ns, run.first_ns, run.last_ns, Cause.START)
-            )
+            found.append(_segment(BEGINNING, run, epoch, Cause.START))
         elif number != epoch_before:
-            event = one.events[number - 1]
-            found.append(
-                TimeSegment(
-                    0,
-                    epoch.begins_ns,
-                    first_ns,
-                    last_ns,
-                    run.first_ns,
-                    run.last_ns,
-                    Cause.SET_BACK,
-                    by_ns=event.after_ns - event.before_ns,
-                )
-            )
+            found.append(_set_back(one, number, run, epoch))
         elif first_ns - found[-1].end_ns <= limit_ns:
             end_ns = max(found[-1].end_ns, last_ns)
             found[-1] = replace(found[-1], end_ns=end_ns, log_end_ns=end_ns - epoch.shift_ns)
         else:
             end_ns = found[-1].end_ns
             begins_ns = max(end_ns + 1, first_ns - limit_ns)
-            found.append(
-                TimeSegment(
-                    0,
-                    begins_ns,
-                    first_ns,
-                    last_ns,
-                    run.first_ns,
-                    run.last_ns,
-                    Cause.SILENCE,
-                    gap_ns=first_ns - end_ns,
-                )
-            )
+            silent = _segment(begins_ns, run, epoch, Cause.SILENCE)
+            found.append(replace(silent, gap_ns=first_ns - end_ns))
         epoch_before = number
     return found

@@ -2,9 +2,8 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -68,7 +67,7 @@ class LogWriter:
         self.types: dict[str, str] = {}
         """Types by topic name in the file."""
         self._ledger = ledger
-        self._encoders = Encoders()
+        self._types = OwnTypes()
         self._known: dict[str, Encoder | str] = {}
         self._details: dict[str, str] = {}
         self._from: dict[str, str] = {}
@@ -82,7 +81,7 @@ class LogWriter:
         if topic.name in self._known:
             return not isinstance(self._known[topic.name], str)
         try:
-            encoder: Encoder | str = self._encoders.encoder_for(topic) or why_not_decoded(
+            encoder: Encoder | str = encoder_for(topic, self._types) or why_not_decoded(
                 topic, NO_TYPE
             )
             self._details[topic.name] = f"{topic.type_name} ({topic.encoding})"
@@ -158,13 +157,8 @@ class LogWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._mcap.__exit__(kind, error, trace)
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+        self._mcap.__exit__(kind, *rest)
 
 
 @runtime_checkable
@@ -177,24 +171,18 @@ class Walking(Protocol):
         """Return the fields of the messages that fit, and their row numbers in the block."""
 
 
-@dataclass(slots=True)
-class Encoders:
-    """Encoders of the topics of one file, which share its own types."""
+def encoder_for(topic: Topic, types: OwnTypes) -> Encoder | None:
+    """Return the encoder of ``topic``; None if its type is unknown, so ROS 2 cannot store it.
 
-    types: OwnTypes = field(default_factory=OwnTypes)
-
-    def encoder_for(self, topic: Topic) -> Encoder | None:
-        """Return the encoder of ``topic``; None if its type is unknown, so ROS 2 cannot store it.
-
-        Raises:
-            SchemaError: Its definition is damaged.
-        """
-        if topic.encoding == "cdr":
-            return _cdr(topic)
-        if topic.encoding == "ros1":
-            return ros1_to_cdr(topic)
-        decoder = decoder_for(topic)
-        return None if decoder is None else _Columns(decoder, self.types)
+    Raises:
+        SchemaError: Its definition is damaged.
+    """
+    if topic.encoding == "cdr":
+        return _cdr(topic)
+    if topic.encoding == "ros1":
+        return ros1_to_cdr(topic)
+    decoder = decoder_for(topic)
+    return None if decoder is None else _Columns(decoder, types)
 
 
 def _cdr(topic: Topic) -> Encoder | None:

@@ -109,9 +109,6 @@ class BlfLog(Closing):
         """The buses found so far: those in the first containers, or all buses after a pass."""
         return tuple(bus_topic(name) for name in self._names)
 
-    def close(self) -> None:
-        """Do nothing, because no file stays open between passes."""
-
     def report_missing(self, ledger: Ledger) -> None:
         """Report that the file is shorter than the header declares; see ``KnowsItsEnd``."""
         declared, size = self._header.file_bytes, self.path.stat().st_size

@@ -226,9 +226,6 @@ class TextCanLog(Closing):
         """The buses found so far: those in the first chunk, or all buses after a pass."""
         return tuple(bus_topic(name) for name in self._names)
 
-    def close(self) -> None:
-        """Do nothing, because no file stays open between passes."""
-
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """Yield all frames, chunk by chunk; see ``Log.read``."""
         keep_memory()

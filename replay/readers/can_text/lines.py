@@ -6,15 +6,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .digits import BACK, FRONT, Words, byte_words
-
-Bytes: TypeAlias = NDArray[np.uint8]
-Int64s: TypeAlias = NDArray[np.int64]
+from .digits import BACK, FRONT, Bytes, Int64s, Words, byte_words
 
 CHUNK_BYTES: Final = 1 << 20
 NEWLINE: Final = 10

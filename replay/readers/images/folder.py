@@ -51,9 +51,6 @@ class ImageFolder(Closing):
         """Record of the files read, for a seal."""
         return self._pictures.touched
 
-    def close(self) -> None:
-        """Do nothing, because no file stays open."""
-
 
 def open_images(path: Path, limits: Limits) -> ImageFolder:
     """Open a folder of images; see ``crosscue.replay.formats.FORMATS``.

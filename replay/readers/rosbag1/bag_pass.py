@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -67,10 +67,7 @@ class Roster:
     def topics(self) -> tuple[Topic, ...]:
         """Return all topics known so far, with the counts declared in the index section."""
         counts = self._declared()
-        return tuple(
-            Topic(t.name, t.type_name, t.encoding, t.schema, t.schema_encoding, counts.get(t.name))
-            for t in self._topics.values()
-        )
+        return tuple(replace(t, declared=counts.get(t.name)) for t in self._topics.values())
 
     def topic_of(self, conn: int) -> str:
         """Return the topic of a connection; empty if unknown."""
@@ -136,13 +133,14 @@ class _Checked:
 
 @dataclass(slots=True)
 class _Batch:
-    """Rows of several chunks, collected for the next blocks."""
+    """Rows of several chunks, collected for the next blocks.
+
+    Attributes:
+        parts: Shape (4, N) each: connection, log time, start and stop of the payload.
+    """
 
     buffer: Bytes | None = None
-    conn: list[Int64s] = field(default_factory=list)
-    log_ns: list[Int64s] = field(default_factory=list)
-    start: list[Int64s] = field(default_factory=list)
-    stop: list[Int64s] = field(default_factory=list)
+    parts: list[Int64s] = field(default_factory=list)
     size: int = 0
     count: int = 0
 
@@ -158,10 +156,8 @@ class _Batch:
             self.buffer = content if is_large else np.empty(BATCH_BYTES, dtype=np.uint8)
         if self.buffer is not content:
             self.buffer[self.size : self.size + len(raw)] = content
-        self.conn.append(rows.conn)
-        self.log_ns.append(rows.log_ns)
-        self.start.append(rows.start + self.size)
-        self.stop.append(rows.stop + self.size)
+        starts, stops = rows.start + self.size, rows.stop + self.size
+        self.parts.append(np.stack((rows.conn, rows.log_ns, starts, stops)))
         self.size += len(raw)
         self.count += len(rows.conn)
 
@@ -470,7 +466,8 @@ class Pass:
         batch, self._batch = self._batch, _Batch()
         if batch.buffer is None or not batch.count:
             return
-        conn = np.concatenate(batch.conn)
+        columns = np.concatenate(batch.parts, axis=1)
+        conn = columns[0]
         names: list[str] = []
         place: dict[int, int] = {}
         for number, count in tally(conn).items():
@@ -484,9 +481,7 @@ class Pass:
                 place[number] = names.index(name)
         topic = _looked_up(conn, place)
         keep = topic >= 0
-        columns = (np.concatenate(c) for c in (batch.log_ns, batch.start, batch.stop))
-        log_ns, start, stop = (column[keep] for column in columns)
-        rows = MixedRows(batch.buffer[: batch.size], topic[keep], log_ns, start, stop)
+        rows = MixedRows(batch.buffer[: batch.size], topic[keep], *columns[1:, keep])
         yield from blocks_of(rows, names, self._selection, self._limits, self._ledger)
 
 

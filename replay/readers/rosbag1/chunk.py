@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import bz2
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -49,6 +49,7 @@ _FIRST_RUN: Final = 16
 _IN_A_ROW: Final = 3
 _DAY_NS: Final = 86_400 * 10**9
 _LONGEST_RUN: Final = 65_536
+_NO_STEPS: Final = np.empty((5, 0), np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,29 +269,20 @@ def _connections_between(raw: bytes, at: int, stop: int, largest: int) -> list[C
 
 @dataclass(slots=True)
 class _Steps:
-    """Rows collected while stepping through a chunk."""
+    """Rows collected while stepping through a chunk.
 
-    at: list[Int64s] = field(default_factory=list)
-    conn: list[Int64s] = field(default_factory=list)
-    log_ns: list[Int64s] = field(default_factory=list)
-    start: list[Int64s] = field(default_factory=list)
-    stop: list[Int64s] = field(default_factory=list)
+    Attributes:
+        parts: Shape (5, N) each: record, connection, log time, start and stop of the payload.
+        connections: Connection records.
+    """
+
+    parts: list[Int64s] = field(default_factory=list)
     connections: list[Connection] = field(default_factory=list)
-    count: int = 0
 
-    def add(self, at: Int64s, conn: Int64s, log_ns: Int64s, start: Int64s, stop: Int64s) -> None:
-        self.at.append(at)
-        self.conn.append(conn)
-        self.log_ns.append(log_ns)
-        self.start.append(start)
-        self.stop.append(stop)
-        self.count += len(at)
-
-    def drop_last(self, stop: int) -> None:
-        """Remove the last row if it ends at ``stop``, because its length is not confirmed."""
-        if self.stop and len(self.stop[-1]) and self.stop[-1][-1] == stop:
-            for column in (self.at, self.conn, self.log_ns, self.start, self.stop):
-                column[-1] = column[-1][:-1]
+    def last(self, stop: int) -> int | None:
+        """Return the offset of the last row if it ends at ``stop``, else None."""
+        part = self.parts[-1] if self.parts else _NO_STEPS
+        return int(part[0, -1]) if part.shape[1] and part[4, -1] == stop else None
 
 
 def _by_steps(
@@ -319,31 +311,17 @@ def _by_steps(
         is_tail_of_cut = inflated.fault == CUT and onward is None
         if fault_at < 0:
             fault, fault_at = fault or DAMAGED_BYTES, at
-        if not is_tail_of_cut and (entries is None or at not in entries.offset):
-            steps.drop_last(at)
+        is_confirmed = entries is not None and at in entries.offset
+        if not is_tail_of_cut and not is_confirmed and steps.last(at) is not None:
+            steps.parts[-1] = steps.parts[-1][:, :-1]  # its length is not confirmed
         if onward is None:
             break
         at = onward
-    rows = _joined(steps, fault, fault_at)
+    offsets, conn, log_ns, start, stop = np.concatenate([_NO_STEPS, *steps.parts], axis=1)
+    rows = ChunkRows(conn, log_ns, start, stop, tuple(steps.connections), fault, fault_at)
     if entries is None or inflated.is_checked:
         return rows
-    return _without_disputed(raw, rows, _all(steps.at), entries)
-
-
-def _joined(steps: _Steps, fault: str, fault_at: int) -> ChunkRows:
-    return ChunkRows(
-        _all(steps.conn),
-        _all(steps.log_ns),
-        _all(steps.start),
-        _all(steps.stop),
-        tuple(steps.connections),
-        fault,
-        fault_at,
-    )
-
-
-def _all(parts: list[Int64s]) -> Int64s:
-    return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
+    return _without_disputed(raw, rows, offsets, entries)
 
 
 def _run_of_messages(raw: bytes, at: int, steps: _Steps, max_count: int) -> tuple[int, int]:
@@ -365,10 +343,8 @@ def _run_of_messages(raw: bytes, at: int, steps: _Steps, max_count: int) -> tupl
     offsets = np.array(places, dtype=np.int64)
     heads = _heads(np.frombuffer(raw, dtype=np.uint8), offsets, layout)
     good = len(places) if heads.fits.all() else int(np.argmin(heads.fits))
-    part = slice(0, good)
-    steps.add(
-        offsets[part], heads.conn[part], heads.log_ns[part], offsets[part] + _HEAD, heads.stop[part]
-    )
+    columns = (offsets, heads.conn, heads.log_ns, offsets + _HEAD, heads.stop)
+    steps.parts.append(np.stack(columns)[:, :good])
     return good, int(heads.stop[good - 1])
 
 
@@ -379,7 +355,7 @@ def _one_record(raw: bytes, at: int, steps: _Steps, largest: int) -> int | None:
         return None
     if record.op == MESSAGE:
         columns = (at, record.u32(b"conn"), record.time_ns(b"time"), record.body, record.end)
-        steps.add(*(np.array([value], dtype=np.int64) for value in columns))
+        steps.parts.append(np.array(columns, dtype=np.int64)[:, None])
         return record.end
     if record.op != CONNECTION:
         return None
@@ -406,11 +382,10 @@ def _next_plausible(raw: bytes, at: int, steps: _Steps) -> int | None:
 
     The message that led to ``at`` may have a damaged length, so the search starts inside it.
     """
-    begin = at + 1
-    if steps.stop and len(steps.stop[-1]) and steps.stop[-1][-1] == at:
-        begin = int(steps.at[-1][-1]) + 1
-    known = {int(conn) for part in steps.conn for conn in np.unique(part)}
-    last_ns = next((int(part[-1]) for part in reversed(steps.log_ns) if len(part)), None)
+    last = steps.last(at)
+    begin = (at if last is None else last) + 1
+    known = {int(conn) for part in steps.parts for conn in np.unique(part[1])}
+    last_ns = next((int(part[2, -1]) for part in reversed(steps.parts) if part.shape[1]), None)
     found = raw.find(_U32.pack(_HEADER), begin)
     while found >= 0:
         if _is_consecutive(raw, found, known, last_ns):
@@ -461,7 +436,5 @@ def _without_disputed(raw: bytes, rows: ChunkRows, at: Int64s, entries: Entries)
                 is_bad[covering] = True
     if not is_bad.any():
         return rows
-    keep = ~is_bad
     fault_at = int(at[np.argmax(is_bad)]) if rows.fault_at < 0 else rows.fault_at
-    columns = (rows.conn[keep], rows.log_ns[keep], rows.start[keep], rows.stop[keep])
-    return ChunkRows(*columns, rows.connections, rows.fault or DISAGREES, fault_at)
+    return replace(rows.take(~is_bad), fault=rows.fault or DISAGREES, fault_at=fault_at)

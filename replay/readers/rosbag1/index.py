@@ -21,13 +21,10 @@ from .records import (
     chunk_info_of,
     connection_of,
     join_index_records,
-    record_at,
 )
 from .resync import BagResync
 
 ENTRY_BYTES: Final = 12
-_SEARCHED_AT_ONCE: Final = 4 << 20
-_CHUNK_OP: Final = b"\x04\x00\x00\x00op=\x05"
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +120,7 @@ def units(
     while at < file.size:
         record = file.record(at)
         if record is not None and record.op == CHUNK:
-            unit = _chunk_unit(file, record, known, limits, resync)
+            unit = _chunk_unit(file, record, limits, resync)
             yield unit
             at = unit.end
         elif record is not None and resync.is_believed(record):
@@ -136,9 +133,7 @@ def units(
             at = stop
 
 
-def _chunk_unit(
-    file: BagFile, record: BagRecord, known: list[int], limits: Limits, resync: BagResync
-) -> ChunkUnit:
+def _chunk_unit(file: BagFile, record: BagRecord, limits: Limits, resync: BagResync) -> ChunkUnit:
     is_plain = record.fields[b"compression"] == b"none"
     ends = [record.end, record.body + record.u32(b"size")] if is_plain else [record.end]
     for end in ends:
@@ -148,7 +143,7 @@ def _chunk_unit(
             entries, after = _index_records(file, end, limits)
             return ChunkUnit(record, end, True, after, entries)
     # The records of an uncompressed chunk would be mistaken for records outside chunks.
-    onward = next_chunk(file, record.body, known) if is_plain else resync.next(record.body)
+    onward = resync.next_chunk(record.body) if is_plain else resync.next(record.body)
     stop = file.size if onward is None else onward
     if record.end <= stop and record.u32(b"size") == record.size:
         return ChunkUnit(record, record.end, is_framed=True, end=record.end)
@@ -171,35 +166,6 @@ def _index_records(file: BagFile, at: int, limits: Limits) -> tuple[Entries | No
             is_sound = False
         at = record.end
     return (join_index_records(parts) if is_sound and parts else None), at
-
-
-def next_chunk(file: BagFile, at: int, known: list[int]) -> int | None:
-    """Return the start of the next chunk at or after ``at``, by the index or by search."""
-    for place in known:
-        if place >= at and (record := file.record(place)) is not None and record.op == CHUNK:
-            return place
-    return _searched_chunk(file, at)
-
-
-def _searched_chunk(file: BagFile, at: int) -> int | None:
-    """Find the first chunk header at or after ``at`` by its operation field."""
-    while at < file.size:
-        window = file.bytes_at(at, at + _SEARCHED_AT_ONCE + 256)
-        found = -1
-        while (found := window.find(_CHUNK_OP, found + 1)) >= 0:
-            for start in range(max(0, found - 128), found):
-                if _heads_chunk(window, start, found) and file.whole_record(at + start):
-                    return at + start
-        at += _SEARCHED_AT_ONCE
-    return None
-
-
-def _heads_chunk(window: bytes, start: int, op_at: int) -> bool:
-    length = int.from_bytes(window[start : start + 4], "little")
-    if not op_at + len(_CHUNK_OP) <= start + 4 + length <= start + 256:
-        return False
-    record = record_at(window, start)
-    return record is not None and record.op == CHUNK
 
 
 def scan_records(file: BagFile, first: int, limits: Limits) -> Contents:

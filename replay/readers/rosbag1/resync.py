@@ -7,7 +7,7 @@ plausible by their kinds, sizes, connections and times.
 """
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Final
 
 from .records import BAG_HEADER, CHUNK, CHUNK_INFO, INDEX, MESSAGE, BagFile, BagRecord, record_at
@@ -16,6 +16,7 @@ from .records import BAG_HEADER, CHUNK, CHUNK_INFO, INDEX, MESSAGE, BagFile, Bag
 IN_A_ROW: Final = 3
 _SEARCHED_AT_ONCE: Final = 4 << 20
 _OP: Final = b"\x04\x00\x00\x00op="
+_CHUNK_OP: Final = _OP + bytes([CHUNK])
 _BEFORE_OP: Final = 128
 # Maximum header length of a record at which reading resumes.
 _HEADER_MAX: Final = 256
@@ -56,13 +57,27 @@ class BagResync:
 
     def next(self, at: int) -> int | None:
         """Return the offset at or after ``at`` at which reading resumes; None if none exists."""
-        place = next((k for k in self._known if k >= at and self._is_chunk(k)), None)
-        found = self._searched(at, self._file.size if place is None else place)
+        place = self._known_chunk(at)
+        stop = self._file.size if place is None else place
+        found = self._searched(at, stop, _OP, self._goes_on)
         return place if found is None else found
+
+    def next_chunk(self, at: int) -> int | None:
+        """Return the start of the next chunk at or after ``at``, by the index or by search."""
+        place = self._known_chunk(at)
+        if place is not None:
+            return place
+        return self._searched(at, self._file.size, _CHUNK_OP, self._is_whole_chunk)
+
+    def _known_chunk(self, at: int) -> int | None:
+        return next((k for k in self._known if k >= at and self._is_chunk(k)), None)
 
     def _is_chunk(self, at: int) -> bool:
         record = self._file.record(at)
         return record is not None and record.op == CHUNK
+
+    def _is_whole_chunk(self, at: int) -> bool:
+        return self._is_chunk(at) and self._file.whole_record(at) is not None
 
     def is_head(self, at: int) -> bool:
         """Return whether a record starts at ``at``, possibly with a damaged header."""
@@ -70,16 +85,18 @@ class BagResync:
             self._file.bytes_at(at, at + _HEADER_MAX)
         )
 
-    def _searched(self, at: int, stop: int) -> int | None:
-        """Return the start of the first plausible records from ``at`` on and before ``stop``."""
+    def _searched(
+        self, at: int, stop: int, op: bytes, is_wanted: Callable[[int], bool]
+    ) -> int | None:
+        """Return the first record from ``at`` on and before ``stop`` with this field, if wanted."""
         while at < stop:
             window = self._file.bytes_at(at, at + _SEARCHED_AT_ONCE + _HEADER_MAX)
             found = -1
-            while (found := window.find(_OP, found + 1)) >= 0:
+            while (found := window.find(op, found + 1)) >= 0:
                 for start in range(max(0, found - _BEFORE_OP), found):
                     if at + start >= stop:
                         return None
-                    if _heads_record(window, start, found) and self._goes_on(at + start):
+                    if _heads_record(window, start, found + len(op)) and is_wanted(at + start):
                         return at + start
             at += _SEARCHED_AT_ONCE
         return None
@@ -113,9 +130,9 @@ class BagResync:
         return near_ns is None or abs(record.time_ns(b"time") - near_ns) <= _DAY_NS
 
 
-def _heads_record(window: bytes, start: int, op_at: int) -> bool:
+def _heads_record(window: bytes, start: int, op_end: int) -> bool:
     length = int.from_bytes(window[start : start + 4], "little")
-    if not op_at + len(_OP) <= start + 4 + length <= start + _HEADER_MAX:
+    if not op_end <= start + 4 + length <= start + _HEADER_MAX:
         return False
     return record_at(window, start) is not None
 

@@ -102,9 +102,6 @@ class FolderLog(Closing):
         for hint in self._absent():
             ledger.drop("", MISSING, hint.count, hint.name)
 
-    def close(self) -> None:
-        """Do nothing, because no file stays open between passes."""
-
     def _stream(
         self, split: Split, ledger: Ledger, selection: Selection, stack: ExitStack
     ) -> StorageStream:

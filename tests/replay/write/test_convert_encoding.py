@@ -19,8 +19,9 @@ from crosscue.replay.columns import Block, CanFrames, Images, Messages, Rows, Ta
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.refuse import MISFIT
 from crosscue.replay.encode.outgoing import TIME_MISFIT, Outgoing
+from crosscue.replay.encode.tables import OwnTypes
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.write.convert import Encoders
+from crosscue.replay.write.convert import encoder_for
 from support.data import shared
 from support.mcap_damage import sound_parts
 from support.mcap_files import McapFile, channel, header, message, read_back, record, schema
@@ -40,7 +41,7 @@ QUICK = settings(max_examples=40, deadline=None)
 
 
 def encoded(topic: Topic, block: Block, ledger: Ledger | None = None) -> list[Outgoing]:
-    encoder = Encoders().encoder_for(topic)
+    encoder = encoder_for(topic, OwnTypes())
     assert encoder is not None
     return encoder(block, ledger or Ledger("made"))
 
