@@ -25,7 +25,7 @@ from crosscue.eval.scoring.by_drive import (
     direction,
     no_longer_scored,
 )
-from crosscue.eval.scoring.intervals import TOO_FEW
+from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.replay.errors import UnreadableRunError, UsageError
 from crosscue.replay.files import door
@@ -34,7 +34,7 @@ from crosscue.replay.limits import MIB
 from crosscue.replay.safe_text import counted, visible
 from crosscue.results import HIDDEN, Result
 
-from .paired import FALSE_ALARMS, MIN_PLACES, PairedMetric, Verdict, compare_drives
+from .paired import FALSE_ALARMS, PairedMetric, Verdict, compare_drives
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -506,8 +506,8 @@ def _verdict_lines(found: Comparison, differing: int) -> Iterator[str]:
     where = "on both sides" if found.is_many else "in both runs"
     yield f"drives     {both} {where}" + (left_out if only_first or only_second else "")
     places = max((one.places for one in found.judged), default=0)
-    if differing and places < MIN_PLACES:
-        yield f"           too few places: {places}, {MIN_PLACES} wanted for a verdict"
+    if differing and places < MIN_CLUSTERS:
+        yield f"           too few places: {places}, {MIN_CLUSTERS} wanted for a verdict"
     elif differing:
         yield (
             f"           a metric that did not change gets a verdict in at most "

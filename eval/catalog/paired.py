@@ -38,8 +38,6 @@ from crosscue.replay.columns import Floats, Int64s
 
 # Max fraction of comparisons in which any unchanged metric gets a verdict.
 FALSE_ALARMS: Final = 0.05
-# With five places, no p value is below 2 / 32, so nothing would ever be decided.
-MIN_PLACES: Final = 6
 # Above this, the number of places that would decide is not printed.
 MAX_PLACES: Final = 1_000_000
 FIXED_POINT_STEPS: Final = 6
@@ -70,8 +68,7 @@ class PairedMetric:
         better: Good direction of the metric.
         drives: Number of drives with rows in at least one run.
         places: Number of their places.
-        low: Lower end of the 95 % interval of after minus before, over places; NaN below four
-            places.
+        low: Lower end of the 95 % interval of after minus before, over places; NaN below six.
         high: Upper end of the interval.
         p: p value, corrected for all metrics.
         could_see: The smallest loss that 80 % of simulated repetitions find (``power``); infinite
@@ -138,7 +135,7 @@ def compare_drives(
     enough = {
         path: one
         for path, one in effects.items()
-        if one.residuals.any() and np.count_nonzero(one.weights) >= MIN_PLACES
+        if one.residuals.any() and np.count_nonzero(one.weights) >= MIN_CLUSTERS
     }
     could_see = detectable(enough, swaps, FALSE_ALARMS)
     return tuple(
@@ -262,12 +259,12 @@ def _judged(
     difference = after - before
     places = int(np.count_nonzero(effects.weights))
     half = math.nan
-    if places >= MIN_CLUSTERS:
+    if is_enough := places >= MIN_CLUSTERS:
         squares = float((effects.residuals**2).sum())
         half = effects.half * math.sqrt(places / (places - 1) * squares)
     allowed = allowed_of(path, before)
-    verdict: Verdict = "undecided" if places >= MIN_PLACES else "too few places"
-    if p <= FALSE_ALARMS and places >= MIN_PLACES and half < abs(difference):
+    verdict: Verdict = "undecided" if is_enough else "too few places"
+    if p <= FALSE_ALARMS and half < abs(difference):
         if effects.sign * difference < 0.0:
             verdict = "better"
         elif abs(difference) - half > allowed:
@@ -297,15 +294,15 @@ def _more_places(could_see: float, difference: float, places: int) -> int | None
 
     The detectable difference falls as 1 / sqrt(places), and with the quantiles of Student's t.
     """
-    if places < MIN_PLACES:
-        return MIN_PLACES - places
+    if places < MIN_CLUSTERS:
+        return MIN_CLUSTERS - places
     if not math.isfinite(could_see):
         return None
     enough = float(places)
     for _ in range(FIXED_POINT_STEPS):
         if enough > MAX_PLACES:
             return None
-        quantiles = [_t(n - 1, 0.95) + _t(n - 1, 0.6) for n in (max(enough, MIN_PLACES), places)]
+        quantiles = [_t(n - 1, 0.95) + _t(n - 1, 0.6) for n in (max(enough, MIN_CLUSTERS), places)]
         enough = places * (could_see * quantiles[0] / quantiles[1] / difference) ** 2
     return max(math.ceil(enough) - places, 1)
 
@@ -390,9 +387,10 @@ def detectable(effects: Mapping[str, Effects], swaps: Floats, alarms: float) -> 
     """
     if not effects:
         return {}
-    signs = 1.0 - 2.0 * swaps[:TRIED]
-    places = signs.shape[1]
     rng = np.random.default_rng(SEED)
+    # Drawn, because all swaps in order begin with those of the first places only.
+    signs = 1.0 - 2.0 * swaps[np.append(0, 1 + rng.permutation(len(swaps) - 1)[: TRIED - 1])]
+    places = signs.shape[1]
     normal = rng.normal(0.0, 1.0, (REPETITIONS, places, places))
     scales = np.sqrt((places - 1.0) / rng.chisquare(places - 1, REPETITIONS))
     normal *= scales[:, None, None]

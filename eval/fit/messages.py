@@ -161,7 +161,7 @@ class _SideRate(NamedTuple):
     Attributes:
         rate: Mean over places; NaN without places.
         wilson: Interval from the number of independent observations, rounded to an integer.
-        places: Interval over places; NaN for fewer than four.
+        places: Interval over places; NaN for fewer than six.
     """
 
     rate: float

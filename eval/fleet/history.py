@@ -20,12 +20,12 @@ from crosscue.eval.report.svg_plot import Panel, SvgChart, ticks
 from crosscue.eval.scoring.by_drive import DriveMetric, Kind, direction
 from crosscue.eval.scoring.change_points import (
     FALSE_ALARMS,
-    MIN_PLACES,
     SHUFFLES,
     ChangePoint,
     Results,
     change_points,
 )
+from crosscue.eval.scoring.intervals import MIN_CLUSTERS
 from crosscue.eval.scoring.places import group_drives
 from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import EmptyResultError, OutputError
@@ -148,7 +148,7 @@ class VersionPoint:
 
     Attributes:
         value: Value pooled over the version's drives; NaN if no drive has the metric.
-        low: Lower end of the 95 % interval over places; NaN below four places.
+        low: Lower end of the 95 % interval over places; NaN below six places.
         high: Upper end of the interval.
         drives: Number of drives pooled.
     """
@@ -271,7 +271,7 @@ def limits() -> dict[str, object]:
     return {
         "shuffles": SHUFFLES,
         "alarms": round(100.0 * FALSE_ALARMS),
-        "min_places": MIN_PLACES,
+        "min_places": MIN_CLUSTERS,
     }
 
 

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import Int64s
 
+from .intervals import MIN_CLUSTERS
+
 FALSE_ALARMS: Final = 0.05
-# Min number of places with results on both sides of a split, as in a comparison.
-MIN_PLACES: Final = 6
 SHUFFLES: Final = 1000
 SEED: Final = 0
 ROUNDING: Final = 1e-9
@@ -174,7 +174,7 @@ def _split_weights(is_known: NDArray[np.bool_], of: Results) -> NDArray[np.float
         sides = [is_known & (place < split), is_known & (place >= split)]
         counts = [side.sum(axis=1) for side in sides]
         both = (counts[0] > 0) & (counts[1] > 0) & (weights > 0.0)
-        if len(np.unique(of.places[both])) < MIN_PLACES:
+        if len(np.unique(of.places[both])) < MIN_CLUSTERS:
             continue
         fraction = np.where(both, weights, 0.0) / weights[both].sum()
         before, after = (

@@ -16,9 +16,9 @@ has fewer degrees of freedom, by the clusters' kurtosis (Satterthwaite, *Biometr
 1946).
 
 From twelve clusters on, intervals of fractions cover 93 to 97 % for correlations within clusters of
-up to 0.4, and at most 98 % beyond (``benchmarks/interval_coverage``). With four to six, coverage
-depends on the correlation, which so few hardly show: 96 to 99 % at 0.05, 90 to 95 % at 0.6
-(fractions of 0.5 and 0.8). A smaller quantile would lower both.
+up to 0.4, and at most 98 % beyond; over six to eight, 92 to 98 %, and 89 % at worst
+(``benchmarks/interval_coverage``). There is none over fewer, whose coverage would depend on the
+correlation, which so few hardly show.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 CONFIDENCE: Final = 0.95
-MIN_CLUSTERS: Final = 4
+# Over fewer, coverage depends on a correlation that they hardly show, and no swap of them decides.
+MIN_CLUSTERS: Final = 6
 # Minimum number of clusters whose kurtosis is estimated.
 KURTOSIS_CLUSTERS: Final = 8
 # Text in place of an interval over too few places.
@@ -57,7 +58,7 @@ class Proportion:
         low: Lower end of Wilson's interval, which assumes independent counts.
         high: Upper end of Wilson's interval.
         clusters: Number of places that the counts come from.
-        clusters_low: Lower end of the interval over clusters; NaN for fewer than four.
+        clusters_low: Lower end of the interval over clusters; NaN for fewer than six.
         clusters_high: Upper end of the interval over clusters.
     """
 
@@ -77,8 +78,8 @@ class Mean:
 
     Attributes:
         value: Mean; NaN without rows.
-        low: Lower end; NaN for fewer than four clusters.
-        high: Upper end; NaN for fewer than four clusters.
+        low: Lower end; NaN for fewer than six clusters.
+        high: Upper end; NaN for fewer than six clusters.
         of: Number of rows.
         clusters: Number of places.
     """

@@ -39,8 +39,8 @@ def test_wilson_interval_is_nan_without_data_and_refuses_impossible_counts() -> 
 
 
 def test_repeated_frames_narrow_wilson_interval_but_not_interval_over_drives() -> None:
-    right = np.array([True, True, False, True, False])
-    drives = np.arange(5)
+    right = np.array([True, True, False, True, False, True])
+    drives = np.arange(6)
     few = fraction(right, drives)
     many = fraction(np.repeat(right, 100), np.repeat(drives, 100))
 
