@@ -41,7 +41,7 @@ def a_run(rng: np.random.Generator, places: int, each: int, loss: float = 0.0) -
                 right = float(rng.binomial(rows, rate))
                 found.append(DriveMetric(log, f"cues.{name}", "mean", right, rows, at))
             error_m = 2.0 * math.exp(own) * rng.chisquare(20) / 20.0
-            found.append(DriveMetric(log, "range.rmse_m", "rms", 20.0 * error_m**2, 20.0, at))
+            found.append(DriveMetric(log, "range.rmse_m", "rms", 20.0 * error_m**2, 20, at))
     return found
 
 
