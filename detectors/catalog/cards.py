@@ -14,7 +14,13 @@ from crosscue.detectors.catalog.architectures import WEIGHTS_SUFFIXES
 from crosscue.detectors.catalog.class_names import COCO_80, COCO_90, class_names_given
 from crosscue.detectors.catalog.draft import Draft, draft_card_text
 from crosscue.detectors.catalog.places import card_named
-from crosscue.detectors.catalog.recognise import closed, guesses, plausible, read_interface
+from crosscue.detectors.catalog.recognise import (
+    SEMANTIC,
+    closed,
+    guesses,
+    plausible,
+    read_interface,
+)
 from crosscue.detectors.decoders.base import Guess, Interface, decoder_name
 from crosscue.detectors.decoders.detr import with_no_object
 from crosscue.detectors.decoders.table import DECODERS
@@ -29,7 +35,7 @@ from crosscue.results import HIDDEN, Result, json_key
 from crosscue.verb import Option, keywords
 
 # Supported tasks in the metadata of Ultralytics' exports.
-_TASKS: Final = ("detect", "segment")
+_TASKS: Final = ("detect", "segment", SEMANTIC)
 _MAX_TASK_CHARACTERS: Final = 40
 
 
@@ -265,8 +271,9 @@ def _guess(path: Path, model: Interface, kind: str | None, names: int) -> Guess:
         # COCO's numbers of classes, unless the user says otherwise.
         counts = (names,) if names else (len(COCO_80), len(COCO_90))
         found = [one for one in found if one.class_count in counts] or found
-    if len(found) == 1:
-        (guess,) = found
+    if len({one.settings["kind"] for one in found}) == 1:
+        # The usual way to store boxes first.
+        guess = found[0]
         is_more = guess.settings["kind"] == "detr" and guess.class_count == names + 1
         return with_no_object(guess) if names and is_more and not guess.is_decided else guess
     if not found:

@@ -6,7 +6,7 @@ import ast
 import io
 import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -18,6 +18,8 @@ import numpy as np
 from crosscue.detectors.decoders.base import (
     DEFAULT_SCORE,
     GRID_STRIDES,
+    IMAGENET,
+    IMAGENET_BGR,
     Guess,
     Interface,
     Tensor,
@@ -57,6 +59,28 @@ _ONNX_BYTE: Final = 2
 SPREAD_FRACTION: Final = 0.5
 # Path of the class names in an OpenVINO file, with underscores for spaces.
 _LABELS: Final = ["model_info", "labels"]
+# Task of a segmentation in LibreYOLO's metadata.
+SEMANTIC: Final = "semantic"
+_UNIT: Final = {"colour": "rgb", "mean": (0.0,) * 3, "scale": (1 / 255,) * 3}
+_LETTERBOX: Final = {**_UNIT, "fit": "letterbox", "pad": 114}
+_DARKNET: Final = {**_LETTERBOX, "pad": 128}
+_STRETCHED: Final = {"colour": "rgb", **IMAGENET, "fit": "stretch"}
+_FAMILIES: Final[Mapping[str, Mapping[str, object]]] = {
+    "yolo2": _DARKNET,
+    "yolo3": _DARKNET,
+    "yolo4": _DARKNET,
+    "yolo7": _LETTERBOX,
+    "yolo9": _LETTERBOX,
+    "yolo9_e2e": _LETTERBOX,
+    "pidnet": _LETTERBOX,
+    "rtmdet": {**IMAGENET_BGR, "fit": "letterbox", "pad": 114},
+    "efficientdet": {**_STRETCHED, "fit": "letterbox", "pad": 114},
+    "picodet": _STRETCHED,
+    "ppyoloe": _STRETCHED,
+    "detr": _STRETCHED,
+    "lwdetr": _STRETCHED,
+    "ssd": {**_UNIT, "mean": (123.0, 117.0, 104.0), "scale": (1.0,) * 3, "fit": "stretch"},
+}
 _REFUSED: Final = {
     ".pkl": "a pickle runs code when it is read; export it to ONNX",
     ".torchscript": "a TorchScript archive carries code; export it to ONNX",
@@ -291,18 +315,15 @@ def closed(path: Path, model: Interface, size_px: tuple[int, int] | None) -> Int
     network = load_network(_weights(path))
     noise = np.random.default_rng(0).random(shape, np.float32)
     try:
-        outputs = network(noise)
+        outputs = network(noise.astype(np.uint8) if given.is_bytes else noise)
     except Exception as error:
         raise UsageError(
             f"{path}: does not run on input {'x'.join(map(str, shape))}: {one_line(error, 160)}; "
             "use another --size"
         ) from None
-    return Interface(
-        (Tensor(given.name, shape), *model.inputs[1:]),
-        tuple(Tensor(out.name, outputs[out.name].shape, out.is_integer) for out in model.outputs),
-        model.metadata,
-        model.class_names,
-    )
+    outs = (replace(out, shape=outputs[out.name].shape) for out in model.outputs)
+    picture = replace(given, shape=shape)
+    return replace(model, inputs=(picture, *model.inputs[1:]), outputs=tuple(outs))
 
 
 def size_in(metadata: Mapping[str, str]) -> tuple[int, int] | None:
@@ -349,7 +370,8 @@ def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
     output = decoder.model_validate({**guess.settings, "classes": classes})
     try:
         found, size = candidates_in(network, output, given, noise)
-    except ValueError:
+    except Exception:
+        # The layout does not fit, or the network does not run: the trial of its card says why.
         return False
     if oddity(found, (width, height), DEFAULT_SCORE) is not None:
         return False
@@ -363,7 +385,7 @@ def _is_plausible(network: Network, model: Interface, guess: Guess) -> bool:
 
 def input_settings(model: Interface, guess: Guess) -> dict[str, object]:
     """Return keys of the card's ``[input]`` besides the size: of the layout, or as declared."""
-    usual = dict(guess.input or {})
+    usual = {**(guess.input or {}), **_picture_of_family(model.metadata)}
     usual["layout"] = model.layout or usual.get("layout", "nchw")
     if model.inputs[0].is_bytes:
         # Such a network scales its pixels itself.
@@ -372,6 +394,13 @@ def input_settings(model: Interface, guess: Guess) -> dict[str, object]:
     elif model.inputs[0].limits is not None:
         usual |= _quantised(usual, *model.inputs[0].limits)
     return usual
+
+
+def _picture_of_family(metadata: Mapping[str, str]) -> Mapping[str, object]:
+    """Keys of ``[input]`` with which LibreYOLO trains the family that its metadata name."""
+    found = _FAMILIES.get(metadata.get("model_family", ""), {})
+    pad = metadata.get("letterbox_pad")
+    return {**found, "fit": "letterbox-center"} if found and pad == "center" else found
 
 
 def _quantised(usual: Mapping[str, object], low: float, high: float) -> dict[str, object]:
@@ -393,18 +422,33 @@ def guesses(model: Interface) -> list[Guess]:
     if not model.inputs or not model.outputs:
         return []
     found = [guess for decoder in DECODERS if (guess := decoder.recognise(model)) is not None]
-    if model.layout == "nhwc":
-        # Ultralytics' TFLite exports have boxes in fractions of the input; the boxes decide.
-        found += [
-            replace(
-                one,
-                settings={**one.settings, "is_fraction": True},
-                assumptions=(*one.assumptions, "boxes are in fractions of the input"),
-            )
-            for one in found
-            if one.settings["kind"] in ("yolov5", "yolov8", "yolov8-seg")
-        ]
+    # Exporters differ in how they store boxes; the boxes decide.
+    found += [
+        replace(one, settings={**one.settings, **keys}, assumptions=(*one.assumptions, *said))
+        for one in found
+        for keys, said in _ways_of_boxes(one, model)
+    ]
     road = recognise_segmentation(model)
     # Integers are class numbers, never boxes.
-    is_road = road is not None and (not found or model.outputs[0].is_integer)
+    is_semantic = model.metadata.get("task") == SEMANTIC
+    is_road = road is not None and (not found or is_semantic or model.outputs[0].is_integer)
+    if is_semantic and road is None:
+        return []
     return [road] if road is not None and is_road else found
+
+
+_FRACTIONS: Final = ({"is_fraction": True}, ("boxes are in fractions of the input",))
+_CORNERS: Final = ({"are_corners": True}, ("boxes are corners",))
+
+
+def _ways_of_boxes(
+    guess: Guess, model: Interface
+) -> Iterator[tuple[dict[str, bool], tuple[str, ...]]]:
+    """Other ways to store boxes in a layout: keys of ``[output]``, and what they assume."""
+    kind = guess.settings["kind"]
+    if kind in ("yolov5", "yolov8", "yolov8-seg") and model.layout == "nhwc":
+        # Ultralytics' TFLite exports.
+        yield _FRACTIONS
+    if kind == "yolov8" and "are_corners" not in guess.settings:
+        # LibreYOLO's exports of YOLOv3, v9, SSD and others.
+        yield _CORNERS

@@ -247,6 +247,8 @@ IMAGENET: Final = {
 }
 # The same in the order of OpenCV, as in networks of OpenMMLab and NanoDet.
 IMAGENET_BGR: Final = {"colour": "bgr"} | {key: three[::-1] for key, three in IMAGENET.items()}
+# Maximum number of a network's queries; tables of candidates by cells have more rows.
+MAX_QUERIES: Final = 1000
 # Strides of the grids of YOLO networks and of YOLOX.
 GRID_STRIDES: Final = (8, 16, 32)
 

@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from .base import (
     IMAGENET,
+    MAX_QUERIES,
     BoxCandidates,
     BoxOutput,
     Guess,
@@ -28,7 +29,6 @@ from .base import (
     static,
 )
 
-_MAX_QUERIES: Final = 1000
 _SELECTED_COLUMNS: Final = 6
 _COCO_COLUMNS_OF_DETR: Final = 92
 _RF_DETR_NAMES: Final = ("dets", "labels")
@@ -89,7 +89,7 @@ class DetrOutput(BoxOutput):
             return None
         rows = static(boxes.shape, 1)
         # A box for each cell of a grid is not a query, and such boxes are in pixels.
-        if rows is not None and (rows > _MAX_QUERIES or rows == grid_cells(model)):
+        if rows is not None and (rows > MAX_QUERIES or rows == grid_cells(model)):
             return None
         columns = static(logits.shape, 2)
         settings = {"kind": "detr", "boxes": boxes.name, "logits": logits.name, "overlap": 1.0}
@@ -158,7 +158,7 @@ def _of_one(output: Tensor, model: Interface, picture: dict[str, object]) -> Gue
         "activation": "none",
         "overlap": 1.0,
     }
-    if rows is None or rows > _MAX_QUERIES or columns is None or columns < 5:
+    if rows is None or rows > MAX_QUERIES or columns is None or columns < 5:
         return None
     is_known = model.metadata.get("head") == ULTRALYTICS_HEAD
     if columns == _SELECTED_COLUMNS and (is_known or not model.metadata):

@@ -45,6 +45,9 @@ class EndToEndOutput(BoxOutput):
         return self._of(table, PrototypeMasks(table[:, 6:], prototypes))
 
     def _of(self, table: NDArray[np.float64], masks: PrototypeMasks | None) -> BoxCandidates:
+        if masks is None:
+            # Some exporters pad with a class of -1.
+            table = table[~(table[:, 5] < 0.0)]
         return BoxCandidates(
             table[:, :4], table[:, 4], class_numbers(table[:, 5], len(self.classes)), masks
         )

@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from .base import (
     GRID_STRIDES,
+    MAX_QUERIES,
     Array,
     BoxCandidates,
     BoxOutput,
@@ -41,9 +42,11 @@ class _CentersOutput(BoxOutput):
 
     is_fraction: bool = False
     """True if boxes are in fractions of the input, as in TFLite files; else in its pixels."""
+    are_corners: bool = False
+    """True if boxes are x0, y0, x1, y1 instead of center and size."""
 
     def _corners(self, table: NDArray[np.float64], size_px: Size) -> NDArray[np.float64]:
-        corners = from_centers(table)
+        corners = table[:, :4] if self.are_corners else from_centers(table)
         return corners * np.tile(size_px, 2) if self.is_fraction else corners
 
 
@@ -107,7 +110,7 @@ class YoloV5Output(_CentersOutput):
 
 
 class YoloV8Output(_CentersOutput):
-    """YOLOv8, v9, v11: one output (1, 4 + classes, N): center, size, class scores."""
+    """YOLOv8, v9, v11: one output (1, 4 + classes, N), or transposed: box, class scores."""
 
     kind: Literal["yolov8"]
     name: str | None = None
@@ -122,16 +125,18 @@ class YoloV8Output(_CentersOutput):
     @override
     @classmethod
     def recognise(cls, model: Interface, /) -> Guess | None:
-        found = _transposed(model)
+        names = len(model.class_names)
+        found = _transposed(model) or _rows_of_boxes(model)
         if found is None or len(model.outputs) != 1:
             return None
         name, rows = found
-        names = len(model.class_names)
         if rows < 5 or (names and names != rows - 4):
             return None
         why = f"{rows} rows: 4 and {rows - 4} classes"
+        # Without names, rows of centers are YOLOX's, with an objectness.
+        are_corners = not names and _transposed(model) is None
         return Guess(
-            {"kind": "yolov8", "name": name},
+            {"kind": "yolov8", "name": name, **({"are_corners": True} if are_corners else {})},
             rows - 4,
             (why, *((f"its metadata names {names} classes",) if names else ())),
             () if names else ("class scores without an objectness",),
@@ -211,6 +216,8 @@ def prototypes_of(output: Array) -> NDArray[np.float64]:
 
 
 def _columns(output: Array, rows: int) -> NDArray[np.float64]:
+    if output.ndim == 3 and output.shape[1] != rows:
+        output = output.transpose(0, 2, 1)
     if output.ndim != 3 or output.shape[:2] != (1, rows):
         raise ValueError(f"expected (1, {rows}, N) for these classes, got {output.shape}")
     return np.asarray(output[0].T, np.float64)
@@ -231,6 +238,20 @@ def _heads(model: Interface) -> tuple[str, ...]:
     columns = {static(out.shape, -1) for out in model.outputs}
     is_whole = len(columns) == 1 and sum(rows) in _row_counts(model)[1:]
     return tuple(out.name for out in model.outputs) if len(rows) > 1 and is_whole else ()
+
+
+def _rows_of_boxes(model: Interface) -> tuple[str, int] | None:
+    """Name and number of columns of the output whose rows are the candidates.
+
+    Without names, a table with COCO's 80 classes, or not over the cells of YOLO's grids. Paddle's
+    exports, with an input named image, have a layout of their own.
+    """
+    shape = model.outputs[0].shape
+    rows, columns = static(shape, 1) or 0, static(shape, 2)
+    if columns is None or rows <= max(columns, MAX_QUERIES) or model.inputs[0].name == "image":
+        return None
+    is_other = not model.class_names and columns != 84 and rows in _row_counts(model)
+    return None if is_other else (model.outputs[0].name, columns)
 
 
 def _transposed(model: Interface) -> tuple[str, int] | None:

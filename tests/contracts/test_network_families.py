@@ -181,17 +181,62 @@ def test_number_of_classes_is_read_from_the_suppression(
 
 
 @SIZES
-def test_corners_are_not_taken_for_center_and_size(tmp_path: Path, size: Size) -> None:
-    """LibreYOLO's YOLOv9 has the rows of YOLOv8, with boxes as corners."""
+@pytest.mark.parametrize("axes", [(0, 1, 2), (0, 2, 1)], ids=["columns", "rows"])
+@pytest.mark.parametrize("form", ["corners", "centers"])
+def test_boxes_decide_between_corners_and_centers(
+    tmp_path: Path, size: Size, axes: tuple[int, int, int], form: str
+) -> None:
+    """LibreYOLO's YOLOv9 and RTMDet have the tables of YOLOv8, with boxes as corners."""
     net = tmp_path / "net.onnx"
     corner, stride = cell_grid(size, (8, 16, 32))
     middle = (corner + 0.5) * stride
-    rows = np.hstack([middle - stride, middle + stride, np.full((len(corner), 3), 0.01)])
-    outputs = {"output": np.clip(rows, 0.0, None).T[None].astype(np.float32)}
-    net.write_bytes(constant_model((1, 3, size[1], size[0]), outputs))
+    boxes = np.hstack([middle - stride, middle + stride])
+    boxes[7] = BOX
+    if form == "centers":
+        boxes = np.hstack([(boxes[:, :2] + boxes[:, 2:]) / 2, boxes[:, 2:] - boxes[:, :2]])
+    scores = np.full((len(corner), 3), 0.01)
+    scores[7, CLASS] = SCORE
+    table = np.hstack([boxes, scores]).T[None].transpose(axes).astype(np.float32)
+    model = onnx.load_model_from_string(constant_model((1, 3, size[1], size[0]), {"output": table}))
+    onnx.helper.set_model_props(model, {"names": str(list(CLASSES))})
+    net.write_bytes(model.SerializeToString())
 
-    with pytest.raises(VehicleError, match="on noise, the boxes are corners, taken for center and"):
-        crosscue.draft_card(net, class_names=CLASSES)
+    card = crosscue.draft_card(net)
+    frame = Frame(0, "", np.zeros((size[1], size[0], 3), np.uint8), size)
+    (found,) = build(card=str(card.path))([frame])
+
+    assert isinstance(found, Detections)
+    np.testing.assert_allclose(found.boxes_px, [BOX], atol=1e-3)
+    assert found.labels == (CLASSES[CLASS],)
+
+
+def test_padding_of_an_export_with_suppression_is_no_detection(tmp_path: Path) -> None:
+    """LibreYOLO's EfficientDet has class -1 in the rows after its detections."""
+    net = tmp_path / "net.onnx"
+    rows = np.tile(np.array([0.0, 0.0, 0.0, 0.0, 0.0, -1.0], np.float32), (1, 300, 1))
+    rows[0, 0] = [*BOX, SCORE, CLASS]
+    net.write_bytes(constant_model((1, 3, SIZE[1], SIZE[0]), {"output": rows}))
+
+    card = crosscue.draft_card(net, kind="end-to-end", class_names=CLASSES)
+    frame = Frame(0, "", np.zeros((SIZE[1], SIZE[0], 3), np.uint8), SIZE)
+    (found,) = build(card=str(card.path))([frame])
+
+    assert isinstance(found, Detections)
+    assert found.labels == (CLASSES[CLASS],)
+
+
+@pytest.mark.parametrize("outputs", ["scores", "numbers"])
+def test_task_semantic_in_the_metadata_is_a_segmentation(tmp_path: Path, outputs: str) -> None:
+    net = tmp_path / "net.onnx"
+    shape = (1, 3, SIZE[1], SIZE[0])
+    values = (
+        np.zeros(shape, np.float32) if outputs == "scores" else np.zeros((1, *shape[2:]), np.int64)
+    )
+    model = onnx.load_model_from_string(constant_model(shape, {"semantic_logits": values}))
+    onnx.helper.set_model_props(model, {"names": "['road', 'car', 'sky']", "task": "semantic"})
+    net.write_bytes(model.SerializeToString())
+
+    assert crosscue.draft_card(net).draft.kind == "segmentation"
 
 
 def test_decoded_yolox_with_names_gets_its_own_pixels(tmp_path: Path) -> None:

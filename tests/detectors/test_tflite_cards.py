@@ -16,7 +16,7 @@ from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.draft import draft_card_text
 from crosscue.detectors.catalog.recognise import _suppressed_classes, guesses
 from crosscue.detectors.decoders.base import Interface, Size, Tensor, cell_count, cell_grid
-from crosscue.detectors.networks.backends import load_network
+from crosscue.detectors.networks.backends import _random_operation, load_network
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.networks.weights import Weights
 from support.data import shared
@@ -303,3 +303,26 @@ def test_network_with_int8_numbers_runs_without_xnnpack(kind: type[np.number[Any
 
     assert network.backend.endswith(" without XNNPACK") == (kind is np.int8)
     assert not network(np.zeros((1, 64, 64, 3), np.float32))["rows"].any()
+
+
+@pytest.mark.parametrize(
+    ("operation", "kinds", "is_sound"),
+    [
+        ("DEPTHWISE_CONV_2D", (np.float32, np.int8, np.float32), False),
+        ("DEPTHWISE_CONV_2D", (np.int8, np.int8, np.int32), True),
+        ("DEPTHWISE_CONV_2D", (np.float32, np.float32, np.float32), True),
+        ("CONV_2D", (np.float32, np.int8, np.float32), True),
+    ],
+)
+def test_operation_with_results_at_random_is_refused(
+    operation: str, kinds: tuple[type[np.number[Any]], ...], is_sound: bool
+) -> None:
+    """Two segmentations with int8 weights and float32 pictures had other boxes in each process."""
+    net = SimpleNamespace(
+        _get_ops_details=lambda: [{"op_name": operation, "inputs": np.array([4, 5, -1, 6])}],
+        get_tensor_details=lambda: [
+            {"index": index, "dtype": kind} for index, kind in zip((4, 5, 6), kinds, strict=True)
+        ],
+    )
+
+    assert (_random_operation(net) is None) == is_sound

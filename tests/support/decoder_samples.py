@@ -277,6 +277,13 @@ def _pp_yoloe_joined(size: Size) -> Sample:
     )
 
 
+def _yolov8_corners(size: Size) -> Sample:
+    """LibreYOLO's YOLOv9 and SSD: columns of boxes as corners."""
+    columns = np.concatenate(_pair(size), axis=2).transpose(0, 2, 1)
+    settings = {"kind": "yolov8", "name": "output", "are_corners": True}
+    return Sample(settings, {"output": columns})
+
+
 def _paddle_nms(size: Size) -> Sample:
     names = ("multiclass_nms3_0.tmp_0", "multiclass_nms3_0.tmp_2")
     rows = np.array([[CLASS, SCORE, *BOX], [-1.0] * 6, [99.0, 0.9, 7.0, 7.0, 9.0, 9.0]])
@@ -378,6 +385,7 @@ VARIANTS: Final[dict[str, Callable[[Size], Sample]]] = {
     "yolo-fastestv2, one output": _yolo_fastestv2_joined,
     "damo-yolo": _damo_yolo,
     "pp-yoloe, one output": _pp_yoloe_joined,
+    "yolov8, corners": _yolov8_corners,
     "efficient-nms, names of the plugin": _efficient_nms_plugin,
 }
 SAMPLES: Final[dict[str, Callable[[], Sample]]] = {
