@@ -13,8 +13,8 @@ A reader yields ``Block``s. The rows of a block have one of these types:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Final, Literal, TypeAlias, TypeVar
+from dataclasses import dataclass, field, fields, replace
+from typing import Final, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,23 @@ ERROR: Final = 2
 
 # ``CanFrames.length`` where the log does not store it; the bytes are then padded with zeros.
 LENGTH_UNKNOWN: Final = 255
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColumnSet:
+    """Arrays of equal length, one in each field of a subclass."""
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Self:
+        """Return the selected rows."""
+        return type(self)(*(getattr(self, column.name)[index] for column in fields(self)))
+
+    def __add__(self, later: Self) -> Self:
+        names = [column.name for column in fields(self)]
+        pairs = ((getattr(self, name), getattr(later, name)) for name in names)
+        return type(self)(*map(np.concatenate, pairs))
 
 
 @dataclass(frozen=True, slots=True)

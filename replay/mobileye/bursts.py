@@ -5,18 +5,16 @@ obstacle is a triple of frames A, B, C in its slot. Frames are never joined acro
 frames, and a frame that cannot be assigned is reported with its reason.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .bits import Words
+from crosscue.replay.columns import ColumnSet, Int64s
 
-Int64s: TypeAlias = NDArray[np.int64]
+from .bits import Words
 
 NO_STATUS: Final = "obstacle before the first status frame"
 LATE: Final = "too long after its status frame"
@@ -32,7 +30,7 @@ SLOTS_AT_MOST: Final = 16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Status:
+class Status(ColumnSet):
     """Status frames that start a burst, and the bursts' numbers.
 
     Attributes:
@@ -49,32 +47,10 @@ class Status:
     count: Int64s
     variant: NDArray[np.int8]
 
-    def __len__(self) -> int:
-        return len(self.number)
-
     def at(self, burst: Int64s) -> Int64s:
         """Return the indices of bursts by number; unknown numbers yield indices out of range."""
         places: Int64s = burst - self.number[0]
         return places
-
-    def take(self, index: NDArray[np.intp] | slice) -> Status:
-        """Return the statuses selected by ``index``."""
-        return Status(
-            self.number[index],
-            self.log_ns[index],
-            self.image_ns[index],
-            self.count[index],
-            self.variant[index],
-        )
-
-    def __add__(self, later: Status) -> Status:
-        return Status(
-            np.concatenate([self.number, later.number]),
-            np.concatenate([self.log_ns, later.log_ns]),
-            np.concatenate([self.image_ns, later.image_ns]),
-            np.concatenate([self.count, later.count]),
-            np.concatenate([self.variant, later.variant]),
-        )
 
 
 def no_status() -> Status:
@@ -84,7 +60,7 @@ def no_status() -> Status:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FrameParts:
+class FrameParts(ColumnSet):
     """Frames that are parts of obstacles or lanes, in the order of the log.
 
     Attributes:
@@ -100,28 +76,6 @@ class FrameParts:
     part: Int64s
     log_ns: Int64s
     words: Words
-
-    def __len__(self) -> int:
-        return len(self.burst)
-
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> FrameParts:
-        """Return the frames selected by ``index``."""
-        return FrameParts(
-            self.burst[index],
-            self.place[index],
-            self.part[index],
-            self.log_ns[index],
-            self.words[index],
-        )
-
-    def __add__(self, later: FrameParts) -> FrameParts:
-        return FrameParts(
-            np.concatenate([self.burst, later.burst]),
-            np.concatenate([self.place, later.place]),
-            np.concatenate([self.part, later.part]),
-            np.concatenate([self.log_ns, later.log_ns]),
-            np.concatenate([self.words, later.words]),
-        )
 
 
 def no_parts() -> FrameParts:

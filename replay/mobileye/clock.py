@@ -15,7 +15,7 @@ The offset follows the fastest frames: downwards as fast as the order of images 
 by at most the drift of a crystal.
 """
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,38 +44,11 @@ OUT_OF_ORDER: Final = (
 )
 
 
-class Unwrapped(NamedTuple):
-    """Image times on the log's clock, and notices.
-
-    Attributes:
-        image_ns: Image times, shape (N,), int64; never after the frame's log time, and never
-            decreasing unless the log times decrease.
-        notices: Warnings in plain English.
-    """
-
-    image_ns: NDArray[np.int64]
-    notices: tuple[str, ...]
-
-
-def unwrap(
-    counter_ms: NDArray[np.integer], log_ns: NDArray[np.int64], min_latency_ns: int = 0
-) -> Unwrapped:
-    """Return the time on the log's clock at which the image of each status frame was grabbed.
-
-    Args:
-        counter_ms: Counter, shape (N,), 0 to 255.
-        log_ns: Log time, shape (N,).
-        min_latency_ns: Latency of the fastest frame.
-    """
-    clock = CounterClock(min_latency_ns)
-    image_ns = clock.feed(counter_ms, log_ns)
-    return Unwrapped(image_ns, clock.notices)
-
-
 class CounterClock:
-    """Incremental ``unwrap``; the result does not depend on the division into pieces."""
+    """Times at which images were grabbed, however the frames are divided into pieces."""
 
     def __init__(self, min_latency_ns: int = 0) -> None:
+        """Start with the latency of the fastest frame."""
         self._min_ns = min_latency_ns
         self._offset_ns = 0
         self._frames = 0
@@ -86,7 +59,10 @@ class CounterClock:
         self._noticed: dict[str, tuple[int, int]] = {}
 
     def feed(self, counter_ms: NDArray[np.integer], log_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the image times of the next frames, shape (N,)."""
+        """Return the image times of the next frames on the log's clock, shape (N,).
+
+        They are never after the frame's log time, and never decrease unless the log times do.
+        """
         pairs = zip(counter_ms.tolist(), log_ns.tolist(), strict=True)
         return np.array([self._next(c * MS, t) for c, t in pairs], dtype=np.int64) - self._min_ns
 

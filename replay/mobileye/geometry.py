@@ -6,17 +6,18 @@ y(x) = c0 + c1 x + c2 x**2 + c3 x**3 from the reference point to the end of the 
 
 from dataclasses import dataclass
 from math import cos, sin
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats: TypeAlias = NDArray[np.float64]
+from crosscue.replay.columns import Floats
 
 
 @dataclass(frozen=True, slots=True)
 class DevicePosition:
-    """Position of the device's reference point, from calibration.
+    """Position and rotation of the device's reference point in the vehicle, from calibration.
+
+    It is also the transform from the device's frame to the vehicle's, and its inverse.
 
     Attributes:
         x_m: Distance ahead of the rear axle. The device measures from a reference point, not from
@@ -33,34 +34,20 @@ class DevicePosition:
 AT_REAR_AXLE: Final = DevicePosition()
 
 
-@dataclass(frozen=True, slots=True)
-class Pose:
-    """Position and rotation of one frame in another: ``target_T_source``."""
-
-    x_m: float
-    y_m: float
-    yaw_rad: float
-
-
-def vehicle_T_device(mounting: DevicePosition) -> Pose:  # noqa: N802 - the frames' names
-    """Return the transform from the device's frame to the vehicle's."""
-    return Pose(mounting.x_m, mounting.y_m, mounting.yaw_rad)
-
-
-def device_T_vehicle(mounting: DevicePosition) -> Pose:  # noqa: N802 - the frames' names
+def device_T_vehicle(mounting: DevicePosition) -> DevicePosition:  # noqa: N802 - frames' names
     """Return the transform from the vehicle's frame to the device's."""
     c, s = cos(mounting.yaw_rad), sin(mounting.yaw_rad)
     x, y = mounting.x_m, mounting.y_m
-    return Pose(-(c * x + s * y), s * x - c * y, -mounting.yaw_rad)
+    return DevicePosition(-(c * x + s * y), s * x - c * y, -mounting.yaw_rad)
 
 
-def move_points(pose: Pose, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
+def move_points(pose: DevicePosition, x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
     """Transform points from the source frame to the target frame."""
     c, s = cos(pose.yaw_rad), sin(pose.yaw_rad)
     return pose.x_m + c * x_m - s * y_m, pose.y_m + s * x_m + c * y_m
 
 
-def move_cubic(pose: Pose, c: Floats) -> Floats:
+def move_cubic(pose: DevicePosition, c: Floats) -> Floats:
     """Transform cubics from the source frame to the target frame.
 
     A rotated cubic is not a cubic; it is expanded to third order about its start. For rotations of

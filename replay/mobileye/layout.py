@@ -21,6 +21,9 @@ Beyond: TypeAlias = Literal["refuse", "clip", "drop"]
 
 # Variants named by ``only``; a frame's variant is an index in this tuple, or ``UNKNOWN``.
 VARIANTS: Final = ("classic", "2.32", "extended", "tsr", "basic")
+# Messages whose frames together are an obstacle, or a lane, by table.
+OBSTACLE_PARTS: Final = ("obstacle_a", "obstacle_b", "obstacle_c")
+LANE_PARTS: Final = {"lanes": ("lane_a", "lane_b"), "next_lanes": ("next_lane_a", "next_lane_b")}
 UNKNOWN: Final = -1
 # Variant of each frame as an index in ``VARIANTS``, or ``UNKNOWN``; shape (N,).
 Variant: TypeAlias = NDArray[np.int8]

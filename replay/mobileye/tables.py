@@ -17,13 +17,11 @@ from crosscue.replay.columns import Block, Floats, Int64s, Table
 from crosscue.replay.mobileye.geometry import DevicePosition
 
 from .geometry import (
-    Pose,
     device_T_vehicle,
     evaluate,
     move_cubic,
     move_points,
     turn_slope,
-    vehicle_T_device,
 )
 from .layout import Column, Columns, layout, unit_of
 
@@ -75,10 +73,9 @@ def lane_places(table: str, instance: Int64s) -> Columns:
 
 def to_vehicle(table: str, columns: Columns, mounting: DevicePosition) -> Columns:
     """Convert columns from the device's reference point to the rear axle."""
-    pose = vehicle_T_device(mounting)
     if table in ("lanes", "next_lanes"):
-        return _lanes_to_vehicle(columns, pose)
-    return _moved(table, columns, pose, mounting.x_m)
+        return _lanes_to_vehicle(columns, mounting)
+    return _moved(table, columns, mounting, mounting.x_m)
 
 
 def to_device(table: str, columns: Columns, mounting: DevicePosition) -> Columns:
@@ -89,7 +86,7 @@ def to_device(table: str, columns: Columns, mounting: DevicePosition) -> Columns
     return _moved(table, columns, pose, -mounting.x_m)
 
 
-def _moved(table: str, columns: Columns, pose: Pose, ahead_m: float) -> Columns:
+def _moved(table: str, columns: Columns, pose: DevicePosition, ahead_m: float) -> Columns:
     moved = dict(columns)
 
     def add(name: str, amount: float) -> None:
@@ -120,7 +117,7 @@ def _cubic(columns: Columns) -> Floats:
     return np.vstack([floats(columns.get(name, absent)) for name in _CUBIC])
 
 
-def _lanes_to_vehicle(columns: Columns, pose: Pose) -> Columns:
+def _lanes_to_vehicle(columns: Columns, pose: DevicePosition) -> Columns:
     moved = dict(columns)
     on_device = _cubic(columns)
     range_m = floats(columns["view_range_m"])
@@ -139,7 +136,7 @@ def _lanes_to_vehicle(columns: Columns, pose: Pose) -> Columns:
     return moved
 
 
-def _lanes_to_device(columns: Columns, pose: Pose) -> Columns:
+def _lanes_to_device(columns: Columns, pose: DevicePosition) -> Columns:
     moved = dict(columns)
     in_vehicle = _cubic(columns)
     is_default = np.isnan(in_vehicle[0])

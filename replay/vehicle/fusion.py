@@ -17,11 +17,8 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from .cue_table import CUES
-from .section import NotNegative, Positive, Section
+from .section import Name, NotNegative, Positive, Probability, Section
 from .temporal import Temporal
-
-Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 
 # Precision of roads that the road area shows: a round number below what it is in the frames of the
 # drives used in development (``benchmarks/real_roads.py``), which are too few for a measurement.
@@ -131,19 +128,11 @@ FEATURES: Final[Mapping[str, FeatureEntry]] = {
 
 def usual_cues() -> dict[str, CueEntry]:
     """Return the default entries of all cues, after Table 5 and our interpretation of Fig. 27."""
+    same = CueEntry.model_fields.keys() - {"fade", "use"}
     return {
         name: CueEntry(
-            precision=cue.precision,
-            supports=cue.supports,
-            excludes=cue.excludes,
-            can_start=cue.can_start,
-            per_detection=cue.per_detection,
-            absence_counts=cue.absence_counts,
-            seen_frames=cue.seen_frames,
-            of_frames=cue.of_frames,
-            within_m=cue.within_m,
-            at_most=cue.at_most,
             fade=Fade(way_m=cue.fade_m) if cue.fade_s is None else Fade(time_s=cue.fade_s),
+            **{field: getattr(cue, field) for field in same},
         )
         for name, cue in CUES.items()
     }

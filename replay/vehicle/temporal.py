@@ -6,10 +6,8 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from .section import NotNegative, Positive, Section
+from .section import Name, NotNegative, Positive, Probability, Section
 
-Probability = Annotated[float, Field(gt=0.0, lt=1.0)]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
 ByDistance = Annotated[tuple[Probability, ...], Field(min_length=1)]
 
 

@@ -29,10 +29,10 @@ from .cue_table import CUES as CUES
 from .cue_table import SAME_SIGN
 from .cue_table import STOP_SIGN as STOP_SIGN
 from .cue_table import TRAFFIC_LIGHT as TRAFFIC_LIGHT
-from .fusion import Fusion, Name, RangeFilter
+from .fusion import Fusion, RangeFilter
 from .mobileye_cues import Past
 from .pose import DEGREE, Gnss, Odometry, Start
-from .section import Finite, NotNegative, Positive, Section, tuples
+from .section import Finite, Name, NotNegative, Positive, Section, tuples
 from .time import Time
 from .validation_errors import explain
 

@@ -1,13 +1,20 @@
 """Identify the frames of a Mobileye on a bus, and their messages."""
 
-from __future__ import annotations
-
-from typing import Final, NamedTuple
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import DATA, ERROR, LENGTH_UNKNOWN, REMOTE, CanFrames, Int64s
+from crosscue.replay.columns import (
+    DATA,
+    ERROR,
+    LENGTH_UNKNOWN,
+    REMOTE,
+    CanFrames,
+    ColumnSet,
+    Int64s,
+)
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.bits import Words, leading_words
 from crosscue.replay.mobileye.layout import Message, layout
@@ -26,7 +33,8 @@ _IDS_TOLD: Final = 8
 _LENGTHS: Final = 256
 
 
-class Admitted(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class Admitted(ColumnSet):
     """Frames of the Mobileye, in the order of the log.
 
     Attributes:
@@ -42,19 +50,6 @@ class Admitted(NamedTuple):
     length: NDArray[np.uint8]
     log_ns: Int64s
     words: Words
-
-    def __len__(self) -> int:
-        return len(self.message)
-
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Admitted:
-        """Return the frames selected by ``index``."""
-        return Admitted(
-            self.message[index],
-            self.instance[index],
-            self.length[index],
-            self.log_ns[index],
-            self.words[index],
-        )
 
 
 class Admission:

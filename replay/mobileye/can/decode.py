@@ -29,6 +29,8 @@ from crosscue.replay.mobileye.bursts import (
 )
 from crosscue.replay.mobileye.clock import CounterClock
 from crosscue.replay.mobileye.layout import (
+    LANE_PARTS,
+    OBSTACLE_PARTS,
     UNKNOWN,
     VARIANTS,
     BitField,
@@ -48,8 +50,6 @@ from .family import FamilyEvidence
 CUT_AT_END: Final = "incomplete obstacle at the end of the log"
 NOT_COME: Final = "obstacle frames announced by a status frame but missing"
 _EVENTS_TOLD: Final = 50
-_OBSTACLE_PARTS: Final = ("obstacle_a", "obstacle_b", "obstacle_c")
-_LANE_PARTS: Final = {"lanes": ("lane_a", "lane_b"), "next_lanes": ("next_lane_a", "next_lane_b")}
 REPEATED_STATUS: Final = "repeated status frame"
 # Known protocol versions with status frames of 6 bytes.
 KNOWN_PROTOCOLS: Final = (1, 3)
@@ -175,7 +175,7 @@ class MobileyeDecoder:
         self._statuses = Statuses(bus, ledger, settings, self._clock)
         self._open = no_parts()
         self._is_closed = False
-        self._lanes = {table: no_parts() for table in _LANE_PARTS}
+        self._lanes = {table: no_parts() for table in LANE_PARTS}
         self._mounting = device_mounting(settings, bus, ledger)
 
     def __call__(self, block: Block) -> list[Block]:
@@ -196,10 +196,10 @@ class MobileyeDecoder:
         known = before + opened
         given = [] if status_block is None else [status_block]
         given += self._obstacles(frames, burst_at, known)
-        for table in _LANE_PARTS:
+        for table in LANE_PARTS:
             given += self._lane_rows(table, frames, burst_at)
         for number, message in enumerate(layout().messages):
-            if message.table in ("status", "obstacles", *_LANE_PARTS):
+            if message.table in ("status", "obstacles", *LANE_PARTS):
                 continue
             rows = np.flatnonzero(frames.message == number)
             if len(rows):
@@ -210,7 +210,7 @@ class MobileyeDecoder:
         """Return the rows of the last, possibly incomplete burst, and report final notices."""
         given = self._finish(self._open, self._statuses.last, is_end=True)
         self._open = no_parts()
-        for table in _LANE_PARTS:
+        for table in LANE_PARTS:
             given += self._pair(table, self._lanes[table], is_last=True)
         for notice in self._clock.notices:
             self._ledger.notice(f"{self._bus}: {notice}")
@@ -219,7 +219,7 @@ class MobileyeDecoder:
         return given
 
     def _obstacles(self, frames: Admitted, burst_at: Int64s, known: Status) -> list[Block]:
-        parts = self._open + _parts_of(frames, burst_at, _OBSTACLE_PARTS)
+        parts = self._open + _parts_of(frames, burst_at, OBSTACLE_PARTS)
         kept, faults, is_closed = sift(
             parts, known, self._settings.within_ns, len(self._open), self._is_closed
         )
@@ -256,13 +256,13 @@ class MobileyeDecoder:
             "burst": triples.a.burst,
             "slot": triples.a.place.astype(np.int8),
         }
-        for name, part in zip(_OBSTACLE_PARTS, triples, strict=True):
+        for name, part in zip(OBSTACLE_PARTS, triples, strict=True):
             columns |= _columns(layout()[name], part.words, _unknown(len(part)))
         columns = to_vehicle("obstacles", columns, self._mounting)
         return [table_block(self._bus, "obstacles", log_ns_of_row, columns, image_ns)]
 
     def _lane_rows(self, table: str, frames: Admitted, burst_at: Int64s) -> list[Block]:
-        fresh = _parts_of(frames, burst_at, _LANE_PARTS[table])
+        fresh = _parts_of(frames, burst_at, LANE_PARTS[table])
         return self._pair(table, self._lanes[table] + fresh, is_last=False) if len(fresh) else []
 
     def _pair(self, table: str, parts: FrameParts, is_last: bool) -> list[Block]:
@@ -271,7 +271,7 @@ class MobileyeDecoder:
         if not len(a):
             return []
         columns: Columns = {"t_ns": a.log_ns, "burst": a.burst, **lane_places(table, a.place)}
-        for name, part in zip(_LANE_PARTS[table], (a, b), strict=True):
+        for name, part in zip(LANE_PARTS[table], (a, b), strict=True):
             columns |= _columns(layout()[name], part.words, _unknown(len(part)))
         return [table_block(self._bus, table, a.log_ns, to_vehicle(table, columns, self._mounting))]
 

@@ -15,6 +15,8 @@ from crosscue.replay.mobileye.bits import Words, payloads_of
 from crosscue.replay.mobileye.clock import MS
 from crosscue.replay.mobileye.geometry import AT_REAR_AXLE, DevicePosition
 from crosscue.replay.mobileye.layout import (
+    LANE_PARTS,
+    OBSTACLE_PARTS,
     UNKNOWN,
     VARIANTS,
     Column,
@@ -32,9 +34,6 @@ from crosscue.replay.mobileye.wire import words_from
 FRAME_NS: Final = 250_000
 # Default time from image to status frame, a plausible value that was not measured.
 LATENCY_NS: Final = 80 * MS
-
-_OBSTACLE_PARTS: Final = ("obstacle_a", "obstacle_b", "obstacle_c")
-_LANE_PARTS: Final = {"lanes": ("lane_a", "lane_b"), "next_lanes": ("next_lane_a", "next_lane_b")}
 
 
 class _Sent(NamedTuple):
@@ -160,7 +159,7 @@ def _sent(name: str, block: Block, settings: MobileyeSettings) -> list[_Sent]:
     if name == "obstacles":
         return _obstacles(block, columns)
     instance = np.zeros(len(rows), dtype=np.int64)
-    if name in _LANE_PARTS:
+    if name in LANE_PARTS:
         instance = instance_of_lane(name, columns)
     elif name == "signs":
         instance = columns["sign"].astype(np.int64) - 1
@@ -184,7 +183,7 @@ def _obstacles(block: Block, columns: Columns) -> list[_Sent]:
             DEFAULTS,
             block.topic,
         )
-        for k, name in enumerate(_OBSTACLE_PARTS)
+        for k, name in enumerate(OBSTACLE_PARTS)
     ]
 
 

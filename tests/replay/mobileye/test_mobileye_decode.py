@@ -15,7 +15,7 @@ from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.bits import extract, leading_words, payloads_of, place_bits
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
-from crosscue.replay.mobileye.clock import SET_ANEW, WENT_BACK, unwrap
+from crosscue.replay.mobileye.clock import SET_ANEW, WENT_BACK, CounterClock
 from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.layout import VARIANTS, describe, layout, parse_layout
 from crosscue.replay.mobileye.settings import MobileyeSettings
@@ -270,7 +270,7 @@ def test_arrival_jitter_is_removed(seed: int, period_ms: int, jitter_ms: int) ->
         0, jitter_ms * MS_CLOCK
     )
     log_ns = np.maximum.accumulate(image_ns + latency_ns.astype(np.int64))
-    found = unwrap(counter_ms, log_ns).image_ns
+    found = CounterClock().feed(counter_ms, log_ns)
 
     settled = np.s_[60:]
     assert np.abs(error_without_offset(found[settled], image_ns[settled])).max() <= 4 * MS_CLOCK
@@ -286,7 +286,7 @@ def test_image_times_are_ordered_and_precede_their_frames(
     counters: list[int], steps: list[int]
 ) -> None:
     log_ns = np.cumsum(np.array(steps[: len(counters)], dtype=np.int64))
-    found = unwrap(np.array(counters), log_ns).image_ns
+    found = CounterClock().feed(np.array(counters), log_ns)
 
     assert (np.diff(found) >= 0).all()
     assert (found <= log_ns).all()
@@ -296,16 +296,18 @@ def test_image_times_are_ordered_and_precede_their_frames(
 def test_device_restart_is_followed_and_reported() -> None:
     image_ns, counter_ms = camera(400)
     counter_ms = np.where(np.arange(400) < 200, counter_ms, (counter_ms - 100) & 0xFF)
-    found = unwrap(counter_ms, image_ns)
+    clock = CounterClock()
+    found = clock.feed(counter_ms, image_ns)
 
-    np.testing.assert_allclose(found.image_ns[280:], image_ns[280:], atol=2 * MS_CLOCK)
-    assert any(n.startswith(f"{SET_ANEW} (1 times") for n in found.notices)
+    np.testing.assert_allclose(found[280:], image_ns[280:], atol=2 * MS_CLOCK)
+    assert any(n.startswith(f"{SET_ANEW} (1 times") for n in clock.notices)
 
 
 def test_log_clock_set_back_restarts_image_times() -> None:
     image_ns, counter_ms = camera(100)
     log_ns = np.where(np.arange(100) < 50, image_ns, image_ns - 10**12)
-    found = unwrap(counter_ms, log_ns)
+    clock = CounterClock()
+    found = clock.feed(counter_ms, log_ns)
 
-    np.testing.assert_allclose(found.image_ns, log_ns, atol=MS_CLOCK)
-    assert found.notices == (f"{WENT_BACK} (1 times, first at {log_ns[50]} ns)",)
+    np.testing.assert_allclose(found, log_ns, atol=MS_CLOCK)
+    assert clock.notices == (f"{WENT_BACK} (1 times, first at {log_ns[50]} ns)",)
