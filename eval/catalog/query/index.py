@@ -14,13 +14,13 @@ import hashlib
 import io
 import os
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from crosscue.eval.runs.tables.columns import INDEXED, arrow_schema
-from crosscue.replay.errors import OutputError, UnreadableRunError, one_line
+from crosscue.replay.errors import OutputError, UnreadableRunError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import spelled
 from crosscue.replay.files.whole_file import write_bytes
@@ -32,6 +32,7 @@ from .remote import RemoteRuns
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    import pyarrow.dataset as ds
 
 # Name of the folder of the index.
 NAME: Final = ".catalog"
@@ -71,12 +72,8 @@ class _Earlier:
     tables: dict[str, Any]
 
 
-def open_index(runs: Runs, on_run: Callable[[int, int], None] = lambda done, of: None) -> Index:
+def open_index(runs: Runs) -> Index:
     """Return the current rows of all runs and update the index.
-
-    Args:
-        runs: The storage of the runs.
-        on_run: Called with the number of changed runs read so far, and the number to read.
 
     Raises:
         UnreadableRunError: A folder cannot be listed, or holds no run.
@@ -97,8 +94,7 @@ def open_index(runs: Runs, on_run: Callable[[int, int], None] = lambda done, of:
         return _index(earlier.tables, {**earlier.left_out, **half}, "")
     rows: list[RunRows] = []
     unreadable = {run: why for run, why in earlier.left_out.items() if run in complete}
-    for done, one in enumerate(changed):
-        on_run(done, len(changed))
+    for one in changed:
         unreadable.pop(one.run, None)
         try:
             read = _read_run(runs, one)
@@ -123,18 +119,32 @@ def _path_of(runs: Runs) -> Path:
 
 def _read_index(path: Path | None) -> _Earlier:
     """Return the content of the index; empty if it is missing, damaged or of another version."""
+    import pyarrow as pa
+
+    nothing = _Earlier({}, {}, {})
     if path is None:
-        return _Earlier({}, {}, {})
+        return nothing
     try:
-        stored = StoredIndex(door.read(path, MAX_BYTES), _MARK)
-        entries = stored.table(ENTRIES).to_table()
-        columns = [entries[name].to_pylist() for name in ("run", *_STAMP, "reason")]
-        tables = {name: stored.table(name) for name in KEPT}
-    except (OSError, ValueError, KeyError):
-        return _Earlier({}, {}, {})
-    named, *stamps, reasons = columns
+        archive = zipfile.ZipFile(io.BytesIO(door.read(path, MAX_BYTES)))
+        if archive.read(FORMAT) != _MARK.encode():
+            return nothing
+        entries = _opened(archive, ENTRIES).to_table()
+        named, *stamps, reasons = (entries[name].to_pylist() for name in ("run", *_STAMP, "reason"))
+        tables = {name: _opened(archive, name) for name in KEPT}
+    except (zipfile.BadZipFile, OSError, ValueError, KeyError, pa.ArrowException):
+        return nothing
     left_out = {run: why for run, why in zip(named, reasons, strict=True) if why is not None}
     return _Earlier(dict(zip(named, zip(*stamps, strict=True), strict=True)), left_out, tables)
+
+
+def _opened(archive: zipfile.ZipFile, name: str) -> ds.Dataset:
+    """Return a table of an index as a data set, which decodes only the columns that are used."""
+    import pyarrow as pa
+    import pyarrow.dataset as ds
+
+    form = ds.ParquetFileFormat()
+    fragment = form.make_fragment(pa.py_buffer(archive.read(name)))
+    return ds.FileSystemDataset([fragment], fragment.physical_schema, form)
 
 
 def _entries(complete: Mapping[str, FoundRun], unreadable: Mapping[str, str]) -> pa.Table:
@@ -181,7 +191,7 @@ def _save(path: Path | None, tables: Mapping[str, pa.Table]) -> str:
     """Save the index; return the reason if it could not be saved, else an empty text."""
     try:
         if path is not None:
-            write_index(path, _MARK, tables)
+            _write_index(path, tables)
     except OutputError as error:
         return f"the index was not saved, so the runs are read again next time: {error}"
     return ""
@@ -195,55 +205,12 @@ def _index(tables: Mapping[str, Any], left_out: Mapping[str, str], notice: str) 
     return Index({**tables, "left_out": listed}, left_out, notice)
 
 
-class StoredIndex:
-    """An index in memory; its tables are opened when they are used."""
-
-    def __init__(self, content: bytes, mark: str) -> None:
-        """Check the version.
-
-        Args:
-            content: Content of the file.
-            mark: Version that this crosscue writes.
-
-        Raises:
-            ValueError: The file is damaged or of another version.
-        """
-        try:
-            self._archive: Final = zipfile.ZipFile(io.BytesIO(content))
-            written = self._archive.read(FORMAT)
-        except (zipfile.BadZipFile, KeyError, OSError) as error:
-            raise ValueError(f"damaged ({one_line(error)})") from None
-        if written != mark.encode():
-            raise ValueError("of another version")
-
-    def table(self, name: str) -> Any:
-        """Return one of its tables as a data set, which decodes only the columns that are used.
-
-        Raises:
-            ValueError: The table is damaged.
-        """
-        import pyarrow as pa
-        import pyarrow.dataset as ds
-
-        form = ds.ParquetFileFormat()
-        try:
-            fragment = form.make_fragment(pa.py_buffer(self._archive.read(name)))
-            return ds.FileSystemDataset([fragment], fragment.physical_schema, form)
-        except (zipfile.BadZipFile, KeyError, OSError, pa.ArrowException) as error:
-            raise ValueError(f"damaged ({one_line(error)})") from None
-
-
-def write_index(path: Path, mark: str, tables: Mapping[str, pa.Table]) -> None:
-    """Write an index atomically.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+def _write_index(path: Path, tables: Mapping[str, pa.Table]) -> None:
     import pyarrow.parquet as pq
 
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        archive.writestr(FORMAT, mark)
+        archive.writestr(FORMAT, _MARK)
         for name, table in tables.items():
             member = io.BytesIO()
             pq.write_table(table, member, compression="zstd")
