@@ -10,7 +10,7 @@ import numpy as np
 
 from crosscue.replay.columns import Floats, Int64s, Table, Topic
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
 from crosscue.replay.readers.held_rows import HeldRows, Loss
@@ -28,12 +28,9 @@ def content_of(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
         LogFormatError: It cannot be read, or is too large.
     """
     try:
-        content = read_at_most(path, max_bytes)
+        return read_whole(path, max_bytes)
     except OSError as error:
         raise LogFormatError(f"{path}: {error.strerror}; restore the file") from None
-    if content is None:
-        raise LogFormatError(f"{path}: over {max_bytes // MIB} MiB; not read")
-    return content
 
 
 def lines_of(path: Path, max_bytes: int = MAX_FILE_BYTES) -> list[str]:

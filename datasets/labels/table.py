@@ -25,7 +25,7 @@ from crosscue.datasets.truth.box_labels import read_box_labels
 from crosscue.datasets.truth.coco import read_coco, write_coco
 from crosscue.datasets.truth.label_xml import read_cvat, write_cvat
 from crosscue.replay.errors import AnnotationError, UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
 
@@ -311,10 +311,7 @@ def read_tool_labels(path: Path, sizes: Sizes, kind: ToolFormat | None = None) -
 
 def _tree(path: Path) -> Any:
     try:
-        content = read_at_most(path, MAX_BYTES)
-        if content is None:
-            raise AnnotationError(f"{path}: over {MAX_BYTES >> 20} MiB; split it")
-        return json_tree(content)
+        return json_tree(read_whole(path, MAX_BYTES))
     except (OSError, ValueError) as error:
         raise AnnotationError(f"{path}: not readable as JSON ({error}); expected labels") from None
 

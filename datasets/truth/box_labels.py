@@ -29,7 +29,7 @@ from typing import Annotated, Final, Literal, TypeAlias
 import numpy as np
 
 from crosscue.replay.errors import AnnotationError, EmptyResultError, UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import yaml_tree
 from crosscue.replay.limits import MIB
 from crosscue.verb import Option
@@ -354,10 +354,7 @@ def _yaml_names(file: Path) -> tuple[str, ...]:
 def _lines(file: Path, *, is_whole: bool = False) -> list[str]:
     """Read the lines that are not empty, stripped; or all lines unchanged."""
     try:
-        content = read_at_most(file, MAX_TEXT_BYTES)
-        if content is None:
-            raise AnnotationError(f"{file}: over {MAX_TEXT_BYTES // MIB} MiB; expected labels")
-        lines = content.decode("utf-8").splitlines()
+        lines = read_whole(file, MAX_TEXT_BYTES).decode("utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise AnnotationError(f"{file}: {why}; expected labels as text") from None

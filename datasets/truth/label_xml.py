@@ -19,7 +19,7 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 
 from crosscue.replay.errors import AnnotationError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import MIB
 
@@ -61,9 +61,7 @@ def parse_xml(path: Path, reader: XmlReader, max_bytes: int) -> None:
     parser.CharacterDataHandler = reader.text
     parser.buffer_text = True
     try:
-        content = read_at_most(path, max_bytes)
-        if content is None:
-            raise AnnotationError(f"{path}: over {max_bytes // MIB} MiB; expected {reader.kind}")
+        content = read_whole(path, max_bytes)
         parser.Parse(content, True)
     except (OSError, expat.ExpatError) as error:
         raise AnnotationError(f"{path}: not XML ({error}); expected {reader.kind}") from None

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final, Literal, TypeAlias, cast
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from crosscue.replay.errors import AnnotationError, CrosscueError, EmptyResultError, one_line
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.formats import data_sets
@@ -216,9 +216,7 @@ def read_truth(path: Path) -> Truth:
     """
     path = path / FILE if path.is_dir() else path
     try:
-        content = read_at_most(path, MAX_BYTES)
-        if content is None:
-            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
+        content = read_whole(path, MAX_BYTES)
         tree = json_tree(content, object_pairs_hook=_unique_keys)
         truth = Truth.model_validate(tree)
     except ValidationError as error:

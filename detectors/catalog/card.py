@@ -29,7 +29,7 @@ from crosscue.detectors.decoders.table import AnyBoxOutput
 from crosscue.detectors.networks.weights import Weights
 from crosscue.detectors.settings import Proportion, Settings
 from crosscue.replay.errors import UsageError, VehicleError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import toml_tree
 from crosscue.replay.limits import MIB
 from crosscue.replay.vehicle.section import tuples
@@ -217,12 +217,7 @@ def read_card(path: Path) -> ModelCard:
         VehicleError: The file is missing or not TOML, or a key or value is invalid.
     """
     try:
-        content = read_at_most(path, MAX_CARD_BYTES)
-        if content is None:
-            raise VehicleError(
-                f"{path}: over {MAX_CARD_BYTES // MIB} MiB; this is not a model card"
-            )
-        text = content.decode("utf-8")
+        text = read_whole(path, MAX_CARD_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise VehicleError(f"{path}: {why}; expected a model card") from None
@@ -259,12 +254,9 @@ def model_bytes(path: Path) -> bytes:
         UsageError: The file cannot be read, or is too large.
     """
     try:
-        content = read_at_most(path, MAX_BYTES)
+        return read_whole(path, MAX_BYTES)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}; expected a model file or weights") from None
-    if content is None:
-        raise UsageError(f"{path}: over {MAX_BYTES // MIB} MiB; not read")
-    return content
 
 
 def _verified(path: Path, want: str, key: str) -> bytes:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import yaml_tree
 from crosscue.replay.limits import MIB
 
@@ -85,10 +85,7 @@ def class_names_given(given: Sequence[str] | Path | str) -> tuple[str, ...]:
         return tuple(given)
     path = Path(given)
     try:
-        content = read_at_most(path, MIB)
-        if content is None:
-            raise UsageError(f"{path}: over 1 MiB; expected class names, one per line")
-        text = content.decode("utf-8")
+        text = read_whole(path, MIB).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise UsageError(f"{path}: {why}; expected class names, one per line") from None

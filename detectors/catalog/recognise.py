@@ -34,7 +34,7 @@ from crosscue.detectors.networks.openvino import import_openvino
 from crosscue.detectors.networks.trial import candidates_in
 from crosscue.detectors.networks.weights import Weights
 from crosscue.replay.errors import UsageError, one_line
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import yaml_tree
 
 from .architectures import WEIGHTS_SUFFIXES
@@ -163,8 +163,8 @@ def _of_openvino(content: bytes, path: Path) -> Interface:
         raise UsageError(f"{path}: needs the package openvino: pip install openvino")
     ov = import_openvino()
     second = path.with_suffix(".bin")
-    weights = read_at_most(second, MAX_BYTES) if second.exists() else b""
-    model = ov.Core().read_model(content, weights or b"")
+    weights = read_whole(second, MAX_BYTES) if second.exists() else b""
+    model = ov.Core().read_model(content, weights)
 
     def tensor(port: Any) -> Tensor:
         names = sorted(port.get_names())
@@ -251,11 +251,9 @@ def _yaml_metadata(path: Path) -> dict[str, str]:
     if not path.is_file():
         return {}
     try:
-        content = read_at_most(path, _MAX_NAMES_CHARACTERS)
-        if content is None:
-            raise ValueError(f"over {_MAX_NAMES_CHARACTERS:,} bytes")
+        content = read_whole(path, _MAX_NAMES_CHARACTERS)
         found = yaml_tree(content.decode("utf-8"))
-    except ValueError as error:
+    except (OSError, ValueError) as error:
         why = one_line(error, 160)
         raise UsageError(f"{path}: not readable as metadata: {why}; correct or remove it") from None
     if not isinstance(found, dict):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from crosscue.detectors import rle
 from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import AnnotationError, SchemaError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import json_tree
 
 # Maximum size of an annotation file.
@@ -154,9 +154,7 @@ def coco_tree(path: Path, max_bytes: int = MAX_BYTES) -> Mapping[str, Any]:
         AnnotationError: The file does not exist, is too large, or has another content.
     """
     try:
-        content = read_at_most(path, max_bytes)
-        if content is None:
-            raise AnnotationError(f"{path}: more than {max_bytes:,} bytes of annotations; split it")
+        content = read_whole(path, max_bytes)
         tree = json_tree(content)
     except OSError as error:
         raise AnnotationError(f"{path}: {error.strerror}; expected a COCO file") from None

@@ -30,7 +30,7 @@ from typing import Final, NamedTuple
 
 from crosscue.eval.runs.folder import MANIFEST
 from crosscue.replay.errors import LogError, UnknownFormatError, UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.identity import identity_of_all, log_identity
 from crosscue.replay.files.log_identity import SHORT
 from crosscue.replay.formats import format_of, known_formats
@@ -183,12 +183,7 @@ def _stem(name: str) -> str:
 
 def _listed(path: Path, *, each: bool) -> Iterator[_Found]:
     try:
-        content = read_at_most(path, LIST_BYTES)
-        if content is None:
-            raise UsageError(
-                f"@{path}: larger than {LIST_BYTES // MIB} MiB; expected a list of logs"
-            )
-        lines = content.decode("utf-8", "surrogateescape").splitlines()
+        lines = read_whole(path, LIST_BYTES).decode("utf-8", "surrogateescape").splitlines()
     except OSError as error:
         raise UsageError(f"@{path}: {error.strerror}; expected a text file") from None
     count = 0

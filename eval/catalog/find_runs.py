@@ -11,7 +11,7 @@ from typing import Final
 from crosscue.eval.batch.merge import is_merged
 from crosscue.eval.runs.folder import FAILURE, LOCK, MANIFEST, RunFolder
 from crosscue.replay.errors import RunError, UnreadableRunError, UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.remote.address import is_remote
 
 from .query.local import LocalRuns, is_cut_short
@@ -98,12 +98,7 @@ def _is_merged(folder: Path) -> bool:
 
 def _lines(path: Path) -> list[str]:
     try:
-        content = read_at_most(path, LIST_BYTES)
-        if content is None:
-            raise UsageError(
-                f"@{path}: larger than {LIST_BYTES >> 20} MiB; expected a list of runs"
-            )
-        lines = content.decode("utf-8", "surrogateescape").splitlines()
+        lines = read_whole(path, LIST_BYTES).decode("utf-8", "surrogateescape").splitlines()
     except OSError as error:
         raise UsageError(f"@{path}: {error.strerror}; expected a text file") from None
     named = [line.strip() for line in lines if line.strip() and not line.startswith("#")]

@@ -19,7 +19,7 @@ from typing import Final, Literal
 from pydantic import ValidationError
 
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import toml_tree
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import MIB
@@ -61,10 +61,7 @@ def read_spec(path: Path | str) -> LogSpec:
     """
     path = Path(path)
     try:
-        content = read_at_most(path, MIB)
-        if content is None:
-            raise UsageError(f"{path}: over 1 MiB; expected a specification")
-        text = content.decode()
+        text = read_whole(path, MIB).decode()
         return LogSpec.model_validate(tuples(toml_tree(text)))
     except ValidationError as error:
         raise UsageError(explain(error, text, str(path), LogSpec)) from None

@@ -23,7 +23,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import toml_tree
 from crosscue.replay.limits import MIB
 from crosscue.replay.vehicle.validation_errors import explain
@@ -94,10 +94,7 @@ def load_gates(path: Path) -> tuple[Gate, ...]:
         UsageError: The file is missing, not TOML, or not a gate file of version 1.
     """
     try:
-        content = read_at_most(path, MAX_BYTES)
-        if content is None:
-            raise UsageError(f"{path}: over {MAX_BYTES // MIB} MiB; expected a gate file")
-        text = content.decode("utf-8")
+        text = read_whole(path, MAX_BYTES).decode("utf-8")
         tree = toml_tree(text)
     except (OSError, ValueError) as error:
         raise UsageError(f"{path}: not readable as TOML ({error}); correct it") from None

@@ -1,5 +1,6 @@
 """Read complete files up to a max size, because a device or a pipe may be endless."""
 
+import errno
 import os
 from pathlib import Path
 from typing import IO, Final
@@ -17,6 +18,23 @@ def read_at_most(path: Path, max_bytes: int) -> bytes | None:
     """
     with path.open("rb") as file:
         return read_pieces(file, max_bytes)
+
+
+def read_whole(path: Path, max_bytes: int) -> bytes:
+    """Return the content of a file.
+
+    Raises:
+        OSError: The file cannot be read, or is larger than ``max_bytes``.
+    """
+    content = read_at_most(path, max_bytes)
+    if content is None:
+        raise too_large(path, max_bytes)
+    return content
+
+
+def too_large(path: Path, max_bytes: int) -> OSError:
+    """Return the error of a file that is larger than ``max_bytes``."""
+    return OSError(errno.EFBIG, f"over {max_bytes / (1 << 20):g} MiB", str(path))
 
 
 def read_pieces(file: IO[bytes], max_bytes: int) -> bytes | None:

@@ -14,7 +14,7 @@ import stat
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final
 
-from .bounded import read_pieces
+from .bounded import read_pieces, too_large
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -68,7 +68,7 @@ def read(path: Path, max_bytes: int = SMALL_BYTES) -> bytes:
     with os.fdopen(opened(path), "rb") as file:
         content = read_pieces(file, max_bytes)
     if content is None:
-        raise OSError(errno.EFBIG, f"over {max_bytes / (1 << 20):g} MiB", str(path))
+        raise too_large(path, max_bytes)
     return content
 
 

@@ -16,7 +16,7 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator, mo
 from pydantic_core import PydanticCustomError
 
 from crosscue.replay.errors import VehicleError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import toml_tree, unspelled
 from crosscue.replay.limits import MIB
 
@@ -449,10 +449,7 @@ def load(path: Path) -> Vehicle:
             names the line.
     """
     try:
-        content = read_at_most(path, MAX_BYTES)
-        if content is None:
-            raise VehicleError(f"{path}: over {MAX_BYTES // MIB} MiB; this is not a vehicle file")
-        text = content.decode("utf-8")
+        text = read_whole(path, MAX_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise VehicleError(f"{path}: {why}; make one with: crosscue vehicle init LOG") from None

@@ -19,7 +19,7 @@ from torch import Tensor
 from crosscue.detectors.settings import Settings
 from crosscue.detectors.weights_file import embedded, pack_weights, unpack_weights
 from crosscue.replay.errors import VehicleError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.whole_file import write_bytes
 
 from .network import NetworkPlan, build_network
@@ -128,12 +128,9 @@ def _content(path: Path) -> bytes:
             "for weights of torchvision networks write a card: crosscue model init"
         )
     try:
-        content = read_at_most(path, MAX_BYTES)
+        return read_whole(path, MAX_BYTES)
     except OSError as error:
         raise VehicleError(f"{path}: {error.strerror}; check the network's file name") from None
-    if content is None:
-        raise VehicleError(f"{path}: more than {MAX_BYTES:,} bytes; expected a checkpoint")
-    return content
 
 
 def _facts(description: str | None, path: Path) -> Facts:

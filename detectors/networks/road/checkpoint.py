@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 from crosscue.detectors.settings import Settings
 from crosscue.detectors.weights_file import pack_weights, unpack_weights
 from crosscue.replay.errors import VehicleError, one_line
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.whole_file import write_bytes
 
 from .network import RoadNetwork
@@ -71,9 +71,7 @@ def load_road(path: Path) -> RoadCheckpoint:
     if path.suffix != ".safetensors":
         raise VehicleError(f"{path}: expected .safetensors; other files can run programs when read")
     try:
-        content = read_at_most(path, MAX_BYTES)
-        if content is None:
-            raise VehicleError(f"{path}: more than {MAX_BYTES:,} bytes; expected a road network")
+        content = read_whole(path, MAX_BYTES)
     except OSError as error:
         raise VehicleError(f"{path}: {error.strerror}; check the file name") from None
     description, tensors = unpack_weights(content, KEY, path)

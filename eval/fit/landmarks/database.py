@@ -25,7 +25,7 @@ from crosscue.localization.landmarks.images import copy_picture, grey_of, read_e
 from crosscue.replay.base import Log, Selection
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import AnnotationError, LogError, MissingTopicError, UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import chosen_camera
@@ -278,9 +278,7 @@ def read_coordinates(path: Path, source: str) -> Iterator[tuple[str, LandmarkPos
         AnnotationError: The table is invalid; the message names the line.
     """
     try:
-        content = read_at_most(path, MAX_COORDINATE_BYTES)
-        if content is None:
-            raise AnnotationError(f"{path}: more than {MAX_COORDINATE_BYTES >> 20} MiB; split it")
+        content = read_whole(path, MAX_COORDINATE_BYTES)
         with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file)
             known = set(rows.fieldnames or ())

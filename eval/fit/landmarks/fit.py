@@ -31,7 +31,7 @@ from crosscue.localization.landmarks.fit import LandmarkFit, Rate, ScoredPairs
 from crosscue.localization.landmarks.fit import fit_landmarks as fit_threshold
 from crosscue.localization.landmarks.images import grey_of, read_encoded
 from crosscue.replay.errors import AnnotationError, LogError, SchemaError, UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.limits import MIB
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result
@@ -221,9 +221,7 @@ def landmark_pairs(path: Path, matcher: Matcher) -> ScoredPairs:
 
 def _labelled(path: Path) -> Iterator[tuple[str, str, bool]]:
     try:
-        content = read_at_most(path, MAX_PAIR_BYTES)
-        if content is None:
-            raise AnnotationError(f"{path}: more than {MAX_PAIR_BYTES // MIB} MiB; split it")
+        content = read_whole(path, MAX_PAIR_BYTES)
         with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
             table = csv.DictReader(file)
             if not {"query", "known", "same"} <= set(table.fieldnames or ()):

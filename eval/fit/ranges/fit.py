@@ -25,7 +25,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import AnnotationError, EmptyResultError, SchemaError, UsageError
 from crosscue.replay.files import door
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.files.whole_file import write_whole
 from crosscue.replay.limits import MIB
@@ -353,10 +353,7 @@ def _objects(truth: Path) -> Any:
         raise SchemaError(f"{truth}: has no objects; name a COCO file with them as objects")
     path = _folder(truth) / name
     try:
-        content = read_at_most(path, MAX_BYTES)
-        if content is None:
-            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
-        return json_tree(content)
+        return json_tree(read_whole(path, MAX_BYTES))
     except (OSError, ValueError) as error:
         raise AnnotationError(f"{path}: not readable as JSON ({error}); repair it") from None
 
@@ -366,9 +363,7 @@ def _folder(truth: Path) -> Path:
 
 
 def _csv(path: Path, names: tuple[str, ...]) -> tuple[Floats, ...]:
-    content = read_at_most(path, MAX_BYTES)
-    if content is None:
-        raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; give fewer rows")
+    content = read_whole(path, MAX_BYTES)
     reader = csv.DictReader(content.decode("utf-8").splitlines())
     if set(names) - set(reader.fieldnames or ()):
         raise KeyError(names)

@@ -27,7 +27,7 @@ from crosscue.replay.errors import (
     MissingTopicError,
     UsageError,
 )
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.limits import DEFAULT_LIMITS, MIB, Limits
@@ -79,10 +79,7 @@ def read_text(path: Path, max_bytes: int = MAX_BYTES) -> str:
         AnnotationError: It cannot be read, is larger than ``max_bytes``, or is not text.
     """
     try:
-        content = read_at_most(path, max_bytes)
-        if content is None:
-            raise AnnotationError(f"{path}: over {max_bytes // MIB} MiB; split it")
-        return content.decode("utf-8")
+        return read_whole(path, max_bytes).decode("utf-8")
     except OSError as error:
         raise AnnotationError(f"{path}: {error.strerror}; {_WANTED}") from None
     except UnicodeDecodeError:

@@ -22,7 +22,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from crosscue.localization.town.settings import City, Proportion, TownDrive
 from crosscue.replay.errors import StudyFileError, UsageError
-from crosscue.replay.files.bounded import read_at_most
+from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import toml_tree
 from crosscue.replay.vehicle.section import Section, tuples
 from crosscue.replay.vehicle.validation_errors import explain
@@ -221,10 +221,7 @@ def load_study(path: Path, kind: type[Study]) -> Study:
             valid; the message names the line.
     """
     try:
-        content = read_at_most(path, LARGEST_FILE)
-        if content is None:
-            raise StudyFileError(f"{path}: larger than {LARGEST_FILE} bytes; expected a study file")
-        text = content.decode("utf-8")
+        text = read_whole(path, LARGEST_FILE).decode("utf-8")
         tree = toml_tree(text)
     except OSError as error:
         raise StudyFileError(f"{path}: {error.strerror}; check the path") from None
