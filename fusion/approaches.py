@@ -41,6 +41,7 @@ from .belief import (
     published_message_model,
 )
 from .calibrated import CalibratedMessageModel, cue_messages_of
+from .combined import CombinedFilter, CombinedModel
 from .evidence import FrameEvidence, PastCues, RangePosterior, SignRange
 from .factor_graph import FactorGraph
 from .intersection_range import RangeBelief, Reference
@@ -520,11 +521,14 @@ def _over_drive(graph: FactorGraph, fusion: Fusion) -> TemporalFilter | None:
     Raises:
         ValueError: The kind has no fitted parameters; a vehicle file cannot have this state.
     """
-    if fusion.kind != "temporal":
+    if fusion.kind not in ("temporal", "combined"):
         return None
-    if fusion.temporal is None:
+    if fusion.temporal is None or (fusion.kind == "combined" and fusion.combined is None):
         raise ValueError("fusion.temporal: expected what crosscue fit temporal wrote, got None")
-    return TemporalFilter(temporal_model(graph, fusion.temporal))
+    model = temporal_model(graph, fusion.temporal)
+    if fusion.kind == "combined" and fusion.combined is not None:
+        return CombinedFilter(model, CombinedModel(graph, fusion.combined))
+    return TemporalFilter(model)
 
 
 def message_models_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], MessageModel]:
@@ -535,7 +539,7 @@ def message_models_of(graph: FactorGraph, fusion: Fusion) -> Callable[[], Messag
     """
     if fusion.kind == "persistent":
         return lambda: PersistentMessageModel(graph, fusion.dissent)
-    if fusion.kind in ("source", "temporal", None):
+    if fusion.kind in ("source", "temporal", "combined", None):
         model = published_message_model(graph, fusion.dissent)
         return lambda: model
     if fusion.calibrated is None:

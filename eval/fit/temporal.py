@@ -1,4 +1,4 @@
-"""Fit of the belief over time to annotated drives, for ``fusion.kind = "temporal"``."""
+"""Fit of the beliefs over time to annotated drives: ``fusion.kind`` "combined" or "temporal"."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from crosscue.eval.fit.vehicle_output import FittedSection, new_file, section_te
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.scoring.scene.trade import Reached, TradePoint, reached, trade_off
 from crosscue.fusion.factor_graph import FactorGraph
-from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit, filtered
+from crosscue.fusion.fit.combined_fit import combined_beliefs, fit_combined
+from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit
 from crosscue.fusion.fit.temporal_fit import fit_temporal as fit_drives
+from crosscue.replay.columns import Floats
 from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.vehicle.temporal import Combined
 from crosscue.results import HIDDEN
 from crosscue.verb import Option
 
@@ -29,11 +32,13 @@ class FittedTemporal(FittedSection):
 
     Attributes:
         fitted: The learned parameters and their scores.
+        combined: The learned regression beside them.
         threshold: Threshold at the wanted rate of false features; None unless wanted.
         runs: Number of runs.
     """
 
     fitted: TemporalFit = field(metadata=HIDDEN)
+    combined: Combined
     threshold: TradePoint | None
     runs: int
 
@@ -47,8 +52,8 @@ class FittedTemporal(FittedSection):
 
     @property
     def section(self) -> str:
-        """The vehicle file's section ``[fusion.temporal]``, and those asked for besides."""
-        return section_of(self.fitted, self.threshold)
+        """The vehicle file's section ``[fusion]``, with those of both beliefs."""
+        return section_of(self.fitted, self.combined, self.threshold)
 
     @property
     def temporal(self) -> dict[str, Any]:
@@ -86,17 +91,18 @@ class FittedTemporal(FittedSection):
         yield ""
 
 
-def section_of(fit: TemporalFit, threshold: TradePoint | None) -> str:
+def section_of(fit: TemporalFit, combined: Combined, threshold: TradePoint | None) -> str:
     """Return the vehicle file's sections, with the numbers of drives and places as a comment."""
     text = f"# Learned from {fit.drives} drives at {fit.places} places, {fit.steps} steps.\n"
-    learned = fit.temporal.model_dump(exclude_unset=True)
-    text += section_text("fusion.temporal", learned)
+    for name, one in (("temporal", fit.temporal), ("combined", combined)):
+        text += section_text(f"fusion.{name}", one.model_dump(exclude_unset=True)) + "\n"
+    text, fusion = text.rstrip("\n") + "\n", {"kind": "combined"}
     if threshold is None:
-        return text
+        return f"{section_text('fusion', fusion)}\n{text}"
     # Rounded up, for no more false features than wanted.
     established = min(max(math.ceil(1e4 * threshold.threshold) / 1e4, 0.01), 0.9999)
     withdrawn = min(0.5, round(0.5 * established, 4))
-    fusion = {"kind": "temporal", "established": established, "withdrawn": withdrawn}
+    fusion |= {"established": established, "withdrawn": withdrawn}
     wanted = f"# At most {threshold.wanted:g} false features a drive, on held-out places."
     return f"{wanted}\n{section_text('fusion', fusion)}\n{text}"
 
@@ -116,16 +122,15 @@ def held_out_threshold(
     at: list[int] = []
     for half in (0, 1):
         learned = [one for one in drives if places.index(one.place) % 2 != half]
-        fitted = fit_drives(learned, graph)
+        fitted, combined = fit_drives(learned, graph), fit_combined(learned, graph)
         for one in drives:
             if places.index(one.place) % 2 == half:
-                found.append(_reached(one, graph, fitted))
+                found.append(_reached(one, graph, combined_beliefs(one, graph, fitted, combined)))
                 at.append(places.index(one.place))
     return trade_off(found, np.array(at, np.int64), (rate,))[0]
 
 
-def _reached(drive: AnnotatedDrive, graph: FactorGraph, fitted: TemporalFit) -> Reached:
-    values = filtered(drive, fitted.model)
+def _reached(drive: AnnotatedDrive, graph: FactorGraph, values: Floats) -> Reached:
     columns = dict(zip(graph.feature_names, values.T, strict=True))
     present = [name for name, is_there in drive.features.items() if is_there]
     absent = [name for name, is_there in drive.features.items() if not is_there]
@@ -143,10 +148,11 @@ def fit_temporal(
     """Fit the belief over time to annotated drives.
 
     Pass finished runs and the truth of each, in the same order, including drives without an
-    intersection. The result is the section [fusion.temporal] of a vehicle file, for fusion.kind =
-    "temporal". It describes how each cue changes from step to step, by distance, with and without a
-    road. With --false-features, it has [fusion] with the lowest threshold that keeps to this rate
-    on held-out places.
+    intersection. The result is the section [fusion] of a vehicle file with kind = "combined".
+    [fusion.temporal] describes how each cue changes from step to step, by distance, with and
+    without a road; it can be used alone, as kind = "temporal". [fusion.combined] is a regression
+    over how often each cue was seen. With --false-features, [fusion] has the lowest threshold that
+    keeps to this rate on held-out places.
 
     Examples:
         crosscue fit temporal runs/* --truth drives/*/truth.json -o temporal.toml
@@ -155,7 +161,7 @@ def fit_temporal(
     Args:
         runs: Finished runs.
         truth: Truth of each run, in the same order.
-        output: File to write the section to (default: print it).
+        output: File to write the sections to (default: print them).
         false_features: Wanted number of absent features above the threshold per drive.
         overwrite: Replace an existing file.
 
@@ -170,7 +176,7 @@ def fit_temporal(
     path = new_file(output, overwrite=overwrite)
     graph, drives = read_annotated(runs, truth, annotated_drives)
     try:
-        fitted = fit_drives(drives, graph)
+        fitted, combined = fit_drives(drives, graph), fit_combined(drives, graph)
         threshold = None
         if false_features is not None:
             threshold = held_out_threshold(drives, graph, false_features)
@@ -179,5 +185,5 @@ def fit_temporal(
             f"fit temporal: {len(drives)} drives are too few to learn from: {error}; use more"
         ) from None
     if path is not None:
-        write_text(path, section_of(fitted, threshold))
-    return FittedTemporal(path, fitted, threshold, len(runs))
+        write_text(path, section_of(fitted, combined, threshold))
+    return FittedTemporal(path, fitted, combined, threshold, len(runs))

@@ -18,7 +18,7 @@ from pydantic_core import PydanticCustomError
 
 from .cue_table import CUES
 from .section import Name, NotNegative, Positive, Probability, Section
-from .temporal import Temporal
+from .temporal import Combined, Temporal
 
 # Precision of roads that the road area shows: a round number below what it is in the frames of the
 # drives used in development (``benchmarks/real_roads.py``), which are too few for a measurement.
@@ -162,16 +162,17 @@ class Calibrated(Section):
 class Fusion(Section):
     """Belief over the features of an intersection (eq. 18)."""
 
-    kind: Literal["source", "calibrated", "persistent", "temporal"] | None = None
+    kind: Literal["source", "calibrated", "persistent", "temporal", "combined"] | None = None
     """``source`` multiplies all messages (eq. 18). ``calibrated`` uses learned likelihood ratios,
     discounted for correlation. ``persistent`` uses the published messages of cues that are positive
     in several frames and near enough, and discounts correlated frames. ``temporal`` filters a
-    learned hidden Markov model along the drive. Default: ``source`` in a simulated vehicle's file,
+    learned hidden Markov model along the drive, and ``combined`` takes the mean of its log odds and
+    those of a learned regression. Default: ``source`` in a simulated vehicle's file,
     else ``persistent``."""
     established: Probability = 0.9
     """Probability of a feature above which it establishes the presence of an intersection."""
     withdrawn: Probability = 0.5
-    """With ``temporal``: presence is withdrawn if no such feature is more probable."""
+    """With ``temporal`` and ``combined``: presence is withdrawn if no such feature exceeds it."""
     dissent: Probability = 0.49
     """Message strength of an undetected cue with ``absence_counts``, near the intersection."""
     dissent_within_m: NotNegative = 20.0
@@ -203,6 +204,7 @@ class Fusion(Section):
 
     calibrated: Calibrated | None = None
     temporal: Temporal | None = None
+    combined: Combined | None = None
 
     def with_openings(self) -> Self:
         """Return the settings in which a road to a side, as the road area shows it, says more.
@@ -311,12 +313,20 @@ class Fusion(Section):
             for name in (*one.there, *one.missing):
                 if name not in self.features:
                     raise _refused(f"temporal: no feature {name!r}{_near(name, self.features)}")
-        if self.kind != "temporal":
+        sides = () if self.combined is None else (self.combined.positive, self.combined.negative)
+        for name, weights in (pair for side in sides for pair in side.items()):
+            if name not in self.features:
+                raise _refused(f"combined: no feature {name!r}{_near(name, self.features)}")
+            for cue in weights:
+                if cue not in self.cues:
+                    raise _refused(f"combined: no cue {cue!r}{_near(cue, self.cues)}")
+        if self.kind not in ("temporal", "combined"):
             return self
-        if self.temporal is None:
-            raise _refused(
-                "kind temporal needs [fusion.temporal]; make it with: crosscue fit temporal"
-            )
+        for name in ("temporal", self.kind):
+            if getattr(self, name) is None:
+                raise _refused(
+                    f"kind {self.kind} needs [fusion.{name}]; make it with: crosscue fit temporal"
+                )
         if self.withdrawn >= self.established:
             raise _refused(
                 f"withdrawn {self.withdrawn:g}, established {self.established:g}: "

@@ -84,3 +84,18 @@ class Temporal(Section):
         if not self.ways:
             raise PydanticCustomError("temporal", "ways: expected at least one")
         return self
+
+
+class Combined(Section):
+    """Logistic regression over running counts of cues, learned by ``crosscue fit temporal``."""
+
+    intercepts: dict[Name, float]
+    """Log odds of each feature without counts."""
+    positive: dict[Name, dict[Name, float]]
+    """Weight of each cue's positive steps in the log odds of each feature."""
+    negative: dict[Name, dict[Name, float]]
+    """Weight of the steps in which the cue was looked for in vain."""
+    fade_m: Positive = 50.0
+    """Distance over which counts fade."""
+    step_m: Positive = 5.0
+    """Distance that counts as one step."""

@@ -29,6 +29,7 @@ from crosscue.replay.vehicle.temporal import CueChain, Temporal
 
 FILTER: Final = RangeFilter()
 TEMPORAL: Final[dict[str, object]] = {"kind": "temporal"}
+EMPTY: Final[dict[str, object]] = {"intercepts": {}, "positive": {}, "negative": {}}
 GRAPH: Final = FactorGraph(
     (Feature("intersection", establishes=True), Feature("left", establishes=True)),
     (CueNode("sign", 0.9, can_start=True), CueNode("road", 0.7, can_start=True)),
@@ -612,6 +613,9 @@ def test_steps_respect_probability_bounds_and_hysteresis(
     ("given_settings", "why"),
     [
         ({"kind": "temporal"}, "kind temporal needs"),
+        ({"kind": "combined"}, r"kind combined needs \[fusion.temporal\]"),
+        ({"combined": {**EMPTY, "positive": {"up": {}}}}, "no feature 'up'"),
+        ({"combined": {**EMPTY, "negative": {"left": {"sign": 1.0}}}}, "no cue 'sign'"),
         ({"kind": "temporal", "temporal": learned(chains=()), "withdrawn": 0.95}, "to be smaller"),
         ({"temporal": learned()}, "no cue 'sign'"),
     ],

@@ -280,7 +280,7 @@ class Scene:
 
         Only beliefs that depend on successive frames need this.
         """
-        if self._drive.vehicle.fusion.kind not in ("persistent", "temporal"):
+        if self._drive.vehicle.fusion.kind not in ("persistent", "temporal", "combined"):
             return True
         before, self._before = self._before, frame
         return before is None or not is_repeated(before.boxes, frame.boxes)

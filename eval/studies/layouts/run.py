@@ -30,6 +30,7 @@ from crosscue.eval.studies.pictures import save_png
 from crosscue.eval.studies.simulated_drives import SPARSE_AND_EMBEDDED, run_drives
 from crosscue.eval.studies.study import PageTable, StudyResult, Written, without_nan
 from crosscue.fusion.fit.annotated_approach import AnnotatedApproach
+from crosscue.fusion.fit.combined_fit import fit_combined
 from crosscue.fusion.fit.message_fit import fit_messages
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, TemporalFit, filtered, fit_temporal
 from crosscue.replay.columns import Floats
@@ -60,7 +61,14 @@ DIFFERENCES: Final = ("left out or compared", "Brier", "by it", "log score", "fa
 
 # Kinds of beliefs that are compared. The fourth is the third with the training layouts' frequencies
 # as priors, which ``temporal`` also learns.
-KINDS: Final = ("source", "persistent", "calibrated", "calibrated, base rates", "temporal")
+KINDS: Final = (
+    "source",
+    "persistent",
+    "calibrated",
+    "calibrated, base rates",
+    "temporal",
+    "combined",
+)
 # The belief over time, also outside approaches, where the other kinds have no belief.
 EVERYWHERE: Final = "temporal, every picture"
 # The rules for real roads, by section of the vehicle file.
@@ -419,7 +427,7 @@ def score_layout_study(drives: Sequence[LayoutDrive], *, ablation: bool = True) 
         {kind: score_layouts(some) for kind, some in kinds.items()},
         {
             f"{name} less {kind}": score_difference(kinds[kind], kinds[name])
-            for name in ("temporal", EVERYWHERE)
+            for name in ("temporal", "combined", EVERYWHERE)
             for kind in KINDS
             if kind != name
         },
@@ -442,7 +450,8 @@ def fit_beliefs(drives: Sequence[LayoutDrive]) -> FoldFits:
     """Fit all kinds of beliefs to these drives; the place of a drive is its layout."""
     graph, vehicle = graph_of_runs([one.run for one in drives])
     calibrated = fit_messages([some for one in drives for some in one.approaches], graph).calibrated
-    fitted = fit_temporal([part for one in drives for part in one.parts], graph)
+    parts = [part for one in drives for part in one.parts]
+    fitted = fit_temporal(parts, graph)
     by_layout = {one.layout: one.features for one in drives}
     rates = {
         name: float(np.mean([known[name] for known in by_layout.values() if name in known]))
@@ -459,6 +468,11 @@ def fit_beliefs(drives: Sequence[LayoutDrive]) -> FoldFits:
         "calibrated": learned,
         "calibrated, base rates": {**learned, "features": priors},
         "temporal": {"kind": "temporal", "temporal": fitted.temporal},
+        "combined": {
+            "kind": "combined",
+            "temporal": fitted.temporal,
+            "combined": fit_combined(parts, graph),
+        },
     }
     return FoldFits(fusions, rates, fitted)
 

@@ -179,10 +179,14 @@ def test_fit_of_chains_writes_a_section_for_the_vehicle_file(
 
     reported = json.loads(capsys.readouterr().out)
     assert reported["runs"] == 9
-    text = "version = 1\n[fusion]\nkind = 'temporal'\n" + section.read_text()
-    learned = parse(text, "car.toml").fusion.temporal
-    assert learned is not None
-    assert learned.model_dump(mode="json") == reported["temporal"]
+    fusion = parse("version = 1\n" + section.read_text(), "car.toml").fusion
+    assert fusion.kind == "combined"
+    assert fusion.temporal is not None
+    assert fusion.temporal.model_dump(mode="json") == reported["temporal"]
+    assert fusion.combined is not None
+    weights = fusion.combined.positive["intersection"]
+    assert weights == pytest.approx(reported["combined"]["positive"]["intersection"], rel=1e-3)
+    assert weights["stop_sign"] > 0.0
 
 
 def test_threshold_for_a_rate_is_fitted_on_request(
@@ -196,7 +200,7 @@ def test_threshold_for_a_rate_is_fitted_on_request(
 
     reported = json.loads(capsys.readouterr().out)
     fusion = parse("version = 1\n" + section.read_text(), "car.toml").fusion
-    assert fusion.kind == "temporal"
+    assert fusion.kind == "combined"
     assert fusion.established >= min(reported["threshold"]["threshold"], 0.9999)
     assert reported["threshold"]["false_features"] <= reported["threshold"]["wanted"] == 0.1
     assert crosscue([*command, "--false-features", "-1"]) == 2
