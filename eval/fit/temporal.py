@@ -96,7 +96,7 @@ def section_of(fit: TemporalFit, combined: Combined, threshold: TradePoint | Non
     text = f"# Learned from {fit.drives} drives at {fit.places} places, {fit.steps} steps.\n"
     for name, one in (("temporal", fit.temporal), ("combined", combined)):
         text += section_text(f"fusion.{name}", one.model_dump(exclude_unset=True)) + "\n"
-    text, fusion = text.rstrip("\n") + "\n", {"kind": "combined"}
+    text, fusion = text.rstrip("\n") + "\n", dict[str, object](kind="combined")
     if threshold is None:
         return f"{section_text('fusion', fusion)}\n{text}"
     # Rounded up, for no more false features than wanted.
