@@ -30,15 +30,8 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 def landmark_settings(vehicle: Vehicle) -> LandmarkSettings:
     """Return the search settings from the [landmarks] section and the camera's mounting."""
     section, camera = vehicle.landmarks, vehicle.camera
-    return LandmarkSettings(
-        min_score=section.min_score,
-        sigmas=section.sigmas,
-        max_candidates=section.max_candidates,
-        gate_nis=section.gate_nis,
-        interval_m=section.interval_m,
-        revisit_m=section.revisit_m,
-        lever_m=(camera.x_m, camera.y_m),
-    )
+    fields = section.model_dump(exclude={"matcher", "interval_s"})
+    return LandmarkSettings(**fields, lever_m=(camera.x_m, camera.y_m))
 
 
 def matcher_for(vehicle: Vehicle, name: str | None = None) -> Matcher:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
-from typing import Final, Protocol
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -35,7 +35,6 @@ from crosscue.localization.pose_track import (
     NO_HEADINGS,
     BothSources,
     Headings,
-    MeasurementSource,
     NoMeasurements,
     PoseColumns,
     TrackCounts,
@@ -51,6 +50,9 @@ from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Timeline, TimeSegm
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .visual import VisualSource
+
+if TYPE_CHECKING:
+    from .landmarks import LandmarkStage
 
 # Max plausible fraction of rejected readings; a consistent filter rejects one in a thousand.
 REJECTED_SHARE: Final = 0.1
@@ -119,30 +121,6 @@ def fused_positions(vehicle: Vehicle) -> PositionUpdates | None:
     return PositionUpdates((gnss.x_m, gnss.y_m), gnss.interval_s, gnss.gate_nis, gnss.delay_s)
 
 
-class LandmarkSource(MeasurementSource, Protocol):
-    """Search for landmarks along the pose track, such as ``landmarks.LandmarkStage``."""
-
-    def take_sightings(self) -> list[Sighting]:
-        """Return the sightings since the last call."""
-        ...
-
-    def take_names(self, t_ns: Int64s) -> list[str | None]:
-        """Return the accepted landmark, or None, at each row's time."""
-        ...
-
-    def cross_gap(self) -> None:
-        """Forget matches before a gap in time."""
-        ...
-
-    def let_go(self, before_ns: int) -> None:
-        """Drop frames that are too old to be reached by odometry."""
-        ...
-
-    def counts(self) -> dict[str, int]:
-        """Return the numbers of frames by outcome, for the manifest."""
-        ...
-
-
 class NoLandmarks(NoMeasurements):
     """A replay without a landmark database."""
 
@@ -186,7 +164,7 @@ class PoseStage:
 
     vehicle: Vehicle
     turn: Signal | None
-    landmarks: LandmarkSource = field(default_factory=NoLandmarks)
+    landmarks: LandmarkStage | NoLandmarks = field(default_factory=NoLandmarks)
     positions: PositionUpdates | None = None
     notices: list[str] = field(default_factory=list)
     odometry_counts: odometry.OdometryCounts = field(default_factory=odometry.OdometryCounts)
@@ -452,14 +430,8 @@ def _split(window: SampleWindow, at_ns: int) -> tuple[SampleWindow, SampleWindow
 
 def compass_settings(vehicle: Vehicle) -> compass.CompassSettings:
     """Return the compass settings from the vehicle file."""
-    section = vehicle.compass
-    return compass.CompassSettings(
-        mounting_rotation=section.mounting_rotation,
-        mounting_yaw_rad=section.mounting_yaw_rad,
-        hard_iron_t=section.hard_iron_t,
-        soft_iron=section.soft_iron,
-        declination_rad=section.declination_rad,
-    )
+    names = {field.name for field in fields(compass.CompassSettings)}
+    return compass.CompassSettings(**vehicle.compass.model_dump(include=names))
 
 
 def _wheels(found: Samples | None) -> WheelSamples:

@@ -130,10 +130,8 @@ class SummedAccount(Record):
 
     def lines(self) -> Iterator[tuple[str, str, Counts]]:
         """Stage, name and counts of everything, in order."""
-        yield from _named("reading", self.reading)
-        yield from _named("detecting", self.detecting)
-        yield from _named("estimating", self.estimating)
-        yield from _named("scoring", self.scoring)
+        for stage in _ROWS:
+            yield from _named(stage, getattr(self, stage))
 
 
 # Any of the accounts.
@@ -224,15 +222,9 @@ def account_of(ledger: Ledger) -> LogAccount:
 
 
 def _topic_line(of: Counted) -> TopicLine:
-    return TopicLine(
-        declared=of.declared,
-        entered=of.in_file,
-        found=of.found,
-        used=of.used,
-        skipped=dict(sorted(of.skipped.items())),
-        dropped=dict(sorted(of.dropped.items())),
-        dropped_unknown=tuple(sorted(set(of.dropped_unknown))),
-    )
+    unknown = sorted(set(of.dropped_unknown))
+    counts = line(of.in_file, of.used, of.skipped, of.dropped, unknown)
+    return TopicLine(**dict(counts), declared=of.declared, found=of.found)
 
 
 def reading_of(ledgers: Iterable[Ledger]) -> list[LogAccount]:
@@ -262,13 +254,9 @@ def _joined(ours: LogAccount, before: LogAccount | None, topic: str) -> LogAccou
     topics = {**ours.topics, topic: before.topics[topic]}
     if UNATTRIBUTED not in ours.topics and UNATTRIBUTED in before.topics:
         topics[UNATTRIBUTED] = before.topics[UNATTRIBUTED]
-    return LogAccount(
-        log=ours.log,
-        integrity=ours.integrity,
-        is_whole=ours.is_whole and before.is_whole,
-        notices=tuple(dict.fromkeys([*before.notices, *ours.notices])),
-        topics=topics,
-    )
+    notices = tuple(dict.fromkeys([*before.notices, *ours.notices]))
+    is_whole = ours.is_whole and before.is_whole
+    return ours.model_copy(update={"is_whole": is_whole, "notices": notices, "topics": topics})
 
 
 def sum_accounts(accounts: Iterable[Account | SummedAccount]) -> SummedAccount:
@@ -284,16 +272,10 @@ def sum_accounts(accounts: Iterable[Account | SummedAccount]) -> SummedAccount:
         for stage, name, counts in one.lines():
             totals[stage, name] = _plus(totals.get((stage, name)), counts)
 
-    def of(stage: str) -> dict[str, SummedLine]:
-        return {name: total for (at, name), total in totals.items() if at == stage}
-
-    made = SummedAccount(
-        reading=of("reading"),
-        detecting=of("detecting"),
-        estimating=of("estimating"),
-        scoring=of("scoring"),
-        is_whole=whole,
-    )
+    by_stage: dict[str, dict[str, SummedLine]] = {stage: {} for stage in _ROWS}
+    for (stage, name), total in totals.items():
+        by_stage[stage][name] = total
+    made = SummedAccount(**by_stage, is_whole=whole)
     check_account(made)
     return made
 
