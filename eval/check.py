@@ -285,11 +285,7 @@ def _checked(file: str, kind: Kind, together: Together) -> FileCheck:
 
 
 def _check_settings(together: Together) -> None:
-    """Refuse a picture or an output that no file needs.
-
-    Raises:
-        UsageError: Naming the setting.
-    """
+    """Refuse a picture or an output that no file needs."""
     models = together.of_kind("model", "model card")
     if together.picture is not None and not models:
         raise UsageError(f"picture: {together.picture}, applies only to a model; name its card")
@@ -309,11 +305,7 @@ def _is_only_compared(log: str, together: Together) -> bool:
 
 
 def _kind_of(file: str) -> Kind:
-    """Return the kind of a file.
-
-    Raises:
-        LogError: It does not exist, or is of no kind.
-    """
+    """Return the kind of a file."""
     tree = {} if is_remote(file) else _tree_of(Path(file))
     for kind in KINDS:
         if kind.recognises(file, tree):

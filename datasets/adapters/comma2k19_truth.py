@@ -72,11 +72,7 @@ def write_comma_truth(path: Path, folder: Path) -> Path:
 
 
 def _numbers(path: Path, shape: tuple[int, ...]) -> Floats:
-    """Read rows of finite numbers with one shape.
-
-    Raises:
-        LogFormatError: The file has other contents.
-    """
+    """Read rows of finite numbers with one shape."""
     rows = read_column(path).rows
     if rows.dtype.kind not in "iuf" or rows.shape[1:] != shape or not np.isfinite(rows).all():
         raise LogFormatError(

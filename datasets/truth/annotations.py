@@ -200,10 +200,7 @@ def _by_time(annotations: Annotations, log: LogPictures) -> PictureTimes | None:
     if any(t is None for t in asked):
         return None
     wanted = np.array(asked, np.int64)
-    after = np.clip(np.searchsorted(log.t_ns, wanted), 0, len(log.t_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    is_before = np.abs(wanted - log.t_ns[before]) < np.abs(wanted - log.t_ns[after])
-    found = log.t_ns[np.where(is_before, before, after)]
+    found = nearest(log.t_ns, wanted)
     off = np.abs(found - wanted)
     period = float(np.median(np.diff(log.t_ns))) if len(log.t_ns) > 1 else math.inf
     if off.max() > FAR * period:
@@ -213,6 +210,14 @@ def _by_time(annotations: Annotations, log: LogPictures) -> PictureTimes | None:
             f"near {wanted[worst]} ns; the nearest is {found[worst]} ns; it belongs to another log"
         )
     return PictureTimes(tuple(found.tolist()), f"by time, at most {off.max() * 1e-6:.1f} ms off")
+
+
+def nearest(t_ns: Int64s, wanted: Int64s) -> Int64s:
+    """Return the time of ``t_ns``, which increases, that is nearest to each wanted one."""
+    after = np.clip(np.searchsorted(t_ns, wanted), 0, len(t_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    is_before = np.abs(wanted - t_ns[before]) < np.abs(wanted - t_ns[after])
+    return t_ns[np.where(is_before, before, after)]
 
 
 def _time_of(picture: Picture) -> int | None:

@@ -289,11 +289,7 @@ def _format(place: Path) -> str:
 
 
 def _named(found: Sequence[_Found]) -> list[DriveInput]:
-    """Return each drive with a name that depends on its own logs alone.
-
-    Raises:
-        UsageError: A drive is named twice, or two drives are copies of each other.
-    """
+    """Return each drive with a name that depends on its own logs alone."""
     drives: dict[str, DriveInput] = {}
     for one in found:
         logs = tuple(sorted(one.logs, key=lambda log: (_parts(log)[-1], log)))

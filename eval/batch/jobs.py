@@ -265,9 +265,6 @@ def _check_free(job: Job) -> None:
     """Refuse a drive that a worker on another machine is processing, unless that worker died.
 
     The worker's process is not visible from here, but while it lives it touches its entry.
-
-    Raises:
-        RunError: The worker touched its entry recently.
     """
     worker, lock = str((read_entry(job.run) or {}).get("worker", "")), job.run / LOCK
     if not worker or is_alive(worker) is not None or not lock.exists():

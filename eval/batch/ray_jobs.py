@@ -99,11 +99,7 @@ def check_fits(ray: Any, address: str, cores: int, memory_bytes: int) -> None:
 
 
 def _check_reachable(address: str) -> None:
-    """Refuse an address that accepts no connection, because Ray itself retries for minutes.
-
-    Raises:
-        CrosscueError: The address accepts no connection.
-    """
+    """Refuse an address that accepts no connection, because Ray itself retries for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not (host and port.isdecimal()):
         return

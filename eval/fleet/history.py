@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from markupsafe import Markup
@@ -32,9 +32,6 @@ from crosscue.replay.errors import EmptyResultError, OutputError
 from crosscue.replay.safe_text import counted
 from crosscue.results import Result
 from crosscue.verb import Option
-
-if TYPE_CHECKING:
-    pass
 
 WIDTH: Final = 460.0
 HEIGHT: Final = 190.0

@@ -305,9 +305,6 @@ def _refuse_uncounted(
     """Refuse a network whose labels no cue counts: its card is likely wrong, or lacks ``[labels]``.
 
     A plug-in states its labels itself, and its cue is often written after it.
-
-    Raises:
-        VehicleError: No cue counts any label of a network.
     """
     for one, choice in zip(named, choices, strict=True):
         labels = reportable(one.detector)

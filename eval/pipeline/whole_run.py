@@ -105,11 +105,7 @@ def _input(
 def _camera(
     drive: Drive, detecting: Detecting, landmarks: LandmarkDatabase | None
 ) -> tuple[int, Topic] | None:
-    """Return the camera if detectors or landmarks need it.
-
-    Raises:
-        EmptyResultError: No camera exists, but the user named detectors or landmarks.
-    """
+    """Return the camera if detectors or landmarks need it."""
     if not detecting.choices and landmarks is None:
         return None
     is_needed = detecting.is_required or landmarks is not None

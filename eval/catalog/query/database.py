@@ -96,12 +96,7 @@ def is_statement(text: str) -> bool:
 
 
 def _check(database: duckdb.DuckDBPyConnection, sql: str) -> None:
-    """Refuse everything but a single SELECT over existing names.
-
-    Raises:
-        UsageError: The text is not a single SELECT.
-        duckdb.Error: The text does not parse, or uses a name that does not exist.
-    """
+    """Refuse everything but a single SELECT over existing names."""
     import duckdb
 
     statements = database.extract_statements(sql)

@@ -109,11 +109,7 @@ class LocalRuns:
 
 
 def _tables(folder: Path, also: Sequence[str] = ()) -> list[str]:
-    """Return the names of a folder's tables; Arrow opens them by name, so they are examined here.
-
-    Raises:
-        OSError: The folder cannot be listed, or a table is not a regular file.
-    """
+    """Return the names of a folder's tables, examined because Arrow opens them by name."""
     names = []
     with os.scandir(folder) as entries:
         for entry in entries:

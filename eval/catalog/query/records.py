@@ -119,11 +119,7 @@ def run_rows(
 
 
 def _check_other(head: bytes, error: ValidationError) -> None:
-    """Accept the manifest of a folder that is not a run, such as merged tables.
-
-    Raises:
-        ValueError: The manifest is damaged or of another version.
-    """
+    """Accept the manifest of a folder that is not a run, such as merged tables."""
     try:
         kind = _Head.model_validate_json(head)
     except ValidationError as of_head:

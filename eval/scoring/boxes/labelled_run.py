@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.datasets.truth.annotations import time_in_name
+from crosscue.datasets.truth.annotations import nearest, time_in_name
 from crosscue.datasets.truth.box_labels import BoxLabels, LabelPicture
 from crosscue.detectors.base import MIN_SCORE
 from crosscue.detectors.boxes import is_best_label
@@ -225,13 +225,10 @@ def _times(
     asked = [_time_of(one) for one in labels.pictures]
     if all(t is not None for t in asked):
         wanted = np.array(asked, np.int64)
-        after = np.clip(np.searchsorted(t_ns, wanted), 0, len(t_ns) - 1)
-        before = np.maximum(after - 1, 0)
-        is_before = np.abs(wanted - t_ns[before]) < np.abs(wanted - t_ns[after])
-        nearest = t_ns[np.where(is_before, before, after)]
+        there = nearest(t_ns, wanted)
         period = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 1e9
-        near = np.abs(nearest - wanted) <= FAR * period
-        times = [int(t) if ok else None for t, ok in zip(nearest, near, strict=True)]
+        near = np.abs(there - wanted) <= FAR * period
+        times = [int(t) if ok else None for t, ok in zip(there, near, strict=True)]
         return times, "by time"
     part = detected.selection
     if part.start_ns is not None or part.end_ns is not None:
