@@ -69,10 +69,10 @@ def read_yolo(path: Path, sizes: Sizes) -> Annotations:
         stem = Path(one.name).stem
         size = labelled_size(stem, sizes, path)
         things = []
-        for box in one.boxes:
-            things.append(Annotation(box.label, _in_pixels(*box.box, size), place=one.name))
+        for thing, box in one.boxes():
+            things.append(Annotation(thing.label, _in_pixels(*box, size), place=one.name))
         pictures.append(Picture(stem, size, None, None, tuple(things)))
-    classes = dict.fromkeys(name for part in parts for name in part.classes)
+    classes = dict.fromkeys(name for part in parts for name in part.labels)
     return Annotations(str(path), tuple(classes), tuple(pictures))
 
 

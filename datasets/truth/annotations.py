@@ -41,8 +41,9 @@ class Annotation:
 
     Attributes:
         label: Label as annotated.
-        box_px: x0, y0, x1, y1; None for a label of the complete picture.
-        is_crowd: True for a group of objects that are not counted.
+        box_px: x0, y0, x1, y1; None for a label of the complete picture. In fractions of the
+            picture if that says so.
+        is_crowd: True for a group of objects that are not counted, or a region that is not scored.
         visible: Visible fraction, or None.
         track: Number of the object in all pictures; None if unknown.
         segmentation: COCO's polygons or run lengths, or None.
@@ -68,10 +69,11 @@ class Picture:
 
     Attributes:
         name: File name.
-        size_px: Width and height in the annotation tool.
+        size_px: Width and height in the annotation tool; 0 if it does not specify them.
         t_ns: Log time, if the file reports it.
         frame: Number of the frame in its video, if the file reports it.
         things: Annotated objects; empty if the picture shows none of them.
+        is_in_fractions: True if boxes are in fractions of the picture, not in pixels.
     """
 
     name: str
@@ -79,6 +81,7 @@ class Picture:
     t_ns: int | None = None
     frame: int | None = None
     things: tuple[Annotation, ...] = ()
+    is_in_fractions: bool = False
 
     def boxes(self) -> Iterator[tuple[Annotation, tuple[float, float, float, float]]]:
         """Yield its objects that have a box, with the box."""

@@ -22,7 +22,7 @@ import csv
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final, Literal, TypeAlias
 
@@ -34,6 +34,7 @@ from crosscue.replay.files.tree_text import yaml_tree
 from crosscue.replay.limits import MIB
 from crosscue.verb import Option
 
+from .annotations import Annotation, Annotations, Picture
 from .coco import read_coco
 from .label_xml import read_voc
 
@@ -44,6 +45,7 @@ NAME_FILES: Final = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml")
 DONT_CARE: Final = "DontCare"
 OUTSIDE: Final = "boxes outside the picture, or without area"
 CUT: Final = "boxes cut off at the picture's edge"
+NO_SIZE: Final = (0, 0)
 _KITTI_COLUMNS: Final = 15
 # Separators of the columns of a table of pictures, by suffix.
 _SEPARATORS: Final = {".csv": ",", ".tsv": "\t"}
@@ -76,80 +78,39 @@ Meanings: TypeAlias = Annotated[Mapping[str, str], Option(made_by=meanings_of)]
 
 
 @dataclass(frozen=True, slots=True)
-class LabelBox:
-    """One labelled object.
+class BoxLabels(Annotations):
+    """Labelled boxes of any number of pictures; a label is empty for a region of any class.
 
     Attributes:
-        label: Label as annotated; empty for a region of any class.
-        box: x0, y0, x1, y1, in pixels or in fractions of the picture.
-        is_ignored: True if detecting it counts neither as correct nor as wrong.
-        range_m: Distance from the camera, NaN if unknown.
-    """
-
-    label: str
-    box: tuple[float, float, float, float]
-    is_ignored: bool = False
-    range_m: float = math.nan
-
-
-@dataclass(frozen=True, slots=True)
-class LabelPicture:
-    """One labelled picture.
-
-    Attributes:
-        name: File name of the picture, or of its labels.
-        boxes: Labelled boxes; empty if the picture shows no objects.
-        size_px: Width and height; None if the format does not specify them.
-        t_ns: Log time, if the file specifies it.
-        is_in_fractions: True if boxes are in fractions of the picture, not in pixels.
-    """
-
-    name: str
-    boxes: tuple[LabelBox, ...]
-    size_px: tuple[int, int] | None = None
-    t_ns: int | None = None
-    is_in_fractions: bool = False
-
-    def inside(self, size_px: tuple[int, int], left_out: Counter[str]) -> list[LabelBox]:
-        """Return its boxes in pixels within a picture; others are counted in ``left_out``."""
-        width, height = size_px
-        factor = np.array([width, height] * 2) if self.is_in_fractions else np.ones(4)
-        found = []
-        for one in self.boxes:
-            whole = np.array(one.box) * factor
-            cut = np.clip(whole, 0.0, [width, height, width, height])
-            if cut[2] - cut[0] < 1.0 or cut[3] - cut[1] < 1.0:
-                left_out[OUTSIDE] += 1
-                continue
-            if np.abs(cut - whole).max() > 1.0:
-                left_out[CUT] += 1
-            x0, y0, x1, y1 = cut.tolist()
-            found.append(LabelBox(one.label, (x0, y0, x1, y1), one.is_ignored, one.range_m))
-        return found
-
-
-@dataclass(frozen=True, slots=True)
-class BoxLabels:
-    """Labels of any number of pictures.
-
-    Attributes:
-        where: Path of the file or folder.
         format: Format of the labels.
-        classes: All classes that annotators could use, where known.
-        pictures: All labelled pictures.
-        left_out: Number of boxes that were not read, by reason.
     """
 
-    where: str
-    format: LabelFormat
-    classes: tuple[str, ...]
-    pictures: tuple[LabelPicture, ...]
-    left_out: Mapping[str, int] = field(default_factory=dict)
+    format: LabelFormat = "coco"
 
     @property
     def is_by_picture(self) -> bool:
         """True if each box stands for a whole picture that shows such an object."""
         return self.format == "pictures"
+
+
+def boxes_inside(
+    picture: Picture, size_px: tuple[int, int], left_out: Counter[str]
+) -> list[Annotation]:
+    """Return a picture's boxes in pixels within it; others are counted in ``left_out``."""
+    width, height = size_px
+    factor = np.array([width, height] * 2) if picture.is_in_fractions else np.ones(4)
+    found = []
+    for one, box in picture.boxes():
+        whole = np.array(box) * factor
+        cut = np.clip(whole, 0.0, [width, height, width, height])
+        if cut[2] - cut[0] < 1.0 or cut[3] - cut[1] < 1.0:
+            left_out[OUTSIDE] += 1
+            continue
+        if np.abs(cut - whole).max() > 1.0:
+            left_out[CUT] += 1
+        x0, y0, x1, y1 = cut.tolist()
+        found.append(replace(one, box_px=(x0, y0, x1, y1)))
+    return found
 
 
 def read_box_labels(
@@ -220,33 +181,17 @@ def _recognised(path: Path, files: Sequence[Path]) -> LabelFormat:
 
 def _coco(path: Path) -> BoxLabels:
     found = read_coco(path)
-    pictures = tuple(
-        LabelPicture(
-            one.name,
-            tuple(
-                LabelBox(
-                    thing.label,
-                    box_px,
-                    thing.is_crowd,
-                    math.nan if thing.range_m is None else thing.range_m,
-                )
-                for thing, box_px in one.boxes()
-            ),
-            one.size_px,
-            one.t_ns,
-        )
-        for one in found.pictures
-    )
-    return BoxLabels(str(path), "coco", found.labels, pictures)
+    return BoxLabels(found.where, found.labels, found.pictures)
 
 
 def _voc(path: Path, files: Sequence[Path], class_names: Sequence[str]) -> BoxLabels:
     pictures = []
     for file in files:
         name, size, things = read_voc(file)
-        boxes = tuple(LabelBox(label, box, is_hard) for label, box, is_hard in things)
-        pictures.append(LabelPicture(name, boxes, size))
-    return BoxLabels(str(path), "voc", _classes(pictures, class_names), tuple(pictures))
+        boxes = tuple(Annotation(label, box, is_hard) for label, box, is_hard in things)
+        pictures.append(Picture(name, size or NO_SIZE, things=boxes))
+    classes = _classes(pictures, class_names)
+    return BoxLabels(str(path), classes, tuple(pictures), format="voc")
 
 
 def _kitti(path: Path, files: Sequence[Path], class_names: Sequence[str]) -> BoxLabels:
@@ -264,15 +209,16 @@ def _kitti(path: Path, files: Sequence[Path], class_names: Sequence[str]) -> Box
             box, ahead_m = _numbers(words[4:8], where), _numbers(words[13:14], where)[0]
             is_any = words[0] == DONT_CARE
             boxes.append(
-                LabelBox(
+                Annotation(
                     "" if is_any else words[0],
                     (box[0], box[1], box[2], box[3]),
                     is_any,
-                    ahead_m if ahead_m > 0.0 else math.nan,
+                    range_m=ahead_m if ahead_m > 0.0 else None,
                 )
             )
-        pictures.append(LabelPicture(file.name, tuple(boxes)))
-    return BoxLabels(str(path), "kitti", _classes(pictures, class_names), tuple(pictures))
+        pictures.append(Picture(file.name, NO_SIZE, things=tuple(boxes)))
+    classes = _classes(pictures, class_names)
+    return BoxLabels(str(path), classes, tuple(pictures), format="kitti")
 
 
 def _pictures(path: Path) -> BoxLabels:
@@ -288,12 +234,13 @@ def _pictures(path: Path) -> BoxLabels:
             )
         shown = [_is_shown(word, f"{path}:{number}") for word in row[1:]]
         boxes = tuple(
-            LabelBox(name, (0.0, 0.0, 1.0, 1.0))
+            Annotation(name, (0.0, 0.0, 1.0, 1.0))
             for name, is_there in zip(heading[1:], shown, strict=True)
             if is_there
         )
-        pictures.append(LabelPicture(row[0].strip(), boxes, is_in_fractions=True))
-    return BoxLabels(str(path), "pictures", tuple(heading[1:]), tuple(pictures))
+        name = row[0].strip()
+        pictures.append(Picture(name, NO_SIZE, things=boxes, is_in_fractions=True))
+    return BoxLabels(str(path), tuple(heading[1:]), tuple(pictures), format="pictures")
 
 
 def _is_shown(word: str, where: str) -> bool:
@@ -303,8 +250,8 @@ def _is_shown(word: str, where: str) -> bool:
     return plain in _YES
 
 
-def _classes(pictures: Sequence[LabelPicture], class_names: Sequence[str]) -> tuple[str, ...]:
-    used = {box.label for one in pictures for box in one.boxes if box.label}
+def _classes(pictures: Sequence[Picture], class_names: Sequence[str]) -> tuple[str, ...]:
+    used = {thing.label for one in pictures for thing in one.things if thing.label}
     return (*class_names, *sorted(used.difference(class_names)))
 
 
@@ -325,9 +272,9 @@ def _yolo(path: Path, files: Sequence[Path], names: Sequence[str]) -> BoxLabels:
                 )
             x, y, w, h = _numbers(words[1:], where)
             box = (x - 0.5 * w, y - 0.5 * h, x + 0.5 * w, y + 0.5 * h)
-            boxes.append(LabelBox(names[int(words[0])], box))
-        pictures.append(LabelPicture(file.name, tuple(boxes), is_in_fractions=True))
-    return BoxLabels(str(path), "yolo", tuple(names), tuple(pictures))
+            boxes.append(Annotation(names[int(words[0])], box))
+        pictures.append(Picture(file.name, NO_SIZE, things=tuple(boxes), is_in_fractions=True))
+    return BoxLabels(str(path), tuple(names), tuple(pictures), format="yolo")
 
 
 def _names_of(path: Path) -> tuple[str, ...]:

@@ -1,13 +1,12 @@
 """Labelled boxes in four formats: the same boxes, and one line for unreadable labels."""
 
 import json
-import math
 from collections import Counter
 from pathlib import Path
 
 import pytest
 
-from crosscue.datasets.truth.box_labels import BoxLabels, read_box_labels
+from crosscue.datasets.truth.box_labels import BoxLabels, boxes_inside, read_box_labels
 from crosscue.replay.errors import AnnotationError, UsageError
 
 BOX = (10.0, 20.0, 50.0, 60.0)
@@ -64,13 +63,13 @@ def test_every_format_yields_same_box(name: str, tmp_path: Path) -> None:
     found = read(FORMATS[name](tmp_path))
 
     (picture,) = found.pictures
-    car, *regions = picture.inside(SIZE, Counter())
+    car, *regions = boxes_inside(picture, SIZE, Counter())
     assert found.format == name
-    assert "car" in found.classes
-    assert (car.label, car.is_ignored) == ("car", False)
-    assert car.box == pytest.approx(BOX)
-    assert [one.is_ignored for one in regions] == ([] if name == "yolo" else [True])
-    assert car.range_m == 12.5 if name in ("coco", "kitti") else math.isnan(car.range_m)
+    assert "car" in found.labels
+    assert (car.label, car.is_crowd) == ("car", False)
+    assert car.box_px == pytest.approx(BOX)
+    assert [one.is_crowd for one in regions] == ([] if name == "yolo" else [True])
+    assert car.range_m == (12.5 if name in ("coco", "kitti") else None)
 
 
 CAR = {"classes.txt": "car"}

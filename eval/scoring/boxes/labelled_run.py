@@ -8,6 +8,7 @@ and left out, and frames without labels are not judged.
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -16,8 +17,8 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.datasets.truth.annotations import nearest, time_in_name
-from crosscue.datasets.truth.box_labels import BoxLabels, LabelPicture
+from crosscue.datasets.truth.annotations import Picture, nearest, time_in_name
+from crosscue.datasets.truth.box_labels import NO_SIZE, BoxLabels, boxes_inside
 from crosscue.detectors.base import MIN_SCORE
 from crosscue.detectors.boxes import is_best_label
 from crosscue.detectors.catalog.class_names import cue_label
@@ -133,7 +134,7 @@ def labelled_run(
         log_t_ns: (t_ns, (width, height))
         for log_t_ns, t_ns, width, height in zip(*columns, strict=True)
     }
-    left_out: Counter[str] = Counter(labels.left_out)
+    left_out: Counter[str] = Counter(labels.ignored)
     placed, rule = _placed(run, detected, labels, np.array(sorted(frames), np.int64), left_out)
     reported = chosen.labels if chosen.labels is not None else _labels_met(run, chosen.name)
     classes, of_labels, of_found = _classes(labels, chosen.name, reported, dict(meanings or {}))
@@ -188,11 +189,11 @@ def _placed(
     labels: BoxLabels,
     t_ns: Int64s,
     left_out: Counter[str],
-) -> tuple[dict[int, LabelPicture], str]:
+) -> tuple[dict[int, Picture], str]:
     """Return labels by log time of the frame, and the rule by which they were matched."""
     found, rule = _times(run, detected, labels, t_ns)
     inside = set(t_ns.tolist())
-    placed: dict[int, LabelPicture] = {}
+    placed: dict[int, Picture] = {}
     for picture, t in zip(labels.pictures, found, strict=True):
         if t is None or t not in inside:
             left_out[OTHER_LOG] += 1
@@ -248,7 +249,7 @@ def _stem(name: str) -> str:
     return re.sub(r"\.[^.]*$", "", re.split(r"[/\\]", name)[-1])
 
 
-def _time_of(picture: LabelPicture) -> int | None:
+def _time_of(picture: Picture) -> int | None:
     if picture.t_ns is not None:
         return picture.t_ns
     return time_in_name(_stem(picture.name))
@@ -262,15 +263,15 @@ def _classes(
     Names that are missing in these are not judged; those of class None are ignored.
     """
     for name, means in meanings.items():
-        if name not in (*labels.classes, *reported):
+        if name not in (*labels.labels, *reported):
             raise UsageError(
                 f"meanings: {name}={means}, no such class; the labels have "
-                f"{_listed(labels.classes)}; {detector} reports {_listed(reported)}"
+                f"{_listed(labels.labels)}; {detector} reports {_listed(reported)}"
             )
     of_found = {name: meanings.get(name, name) or None for name in reported}
     plain = {_plain(name): name for name in reported}
     of_labels: dict[str, str | None] = {}
-    for name in labels.classes:
+    for name in labels.labels:
         if name in meanings:
             of_labels[name] = meanings[name] or None
             continue
@@ -281,7 +282,7 @@ def _classes(
     if not both:
         raise SchemaError(
             f"{labels.where}: no class that {detector} reports; the labels have "
-            f"{_listed(labels.classes)}; map them with --map LABEL=NAME"
+            f"{_listed(labels.labels)}; map them with --map LABEL=NAME"
         )
     return tuple(sorted(both)), of_labels, of_found
 
@@ -303,7 +304,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _truth(
-    pictures: Sequence[LabelPicture],
+    pictures: Sequence[Picture],
     sizes: Sequence[tuple[int, int]],
     of_labels: Mapping[str, str | None],
     left_out: Counter[str],
@@ -311,17 +312,19 @@ def _truth(
     """Return picture, class (None for any class), box, whether it is ignored, and range."""
     rows = []
     for number, (picture, size) in enumerate(zip(pictures, sizes, strict=True)):
-        if picture.size_px not in (None, size):
+        if picture.size_px not in (NO_SIZE, size):
             raise SchemaError(
                 f"{picture.name}: labelled at {picture.size_px} pixels, the run's image has "
                 f"{size}; label images as recorded"
             )
-        for one in picture.inside(size, left_out):
+        for one in boxes_inside(picture, size, left_out):
             if one.label and one.label not in of_labels:
                 left_out[f"{OTHER_CLASS} ({one.label})"] += 1
                 continue
             means = of_labels[one.label] if one.label else None
-            rows.append((number, means, one.box, one.is_ignored or means is None, one.range_m))
+            assert one.box_px is not None
+            range_m = math.nan if one.range_m is None else one.range_m
+            rows.append((number, means, one.box_px, one.is_crowd or means is None, range_m))
     return rows
 
 
