@@ -34,7 +34,7 @@ from crosscue.eval.runs.manifest import (
     MergedLog,
     MergedManifest,
 )
-from crosscue.eval.runs.settings_hash import settings_sha256
+from crosscue.eval.runs.settings_hash import text_and_sha256
 from crosscue.eval.runs.tables.columns import DRIVE, arrow_schema
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tags import read_tags
@@ -175,11 +175,11 @@ def _manifest(
 
 def _settings_hash(manifest: DriveManifest) -> str:
     detected = manifest.detect if isinstance(manifest, EstimateManifest) else None
-    return settings_sha256(
+    return text_and_sha256(
         manifest.settings.model_dump(mode="json"),
         None if detected is None else [one.as_json() for one in detected.detectors],
         manifest.selection.as_json(),
-    )
+    )[1]
 
 
 def _tables_hash(run: RunFolder) -> str:

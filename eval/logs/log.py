@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import numpy as np
 
+from crosscue.eval.runs.tables.parquet import arrow_column, numpy_column
 from crosscue.replay.base import EVERYTHING, Selection, name_of
 from crosscue.replay.base import Log as OneLog
 from crosscue.replay.columns import Block, CanFrames, Images, Messages, Table, Topic
@@ -572,14 +573,18 @@ def _table_of(blocks: Sequence[Block], reported: Mapping[str, object]) -> pa.Tab
     import pyarrow as pa
 
     if not blocks:
-        return pa.table({"log_t_ns": pa.array([], pa.int64())}, metadata=_metadata(reported))
+        return pa.schema({"log_t_ns": pa.int64()}, _metadata(reported)).empty_table()
     units = blocks[0].rows.units if isinstance(blocks[0].rows, Table) else {}
-    arrays = {name: pa.array(values) for name, values in topic_columns(blocks).items()}
+    arrays = {name: numpy_column(values) for name, values in topic_columns(blocks).items()}
+    content: list[pa.Array] = []
     if isinstance(blocks[0].rows, Images):
-        arrays["coding"] = pa.array([one for block in blocks for one in _images(block).coding])
-        arrays["data"] = pa.chunked_array([_views(_images(block).bytes_) for block in blocks])
+        codings = [one for block in blocks for one in _images(block).coding]
+        arrays["coding"] = arrow_column(codings, pa.string())
+        content = [_views(_images(block).bytes_) for block in blocks]
     if isinstance(blocks[0].rows, CanFrames):
-        arrays["data"] = pa.chunked_array([_payloads(block.rows) for block in blocks])
+        content = [_payloads(block.rows) for block in blocks]
+    if content:
+        arrays["data"] = content[0] if len(content) == 1 else pa.chunked_array(content)
     fields = [
         pa.field(name, array.type, metadata={"unit": units[name]} if units.get(name) else None)
         for name, array in arrays.items()
@@ -615,16 +620,14 @@ def _payloads(rows: object) -> pa.Array:
     import pyarrow as pa
 
     assert isinstance(rows, CanFrames)
-    width = rows.data.shape[1]
-    length = np.minimum(rows.length, width).astype(np.int32)
-    stop = np.concatenate([[0], np.cumsum(length, dtype=np.int32)]).astype(np.int32)
-    is_full = bool((length == width).all())
-    content = rows.data if is_full else rows.data[np.arange(width) < length[:, None]]
-    return pa.Array.from_buffers(
-        pa.binary(),
-        len(rows),
-        [None, pa.py_buffer(stop), pa.py_buffer(np.ascontiguousarray(content))],
-    )
+    size, width = rows.data.shape
+    stop, content = np.arange(0, (size + 1) * width, width, dtype=np.int32), rows.data
+    if np.count_nonzero(rows.length < width):
+        length = np.minimum(rows.length, width)
+        np.cumsum(length, out=stop[1:])
+        content = content[np.arange(width) < length[:, None]]
+    buffers = [None, pa.py_buffer(stop), pa.py_buffer(np.ascontiguousarray(content))]
+    return pa.Array.from_buffers(pa.binary(), size, buffers)
 
 
 def _metadata(reported: Mapping[str, object]) -> dict[str, str] | None:

@@ -5,52 +5,32 @@ from __future__ import annotations
 import hashlib
 import json
 import marshal
-from collections.abc import Callable, Mapping
-from functools import wraps
-from typing import Final, ParamSpec
+from collections.abc import Mapping
+from typing import Final
 
 from crosscue.replay.files.tree_text import json_tree
 
-P = ParamSpec("P")
-# Number of results that are kept of each function.
+# Number of results that are kept, because most runs share their settings.
 KEPT: Final = 256
+# Results by a key that is made ten times as fast as JSON, and only compared.
+_kept: Final[dict[bytes, tuple[str, str]]] = {}
 
 
-def _kept(make: Callable[P, str]) -> Callable[P, str]:
-    """Keep the results of a function of JSON values, because most runs share their settings.
+def text_and_sha256(settings: object, detectors: object, selection: object) -> tuple[str, str]:
+    """Return the settings as JSON, and their hash with the detectors and the selection.
 
-    The keys are made ten times as fast as JSON, and they are only compared.
+    All are JSON values. Only the names of files are hashed, without their folders, so that a drive
+    replayed elsewhere yields the same hash.
     """
-    found: dict[bytes, str] = {}
-
-    @wraps(make)
-    def cached(*values: P.args, **named: P.kwargs) -> str:
-        key = marshal.dumps([*values, *named.items()], 2)
-        if key not in found:
-            if len(found) >= KEPT:
-                found.clear()
-            found[key] = make(*values, **named)
-        return found[key]
-
-    return cached
-
-
-@_kept
-def settings_text(settings: object) -> str:
-    """Return the settings as JSON."""
-    return json.dumps(settings, sort_keys=True)
-
-
-@_kept
-def settings_sha256(settings: object, detectors: object, selection: object) -> str:
-    """Return the hash of the settings, the detectors and the selection, all as JSON values.
-
-    Only the names of files are hashed, without their folders, so that a drive replayed elsewhere
-    yields the same hash.
-    """
-    made_with = json.dumps([settings, detectors, selection], sort_keys=True)
-    plain = _without_places(json_tree(made_with))
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+    key = marshal.dumps([settings, detectors, selection], 2)
+    if key not in _kept:
+        if len(_kept) >= KEPT:
+            _kept.clear()
+        made_with = json.dumps([settings, detectors, selection], sort_keys=True)
+        plain = json.dumps(_without_places(json_tree(made_with)), sort_keys=True)
+        text = json.dumps(settings, sort_keys=True)
+        _kept[key] = text, hashlib.sha256(plain.encode()).hexdigest()
+    return _kept[key]
 
 
 def _without_places(value: object) -> object:

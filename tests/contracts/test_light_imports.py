@@ -121,6 +121,18 @@ assert not found, found
     run_without((*HEAVY, "pandas", "multiprocessing"), code, line, folder=drive.parent)
 
 
+def test_tables_and_batches_of_a_log_do_not_import_pandas(drive: Path) -> None:
+    code = """
+import sys
+import crosscue
+with crosscue.open(sys.argv[1]) as log:
+    rows = sum(batch.num_rows for _, batch in log.batches())
+    print(rows, len(log["/can"].table()))
+"""
+    printed = run_without((*HEAVY, "pandas"), code, str(drive))
+    assert min(map(int, printed.split())) > 0
+
+
 def test_replay_with_onnx_detector_and_score_need_no_heavy_library(drive: Path) -> None:
     run = drive.parent / "run"
 

@@ -19,7 +19,7 @@ from crosscue.eval.runs.manifest import (
     TimeSegments,
     Timings,
 )
-from crosscue.eval.runs.settings_hash import settings_sha256, settings_text
+from crosscue.eval.runs.settings_hash import text_and_sha256
 from crosscue.eval.runs.tags import parse_tags
 from crosscue.replay.errors import one_line
 from crosscue.replay.files.identity import identity_of_all
@@ -145,7 +145,8 @@ def _results(content: bytes) -> list[Row]:
     try:
         # Without threads, which take longer to start than a run's few rows to read.
         file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
-        return list(file.read(use_threads=False).to_pylist())
+        rows: list[Row] = file.read(use_threads=False).to_pylist() if file.metadata.num_rows else []
+        return rows
     except (OSError, pa.ArrowException) as error:
         raise ValueError(f"{JUDGED}: damaged ({one_line(error)}); score the run again") from None
 
@@ -161,6 +162,8 @@ def _run_row(
 ) -> Row:
     lines = [one for _, _, one in manifest.account.lines()]
     segments = manifest.time.segments
+    detectors = None if detect is None else list(detect.detectors)
+    text, sha256 = text_and_sha256(manifest.settings, detectors, manifest.selection)
     identity = identity_of_all([log.identity for log in manifest.logs]) if manifest.logs else None
     return {
         "run": found.run,
@@ -174,16 +177,9 @@ def _run_row(
         "vehicle": manifest.settings.get("name"),
         "crosscue": manifest.versions.get("crosscue"),
         "crosscue_commit": manifest.versions.get("crosscue_commit"),
-        "models": [
-            {"name": one["name"], "identity": one["identity"]}
-            for one in (() if detect is None else detect.detectors)
-        ],
-        "settings": settings_text(manifest.settings),
-        "settings_sha256": settings_sha256(
-            manifest.settings,
-            None if detect is None else list(detect.detectors),
-            manifest.selection,
-        ),
+        "models": [{"name": one["name"], "identity": one["identity"]} for one in detectors or ()],
+        "settings": text,
+        "settings_sha256": sha256,
         "tags": list(tags.items()),
         "conditions": sorted({tag for one in results for tag in one["conditions"]}),
         "start_ns": segments[0].start_ns if segments else None,

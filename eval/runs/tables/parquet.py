@@ -56,6 +56,19 @@ def arrow_column(values: Any, kind: pa.DataType) -> pa.Array:
     return pa.Array.from_buffers(kind, size, [present, content])
 
 
+def numpy_column(values: NDArray[np.generic]) -> pa.Array:
+    """Return numbers or texts as a column of Arrow, which shares their memory where it can."""
+    import pyarrow as pa
+
+    if values.dtype.kind == "U":
+        return arrow_column(values, pa.string())
+    if values.dtype == np.bool_:
+        content = _bits(values.view(np.bool_))
+    else:
+        content = pa.py_buffer(np.ascontiguousarray(values))
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, content])
+
+
 def _bits(flags: NDArray[np.bool_]) -> pa.Buffer:
     import pyarrow as pa
 

@@ -18,11 +18,9 @@ _WINDOW_BYTES: Final = 1 << 27
 
 def is_compressed(buffer: Bytes, start: Int64s, stop: Int64s) -> NDArray[np.bool_]:
     """Return a mask of the messages that start like a zstd frame, shape (N,)."""
-    long: NDArray[np.bool_] = stop - start >= 4
-    first = np.zeros(len(start), dtype=np.uint32)
-    for shift in range(4):
-        first[long] |= buffer[start[long] + shift].astype(np.uint32) << np.uint32(8 * shift)
-    packed: NDArray[np.bool_] = long & (first == ZSTD_MAGIC)
+    packed: NDArray[np.bool_] = stop - start >= 4
+    words = np.ndarray((max(len(buffer) - 3, 0),), "<u4", buffer.data, 0, (1,))
+    packed[packed] = words[start[packed]] == ZSTD_MAGIC
     return packed
 
 
