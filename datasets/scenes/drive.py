@@ -27,10 +27,10 @@ from crosscue.datasets.simulated.drive import (
     sense,
     with_simulated_noise,
 )
-from crosscue.datasets.simulated.log_files import SOURCE, sensor_blocks, true_track
+from crosscue.datasets.simulated.log_files import SOURCE, image_block, sensor_blocks, true_track
 from crosscue.datasets.truth.truth import Approach, Features, Mounting
 from crosscue.datasets.truth.tum import write_track_truth
-from crosscue.replay.columns import Block, ImageCoding, Images, Int64s, Messages, Topic
+from crosscue.replay.columns import Block, ImageCoding, Int64s, Messages, Topic
 from crosscue.replay.encode.outgoing import standard_type
 from crosscue.replay.encode.template import filled, template_of
 from crosscue.replay.files import door
@@ -282,7 +282,7 @@ class _Record:
         times = np.array([t_ns for t_ns, _ in batch], np.int64)
         log_ns = times + 9_000_000 + np.rint(late.exponential(2e6, len(times))).astype(np.int64)
         coded = [self._imager.encode(picture, self.settings.picture) for _, picture in batch]
-        yield _images(times, log_ns, coded, self._imager.coding)
+        yield image_block(IMAGES, np.maximum.accumulate(log_ns), times, coded, self._imager.coding)
         yield _calibration(times, log_ns, self.settings.camera)
         yield device.frames(times, [picture for _, picture in batch], MOBILEYE_BUS)
 
@@ -361,14 +361,6 @@ def _between(blocks: list[Block], begin_ns: int, end_ns: int) -> Iterator[Block]
         part = block.take((block.log_ns >= begin_ns) & (block.log_ns < end_ns))
         if len(part):
             yield part
-
-
-def _images(times: Int64s, log_ns: Int64s, coded: list[bytes], coding: ImageCoding) -> Block:
-    stop = np.cumsum([len(one) for one in coded], dtype=np.int64)
-    start = np.concatenate([[0], stop[:-1]]).astype(np.int64)
-    buffer = np.frombuffer(b"".join(coded), np.uint8)
-    images = Images(Messages(buffer, start, stop), (coding,) * len(coded))
-    return Block(IMAGES, np.maximum.accumulate(log_ns), images, header_ns=times)
 
 
 def _calibration(times: Int64s, log_ns: Int64s, camera: SceneCamera) -> Block:

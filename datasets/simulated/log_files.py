@@ -12,7 +12,19 @@ from crosscue.datasets.truth.truth import Mounting
 from crosscue.datasets.truth.tum import Trajectory, planar, write_track_truth
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
-from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table, Topic
+from crosscue.replay.columns import (
+    DATA,
+    Block,
+    Bytes,
+    CanFrames,
+    Floats,
+    ImageCoding,
+    Images,
+    Int64s,
+    Messages,
+    Table,
+    Topic,
+)
 from crosscue.replay.files.whole_file import write_bytes, write_text
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
@@ -39,17 +51,44 @@ def sensor_blocks(sensed: Sensed, seed: int) -> list[Block]:
     """Return readings as rows of a log, in batches, in order of the batches' first rows."""
     rng = np.random.default_rng([seed, 3])
     blocks = [
-        *_batches(_can_block(sensed, rng)),
-        *_batches(_stamped(GYRO.name, sensed.gyro_t_ns, "gyro_{}_radps", sensed.gyro_radps, rng)),
-        *_batches(_stamped(MAGNETOMETER.name, sensed.mag_t_ns, "mag_{}_t", sensed.mag_t, rng)),
+        *batches(_can_block(sensed, rng)),
+        *batches(_stamped(GYRO.name, sensed.gyro_t_ns, "gyro_{}_radps", sensed.gyro_radps, rng)),
+        *batches(_stamped(MAGNETOMETER.name, sensed.mag_t_ns, "mag_{}_t", sensed.mag_t, rng)),
     ]
     return sorted(blocks, key=lambda block: int(block.log_ns[0]))
 
 
-def _batches(block: Block) -> list[Block]:
+def batches(block: Block) -> list[Block]:
+    """Return the rows of a block in blocks of at most ``BATCH_ROWS``."""
     return [
         block.take(slice(start, start + BATCH_ROWS)) for start in range(0, len(block), BATCH_ROWS)
     ]
+
+
+def can_frames(identifiers: list[int], coded: list[Bytes]) -> CanFrames:
+    """Return classic frames: at each time one of each message, with N payloads each."""
+    n, k = len(coded[0]), len(identifiers)
+    payload = np.zeros((k * n, 8), np.uint8)
+    for i, one in enumerate(coded):
+        payload[i::k, : one.shape[1]] = one
+    return CanFrames(
+        np.tile(np.array(identifiers, np.uint32), n),
+        np.zeros(k * n, np.bool_),
+        np.full(k * n, DATA, np.uint8),
+        np.tile(np.array([one.shape[1] for one in coded], np.uint8), n),
+        payload,
+        np.zeros(k * n, np.bool_),
+    )
+
+
+def image_block(
+    topic: str, log_ns: Int64s, header_ns: Int64s, coded: list[bytes], coding: ImageCoding = "jpeg"
+) -> Block:
+    """Return encoded pictures as a block."""
+    stop = np.cumsum([len(one) for one in coded], dtype=np.int64)
+    start = np.concatenate([[0], stop[:-1]]).astype(np.int64)
+    rows = Messages(np.frombuffer(b"".join(coded), np.uint8), start, stop)
+    return Block(topic, log_ns, Images(rows, (coding,) * len(coded)), header_ns=header_ns)
 
 
 def _late(t_ns: Int64s, rng: np.random.Generator, min_ms: float, mean_ms: float) -> Int64s:
@@ -77,17 +116,7 @@ def _can_block(sensed: Sensed, rng: np.random.Generator) -> Block:
             "COUNTER": np.arange(n) % 16,
         },
     )
-    payload = np.zeros((2 * n, 8), np.uint8)
-    payload[0::2, : wheels.shape[1]] = wheels
-    payload[1::2, : steering.shape[1]] = steering
-    frames = CanFrames(
-        np.tile(np.array([176, 192], np.uint32), n),
-        np.zeros(2 * n, np.bool_),
-        np.full(2 * n, DATA, np.uint8),
-        np.tile(np.array([wheels.shape[1], steering.shape[1]], np.uint8), n),
-        payload,
-        np.zeros(2 * n, np.bool_),
-    )
+    frames = can_frames([176, 192], [wheels, steering])
     sent = np.repeat(sensed.wheel_t_ns, 2) + np.tile(np.array([0, 250_000]), n)
     return Block(BUS.name, _late(sent, rng, 0.3, 0.1), frames)
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -72,12 +72,12 @@ NONE: Final = Tolerance("*", 0.0, False)
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
-    """A setting or version that differs; None where a run lacks it."""
+class Change(Generic[T]):
+    """What differs: a setting or version, None where a run lacks it, or a metric, then NaN."""
 
     path: str
-    before: object
-    after: object
+    before: T
+    after: T
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,15 +112,6 @@ class TableChange:
     columns: dict[str, ColumnChange]
 
 
-@dataclass(frozen=True, slots=True)
-class MetricChange:
-    """A metric that differs and is not judged; NaN where a run lacks it."""
-
-    path: str
-    before: float
-    after: float
-
-
 @dataclass(frozen=True, slots=True, repr=False)
 class Comparison(Result):
     """Everything that differs between two runs; its ``repr`` is the output of ``crosscue compare``.
@@ -139,10 +130,10 @@ class Comparison(Result):
         is_many: True if sets of runs are compared.
     """
 
-    changes: tuple[Change, ...]
+    changes: tuple[Change[object], ...]
     tables: tuple[TableChange, ...]
     judged: tuple[PairedMetric, ...]
-    metrics: tuple[MetricChange, ...]
+    metrics: tuple[Change[float], ...]
     no_longer_scored: tuple[str, ...]
     tables_same: int
     drives: tuple[int, int, int]
@@ -335,7 +326,7 @@ def _tree_of(path: Path) -> dict[str, Any]:
 
 def _others(
     before: Mapping[str, MetricValue], after: Mapping[str, MetricValue]
-) -> tuple[MetricChange, ...]:
+) -> tuple[Change[float], ...]:
     """Return the metrics that differ and are not judged.
 
     Metrics of a single drive are named after its run folder. If only one side has that folder, they
@@ -349,7 +340,7 @@ def _others(
         old, new = before.get(path, lacking).value, after.get(path, lacking).value
         is_same = old == new or (math.isnan(old) and math.isnan(new))
         if not is_same and direction(path) is None:
-            changes.append(MetricChange(path, old, new))
+            changes.append(Change(path, old, new))
     return tuple(changes)
 
 
@@ -565,7 +556,7 @@ def _judged_lines(one: PairedMetric) -> Iterator[str]:
     yield f"{'':11}{one.after - one.before:+.3g} ({ends}) {over}"
 
 
-def _metric_line(one: MetricChange) -> str:
+def _metric_line(one: Change[float]) -> str:
     return f"metric     {visible(one.path)}: {_value(one.before)} -> {_value(one.after)}"
 
 

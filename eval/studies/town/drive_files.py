@@ -8,7 +8,6 @@ database. At an unnoticed landmark, the wall is not in the database. Truth is in
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -16,9 +15,16 @@ from typing import Final
 import numpy as np
 
 from crosscue.datasets.simulated.drive import FIELD_T, FILES_OF_DRIVE, START_NS
-from crosscue.datasets.truth.truth import Mounting, Truth
-from crosscue.datasets.truth.truth import save as save_truth
-from crosscue.datasets.truth.tum import planar, write_tum
+from crosscue.datasets.simulated.log_files import (
+    BUS,
+    SOURCE,
+    batches,
+    can_frames,
+    image_block,
+)
+from crosscue.datasets.simulated.log_files import MAGNETOMETER as COMPASS
+from crosscue.datasets.truth.truth import Mounting
+from crosscue.datasets.truth.tum import planar, write_track_truth
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.town.drive import (
     LANDMARK_MISSED,
@@ -30,28 +36,13 @@ from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import TownDrive
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
-from crosscue.replay.columns import (
-    DATA,
-    Block,
-    Bytes,
-    CanFrames,
-    Floats,
-    Images,
-    Int64s,
-    Messages,
-    Table,
-    Topic,
-)
+from crosscue.replay.columns import Block, Bytes, Floats, Int64s, Table, Topic
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 
-BUS: Final = Topic("/can", "crosscue/CanFrames", "columns")
-COMPASS: Final = Topic("/compass", "sensor_msgs/msg/MagneticField", "columns")
 CAMERA: Final = Topic("/camera", "crosscue/Images", "columns")
 WHEELS_ID: Final = 176
-BATCH_ROWS: Final = 1000
-SOURCE: Final = "simulated by crosscue, exact"
 WIDTH_PX, HEIGHT_PX = 480, 360
 TRUTH_EVERY: Final = 5
 
@@ -200,34 +191,19 @@ def _times(settings: TownDrive, steps: int) -> Int64s:
 def _in_order(
     settings: TownDrive, traced: Traced, t_ns: Int64s, passed: Floats, seed: int, folder: Path
 ) -> list[Block]:
-    blocks = list(_batches(_can_block(settings, traced, t_ns, folder)))
+    blocks = batches(_can_block(settings, traced, t_ns, folder))
     if settings.sensors.compass_2sigma_deg is not None:
-        blocks += _batches(_compass_block(traced, t_ns))
+        blocks += batches(_compass_block(traced, t_ns))
     blocks += [_frames_block(row, t_ns, i, seed) for i, row in enumerate(passed)]
     return sorted(blocks, key=lambda block: int(block.log_ns[0]))
-
-
-def _batches(block: Block) -> Iterator[Block]:
-    for start in range(0, len(block), BATCH_ROWS):
-        yield block.take(slice(start, start + BATCH_ROWS))
 
 
 def _can_block(settings: TownDrive, traced: Traced, t_ns: Int64s, folder: Path) -> Block:
     """Return the wheel speeds of each step, with the time of its middle."""
     database = CanDatabase.load([folder / "study_car.dbc"])
     kmh = np.round(traced.steps[:, 4:6] / settings.car.step_s * 3.6, 2)
-    payload = np.zeros((len(t_ns), 8), np.uint8)
     coded = encode(database.named("REAR_WHEELS"), {"REAR_LEFT": kmh[:, 0], "REAR_RIGHT": kmh[:, 1]})
-    payload[:, : coded.shape[1]] = coded
-    n = len(t_ns)
-    frames = CanFrames(
-        np.full(n, WHEELS_ID, np.uint32),
-        np.zeros(n, np.bool_),
-        np.full(n, DATA, np.uint8),
-        np.full(n, coded.shape[1], np.uint8),
-        payload,
-        np.zeros(n, np.bool_),
-    )
+    frames = can_frames([WHEELS_ID], [coded])
     return Block(BUS.name, t_ns - round(settings.car.step_s * 0.5e9), frames)
 
 
@@ -266,10 +242,7 @@ def _frames_block(row: Floats, t_ns: Int64s, number: int, seed: int) -> Block:
         done, buffer = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])
         assert done
         coded.append(buffer.tobytes())
-    stop = np.cumsum([len(one) for one in coded], dtype=np.int64)
-    start = np.concatenate([[0], stop[:-1]]).astype(np.int64)
-    rows = Messages(np.frombuffer(b"".join(coded), np.uint8), start, stop)
-    return Block(CAMERA.name, at_ns, Images(rows, ("jpeg",) * len(coded)), header_ns=at_ns)
+    return image_block(CAMERA.name, at_ns, at_ns, coded)
 
 
 def _wall(seed: int, number: int) -> Bytes:
@@ -317,15 +290,13 @@ def _write_landmarks(path: Path, passed: Floats, sd_m: float, seed: int) -> None
 def _write_truth(folder: Path, traced: Traced, t_ns: Int64s) -> Path:
     kept = slice(None, None, TRUTH_EVERY)
     x, y, heading = traced.steps[kept, :3].T
-    write_tum(folder / "pose.tum", planar(t_ns[kept], x, y, heading), SOURCE)
-    truth = Truth(
-        version=1,
-        log="drive.mcap",
-        start_ns=int(t_ns[0]),
+    return write_track_truth(
+        folder,
+        "drive.mcap",
+        planar(t_ns[kept], x, y, heading),
+        SOURCE,
         end_ns=int(t_ns[-1]) + 1,
-        pose="pose.tum",
         mounting=Mounting(),
         mounting_source=SOURCE,
         source=SOURCE,
     )
-    return save_truth(truth, folder)
