@@ -76,8 +76,8 @@ class Detections:
             other than traffic lights; an empty tuple where lenses were not examined.
         min_scores: Shape (N,): the score that each must exceed to be a cue, as set by its
             detector; None where the detector sets no thresholds.
-        looks: N results of the second look at stop signs (``detectors.signs.second_look``), empty
-            for other objects; an empty tuple where there was none.
+        looks: N results of the second look (``detectors.signs.second_look``) at stop signs and
+            lights, empty for other objects; an empty tuple where there was none.
         spans_px: Shape (N,): number of rows that each mask spans, or the height of a box without
             mask; None where masks were not measured.
         decisions: N decisions by tracks over frames: ``ACCEPTED``, or why the detection is no cue;

@@ -78,7 +78,7 @@ class Runner:
         camera: Topic.
         depth_bits: Number of bits that the camera uses in a 16-bit picture.
         on_skip: Called with the time and reason of each picture that cannot be decoded.
-        light_labels: Labels of traffic lights, whose lenses are examined.
+        light_labels: Labels of traffic lights, whose lenses and surroundings are examined.
         sign_labels: Labels of stop signs, at which a second look is taken.
         is_one_size: True to skip pictures of another size than the first, because the camera's
             intrinsics are for one size.
@@ -195,7 +195,7 @@ class Runner:
     def _examined(self, found: Detections, frame: Frame) -> Detections:
         """Add what the pixels of lights and signs show."""
         found = lens.with_lenses(found, frame, self.light_labels)
-        return second_look.with_looks(found, frame, self.sign_labels)
+        return second_look.with_looks(found, frame, self.sign_labels, self.light_labels)
 
     def _identity(self, named: Named) -> str:
         """Identify all that determines a result: the detector, and the rules of ``_examined``."""

@@ -164,7 +164,8 @@ def _log_odds(score: float) -> float:
 def _other_sign(track: ObjectTrack) -> str | None:
     """Return which other sign a track is, if its boxes look more like others than like it."""
     others = {look: n for look, n in track.looks.items() if look in OTHER_SIGNS}
-    if sum(others.values()) <= track.looks["stop"]:
+    # A light that is on no sign has an empty look.
+    if sum(others.values()) <= track.looks["stop"] + track.looks[""]:
         return None
     most = max(sorted(others), key=lambda look: others[look])
     return f"looks like another sign: {OTHER_SIGNS[most]}"

@@ -1,4 +1,4 @@
-"""The second look at stop signs: drawn signs at every size and in dim and bright light."""
+"""The second look at signs and lights, drawn at every size and in dim and bright light."""
 
 import cv2
 import numpy as np
@@ -6,7 +6,12 @@ import pytest
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections, Frame
-from crosscue.detectors.signs.second_look import OTHER_SIGNS, look_at_sign, with_looks
+from crosscue.detectors.signs.second_look import (
+    OTHER_SIGNS,
+    look_at_light,
+    look_at_sign,
+    with_looks,
+)
 from crosscue.replay.columns import Bytes
 
 RED, WHITE, ORANGE, YELLOW, GREY = (
@@ -86,14 +91,43 @@ def test_small_dark_and_grey_signs_are_unknown() -> None:
     assert look_at_sign(*seen("stop", 40, 0.1)) == "unknown"
 
 
-def test_only_stop_signs_are_looked_at_in_the_scale_of_the_decoded_picture() -> None:
+def test_only_signs_and_lights_are_looked_at_in_the_scale_of_the_decoded_picture() -> None:
     picture, box = seen("no entry", 60)
     frame = Frame(0, "front", picture, (2 * picture.shape[1], 2 * picture.shape[0]))
-    boxes = np.array([2.0 * box, 2.0 * box])
-    found = Detections(0, frame.size_px, boxes, np.ones(2), ("stop sign", "car"), (b"", b""))
+    boxes = np.array([2.0 * box, 2.0 * box, 2.0 * box])
+    labels = ("stop sign", "traffic light", "car")
+    found = Detections(0, frame.size_px, boxes, np.ones(3), labels, (b"", b"", b""))
 
-    assert with_looks(found, frame, ("stop sign",)).looks == ("bar", "")
-    assert with_looks(found, frame, ("halt",)) is found
+    assert with_looks(found, frame, labels[:1], labels[1:2]).looks == ("bar", "", "")
+    assert with_looks(found, frame, ("halt",), ("lamp",)) is found
+
+
+@pytest.mark.parametrize("housing", [(40, 40, 40), YELLOW])
+@pytest.mark.parametrize("side_px", [36, 60, 150])
+def test_light_drawn_on_a_yellow_sign_is_no_light(
+    side_px: int, housing: tuple[int, int, int]
+) -> None:
+    """Boxes are of the drawing or of the whole sign; a yellow housing has no sign around it."""
+    picture, whole = seen("signal ahead", side_px)
+    drawing = whole + side_px * np.array([0.38, 0.3, -0.38, -0.3])
+    street = np.full_like(picture, 110)
+    x0, y0, x1, y1 = np.rint(drawing).astype(int).tolist()
+    street[y0:y1, x0:x1] = housing
+
+    assert look_at_light(picture, drawing) == look_at_light(picture, whole) == "yellow"
+    assert look_at_light(street, drawing) == ""
+    assert look_at_light(np.ascontiguousarray(picture[..., 0]), whole) == ""
+    assert look_at_light(picture, np.zeros(4)) == ""
+
+
+@pytest.mark.parametrize("kind", ["back", "no entry"])
+def test_headlamps_at_night_leave_neither_red_nor_letters_to_tell_by(kind: str) -> None:
+    picture, box = seen(kind, 40)
+    day = look_at_sign(picture, box)
+    picture[:] = np.where(np.all(picture == (90, 110, 100), axis=2)[..., None], 12, picture)
+
+    assert day in OTHER_SIGNS
+    assert look_at_sign(picture, box) == "unknown"
 
 
 def test_look_at_sign_at_the_edge_uses_what_is_visible() -> None:

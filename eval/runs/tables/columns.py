@@ -100,7 +100,7 @@ OF_RUN: Final[Mapping[str, Columns]] = {
         "mask": _MASK,
         "height_px": Column(REAL, "height of the mask, or of the box without one"),
         "lens": Column(TEXT, "lit lens of a traffic light; null if not examined"),
-        "look": Column(TEXT, "result of the second look at a stop sign; null without"),
+        "look": Column(TEXT, "result of the second look at a stop sign or light; null without"),
         "same_as": Column(TEXT, "detector with a better score for the same object; null without"),
         "range_m": Column(REAL, "range by the object's height; null if unknown"),
         "range_sd_m": Column(REAL, "its standard deviation"),

@@ -201,6 +201,18 @@ def test_sign_that_looks_like_another_one_is_rejected_with_the_reason(look: str,
     assert decided([[(600.0, 140.0, 0.95, "unknown")]] * 4, SIGN)[-1] == (ACCEPTED,)
 
 
+def test_light_on_a_yellow_sign_is_rejected_and_one_look_is_not_enough() -> None:
+    def said(looks: list[str]) -> list[str]:
+        tracks, decisions = ControlTracks(car()), []
+        for i, look in enumerate(looks):
+            (one,) = [frame([(600.0, 140.0, 0.7, "red")], jitter=0.01 * i)]
+            decisions += tracks([replace(one, looks=(look,))], STEP)[0].decisions
+        return decisions
+
+    assert set(said(["yellow"] * 30)) == {"looks like another sign: yellow"}
+    assert said(["", "", "yellow"] * 10)[-1] == ACCEPTED
+
+
 def test_near_look_at_a_sign_counts_more_than_far_ones() -> None:
     """At night, letters of 8 px run together to a bar; nearer, they are letters."""
     tracks, said = ControlTracks(car()), list[str]()
