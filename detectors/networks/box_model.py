@@ -23,12 +23,12 @@ from .tiles import Corner, corners, is_uncut
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Part:
-    """A picture or a tile, as passed to the network."""
+    """A picture or a part of it, as passed to the network."""
 
     frame: int
     pixels: Bytes
     corner: Corner | None
-    """Left and top of a tile in decoded pixels; None for the whole picture."""
+    """Left and top of a part in decoded pixels; None for the whole picture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,6 +53,7 @@ class BoxModel:
         where: The card's file, for errors.
         identity: Text that changes with card, settings and back end.
         score: Minimum score of any other detection.
+        is_enlarged: True to look at the middle half of a picture again.
     """
 
     card: ModelCard
@@ -61,6 +62,7 @@ class BoxModel:
     where: str
     identity: str
     score: float
+    is_enlarged: bool = False
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -85,8 +87,9 @@ class BoxModel:
 
     @property
     def view(self) -> View:
-        """The resolution that the card's input needs; full size for tiles."""
-        return View() if self.card.tiles is not None else view_of(self.card.input)
+        """The resolution that the card's input needs; full size for a second look at parts."""
+        is_full = self.card.tiles is not None or self.is_enlarged
+        return View() if is_full else view_of(self.card.input)
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         """Return the detections in each frame."""
@@ -101,10 +104,14 @@ class BoxModel:
 
     def _parts(self, number: int, frame: Frame) -> Iterator[_Part]:
         yield _Part(number, frame.pixels, None)
-        if self.card.tiles is None:
-            return
         height, width = frame.pixels.shape[:2]
         wide, high = self.card.input.width_px, self.card.input.height_px
+        if self.is_enlarged and width > 1:
+            half = (width // 2, min(max(width // 2 * high // wide, 1), height))
+            x, y = (width - half[0]) // 2, (height - half[1]) // 2
+            yield _Part(number, frame.pixels[y : y + half[1], x : x + half[0]], (x, y))
+        if self.card.tiles is None:
+            return
         if width <= wide and height <= high:
             return
         for x, y in corners((width, height), (wide, high), self.card.tiles):
@@ -146,7 +153,7 @@ class BoxModel:
         if part.corner is not None:
             boxes = boxes + np.tile(part.corner, 2)
             height, width = frame.pixels.shape[:2]
-            tile = (self.card.input.width_px, self.card.input.height_px)
+            tile = (part.pixels.shape[1], part.pixels.shape[0])
             is_kept = is_uncut(boxes, part.corner, tile, (width, height))
             boxes, keep = boxes[is_kept], keep[is_kept]
         masks = self._masks(some, keep, boxes, part, placement, frame)
@@ -186,7 +193,7 @@ class BoxModel:
         masks = [mask for one in some for mask in one.masks]
         keep = np.arange(len(scores))
         if len(some) > 1:
-            overlap = min(self.output.overlap, 0.45) if self.card.tiles else self.output.overlap
+            overlap = min(self.output.overlap, 0.45)
             keep = non_maximum_suppression(boxes, scores, classes, self.output.score, overlap)
         width, height = frame.size_px
         inside = np.clip(boxes * np.tile(frame.scale, 2), 0.0, [width, height, width, height])

@@ -111,6 +111,24 @@ def test_tiles_find_objects_too_small_for_the_full_picture(tmp_path: Path) -> No
     np.testing.assert_allclose(found["tiles"].boxes_px, [[701, 251, 707, 257]], atol=1.0)
 
 
+def test_enlarged_middle_finds_small_objects_once_and_in_their_place(tmp_path: Path) -> None:
+    """A box of 4 pixels vanishes if 1024 pixels become 128, but remains in the middle half."""
+    path = str(card(tmp_path, bright_box_model(), BRIGHT, input="width_px = 128\nheight_px = 64"))
+    size = (1024, 512)
+    small, large = frame(*size, (565, 285, 569, 289)), frame(*size, (400, 192, 496, 288))
+    cut, outside = frame(*size, (720, 192, 816, 288)), frame(*size, (32, 32, 128, 128))
+    whole, enlarged = build(card=path), build(card=path, enlarged=True)
+
+    assert whole.identity != enlarged.identity
+    assert not len(detections_of(whole, small)[0])
+    np.testing.assert_allclose(
+        detections_of(enlarged, small)[0].boxes_px, [[565, 285, 569, 289]], atol=4.0
+    )
+    for one in (large, cut, outside):
+        (found,) = detections_of(enlarged, one)
+        np.testing.assert_allclose(found.boxes_px, detections_of(whole, one)[0].boxes_px, atol=8.0)
+
+
 def test_mask_has_the_size_of_the_camera_picture(tmp_path: Path) -> None:
     """The network's mask covers the left half of a box in the centre."""
     boxes = np.zeros((1, 2 + 4 + 32, 40), np.float32)
