@@ -188,17 +188,14 @@ class Runner:
             if fault is not None:
                 raise UsageError(f"detector {named.name}: frame at {frame.t_ns} ns: {fault}")
         return [
-            self._examined(one, frame) if isinstance(one, Detections) else one
+            second_look.with_looks(one, frame, self.sign_labels, self.light_labels)
+            if isinstance(one, Detections)
+            else one
             for one, frame in zip(found, frames, strict=True)
         ]
 
-    def _examined(self, found: Detections, frame: Frame) -> Detections:
-        """Add what the pixels of lights and signs show."""
-        found = lens.with_lenses(found, frame, self.light_labels)
-        return second_look.with_looks(found, frame, self.sign_labels, self.light_labels)
-
     def _identity(self, named: Named) -> str:
-        """Identify all that determines a result: the detector, and the rules of ``_examined``."""
+        """Identify all that determines a result: the detector, and the second look."""
         return (
             f"{named.detector.identity} lens {lens.VERSION} {' '.join(self.light_labels)} "
             f"look {second_look.VERSION} {' '.join(self.sign_labels)}"

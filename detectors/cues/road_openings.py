@@ -62,13 +62,11 @@ class Opening(NamedTuple):
         side: 1 for the left, -1 for the right.
         start_m: Distance of its near kerb ahead of the rear axle.
         end_m: Distance of its far kerb.
-        depth_m: How far beyond the carriageway's edge it is seen.
     """
 
     side: int
     start_m: float
     end_m: float
-    depth_m: float
 
 
 class Legs(NamedTuple):
@@ -185,7 +183,6 @@ class RoadOpenings:
                     old.side,
                     old.start_m + gain * (opening.start_m - old.start_m),
                     old.end_m + gain * (opening.end_m - old.end_m),
-                    max(old.depth_m, opening.depth_m),
                 )
                 nearest.hits += nearest.missed > 0
                 nearest.missed = 0
@@ -299,7 +296,6 @@ def _openings(
                             side,
                             float(plan.ahead_m[start] + 0.5 * CELL_M),
                             float(plan.ahead_m[row] - 0.5 * CELL_M),
-                            depth_m,
                         )
                     )
                 start = None

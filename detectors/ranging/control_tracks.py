@@ -107,7 +107,7 @@ class ControlTracks:
             for i, label in enumerate(one.labels):
                 if label in labels:
                     decisions[k][i] = TOO_LITTLE_EVIDENCE
-                    is_whole = heights_px[k][i] > 0.0 and not is_cut(one, i)
+                    is_whole = heights_px[k][i] > 0.0 and not is_cut(one.boxes_px[i], one.size_px)
                     if is_taken[i] and (is_tracked or is_whole):
                         rows.append((k, i))
         if cue.name not in self._of_cue:
@@ -118,7 +118,12 @@ class ControlTracks:
         tracks(
             motion,
             np.array([found[k].boxes_px[i] for k, i in rows]).reshape(-1, 4),
-            np.array([0.0 if is_cut(found[k], i) else heights_px[k][i] for k, i in rows]),
+            np.array(
+                [
+                    0.0 if is_cut(found[k].boxes_px[i], found[k].size_px) else heights_px[k][i]
+                    for k, i in rows
+                ]
+            ),
             [(*found[k].lenses[i : i + 1], "")[0] for k, i in rows],
             np.array([self._evidence(found[k], i, cue) for k, i in rows]) if is_tracked else None,
             is_new=is_new,

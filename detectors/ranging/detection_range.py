@@ -8,8 +8,6 @@ disables the defaults.
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,10 +16,8 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .ground_plane import GroundPlane
 from .height_to_range import range_of
 from .standard_sizes import VEHICLES, size_prior
+from .usable import is_cut
 from .vehicle_range import GroundCamera, OneRange, size_range, vehicle_range
-
-# Distance to the picture's edge within which a box counts as cut, so that its height is unusable.
-BORDER_PX: Final = 2.0
 
 
 def detection_range(
@@ -47,7 +43,7 @@ def detection_range(
     curve = ranges.traffic_light if label in cues.traffic_light_labels else curve
     if curve is not None:
         return OneRange(float(range_of(np.array([height_px]), curve)[0]), curve.residual_sd_m)
-    if not _has_defaults(vehicle) or _is_cut(box_px, size_px):
+    if not _has_defaults(vehicle) or is_cut(box_px, size_px):
         return None
     found = _by_size(vehicle, label, box_px, height_px, size_px)
     return None if found is None else OneRange(found.mean_m + vehicle.camera.x_m, found.sd_m)
@@ -82,9 +78,3 @@ def _by_size(
     ((ahead, _, up),) = GroundPlane.of(camera, size_px).rays(foot).tolist()
     over_ground = GroundCamera(focal_px, camera.z_m, camera.pitch_sd_rad)
     return vehicle_range(-up / ahead, height_px, over_ground, VEHICLES[label])
-
-
-def _is_cut(box_px: NDArray[np.float64], size_px: tuple[int, int]) -> bool:
-    x0, y0, x1, y1 = box_px.tolist()
-    right, bottom = size_px[0] - BORDER_PX, size_px[1] - BORDER_PX
-    return bool(min(x0, y0) < BORDER_PX or x1 > right or y1 > bottom)

@@ -10,14 +10,11 @@ the car.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-
-from crosscue.detectors.base import Detections, Frame
 
 # Version of the rule; cached results of other versions are not used.
 VERSION: Final = 1
@@ -69,26 +66,6 @@ def lens_of(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Lens:
         is_colour = np.any([(hue >= low) & (hue <= high) for low, high in bands], axis=0)
         lit[colour] = _spot_px(is_lit & is_colour, min(width, height))
     return max(lit, key=lambda colour: lit[colour])
-
-
-def with_lenses(found: Detections, frame: Frame, labels: Sequence[str]) -> Detections:
-    """Add the lenses of the detections that have one of ``labels``.
-
-    Args:
-        found: Detections in one frame.
-        frame: The decoded frame, which may be smaller than the camera's picture.
-        labels: Labels of traffic lights.
-    """
-    if not any(label in labels for label in found.labels):
-        return found
-    scale = np.array([*frame.scale, *frame.scale])
-    return replace(
-        found,
-        lenses=tuple(
-            lens_of(frame.pixels, box_px / scale) if label in labels else ""
-            for label, box_px in zip(found.labels, found.boxes_px, strict=True)
-        ),
-    )
 
 
 def _spot_px(is_lit: NDArray[np.bool_], width_px: float) -> float:

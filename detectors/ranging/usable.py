@@ -27,10 +27,10 @@ def source_of(vehicle: Vehicle, cue: str) -> Source | None:
     return None if chosen == "curve" or vehicle.camera.focal_px is None else "motion"
 
 
-def is_cut(found: Detections, i: int) -> bool:
-    """Return whether the picture's edge cuts a detection's box."""
-    width, height = found.size_px
-    x0, y0, x1, y1 = found.boxes_px[i].tolist()
+def is_cut(box_px: NDArray[np.float64], size_px: tuple[int, int]) -> bool:
+    """Return whether the edge of a picture of this width and height cuts a box."""
+    width, height = size_px
+    x0, y0, x1, y1 = box_px.tolist()
     is_outside = x1 > width - BORDER_PX or y1 > height - BORDER_PX
     return bool(min(x0, y0) < BORDER_PX or is_outside)
 
@@ -46,6 +46,6 @@ def why_not(
         return BELOW_SCORE
     if found.heights_px[i] <= 0.0:
         return NO_HEIGHT
-    if is_cut(found, i):
+    if is_cut(found.boxes_px[i], found.size_px):
         return CUT
     return NO_CURVE if source is None else None

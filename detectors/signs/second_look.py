@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.ranging.lens import lens_of
 
 # Version of the rule; cached results of other versions are not used.
 VERSION: Final = 3
@@ -141,7 +142,7 @@ def look_at_light(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Loo
 def with_looks(
     found: Detections, frame: Frame, signs: tuple[str, ...], lights: tuple[str, ...] = ()
 ) -> Detections:
-    """Add the second look at stop signs and traffic lights.
+    """Add the second look at stop signs and traffic lights, and the lenses of the lights.
 
     Args:
         found: Detections in one frame.
@@ -151,18 +152,15 @@ def with_looks(
     """
     if not {*signs, *lights} & {*found.labels}:
         return found
-    scale = np.array([*frame.scale, *frame.scale])
-    return replace(
-        found,
-        looks=tuple(
-            look_at_sign(frame.pixels, box_px / scale)
-            if label in signs
-            else look_at_light(frame.pixels, box_px / scale)
-            if label in lights
-            else ""
-            for label, box_px in zip(found.labels, found.boxes_px, strict=True)
-        ),
-    )
+    boxes_px = found.boxes_px / np.array([*frame.scale, *frame.scale])
+    looks, lenses = [""] * len(found), [""] * len(found)
+    for i, label in enumerate(found.labels):
+        if label in signs:
+            looks[i] = look_at_sign(frame.pixels, boxes_px[i])
+        elif label in lights:
+            looks[i] = look_at_light(frame.pixels, boxes_px[i])
+            lenses[i] = lens_of(frame.pixels, boxes_px[i])
+    return replace(found, looks=tuple(looks), lenses=tuple(lenses))
 
 
 def _is_glare(pixels: NDArray[np.uint8], value: NDArray[np.uint8]) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -27,9 +27,6 @@ from crosscue.replay.errors import VehicleError
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    pass
 
 TABLE: Final = "visual_odometry"
 # COCO's classes that move, beside the vehicle file's labels of cars; their boxes are masked.
