@@ -203,7 +203,7 @@ def test_sign_that_looks_like_another_one_is_rejected_with_the_reason(look: str,
 
 def test_light_on_a_yellow_sign_is_rejected_and_one_look_is_not_enough() -> None:
     def said(looks: list[str]) -> list[str]:
-        tracks, decisions = ControlTracks(car()), []
+        tracks, decisions = ControlTracks(car()), list[str]()
         for i, look in enumerate(looks):
             (one,) = [frame([(600.0, 140.0, 0.7, "red")], jitter=0.01 * i)]
             decisions += tracks([replace(one, looks=(look,))], STEP)[0].decisions
