@@ -181,7 +181,19 @@ def _of_openvino(content: bytes, path: Path) -> Interface:
         tuple(tensor(port) for port in model.outputs),
         metadata,
         names,
+        _detected_classes(model),
     )
+
+
+def _detected_classes(model: Any) -> int | None:
+    """Number of classes that DetectionOutput is given, without the background."""
+    for operation in model.get_ops():
+        if operation.get_type_name() == "DetectionOutput":
+            shapes = [operation.input(index).get_partial_shape() for index in (0, 1)]
+            if all(shape.is_static for shape in shapes):
+                boxes, scores = (shape[1].get_length() for shape in shapes)
+                return int(4 * scores // boxes) - 1
+    return None
 
 
 def _of_tflite(content: bytes, path: Path) -> Interface:
@@ -444,7 +456,7 @@ def _ways_of_boxes(
 ) -> Iterator[tuple[dict[str, bool], tuple[str, ...]]]:
     """Other ways to store boxes in a layout: keys of ``[output]``, and what they assume."""
     kind = guess.settings["kind"]
-    if kind in ("yolov5", "yolov8", "yolov8-seg") and model.layout == "nhwc":
+    if kind in ("yolov5", "yolov8", "yolov8-seg", "end-to-end") and model.layout == "nhwc":
         # Ultralytics' TFLite exports.
         yield _FRACTIONS
     if kind == "yolov8" and "are_corners" not in guess.settings:

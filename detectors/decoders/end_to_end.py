@@ -32,25 +32,29 @@ class EndToEndOutput(BoxOutput):
     """Name of the output with the boxes; by default the only output."""
     prototypes: str | None = None
     """Name of the output with prototype masks, if there are masks."""
+    is_fraction: bool = False
+    """True if boxes are in fractions of the input, as in TFLite files; else in its pixels."""
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
         if self.prototypes is None:
             table = output_rows(named(outputs, self.name), 6, "x0, y0, x1, y1, score, class")
-            return self._of(table, None)
+            return self._of(table, None, size_px)
         prototypes = prototypes_of(named(outputs, self.prototypes, "prototypes"))
         table = output_rows(
             named(outputs, self.name), 6 + len(prototypes), "boxes and mask weights"
         )
-        return self._of(table, PrototypeMasks(table[:, 6:], prototypes))
+        return self._of(table, PrototypeMasks(table[:, 6:], prototypes), size_px)
 
-    def _of(self, table: NDArray[np.float64], masks: PrototypeMasks | None) -> BoxCandidates:
+    def _of(
+        self, table: NDArray[np.float64], masks: PrototypeMasks | None, size_px: Size
+    ) -> BoxCandidates:
         if masks is None:
             # Some exporters pad with a class of -1.
             table = table[~(table[:, 5] < 0.0)]
-        return BoxCandidates(
-            table[:, :4], table[:, 4], class_numbers(table[:, 5], len(self.classes)), masks
-        )
+        boxes = table[:, :4] * (np.tile(size_px, 2) if self.is_fraction else 1.0)
+        numbers = class_numbers(table[:, 5], len(self.classes))
+        return BoxCandidates(boxes, table[:, 4], numbers, masks)
 
     @override
     @classmethod

@@ -137,7 +137,7 @@ class DetectionOutput(BoxOutput):
             return None
         return Guess(
             {"kind": "ssd", "name": model.outputs[0].name, "overlap": 1.0},
-            len(model.class_names) or None,
+            len(model.class_names) or model.class_count,
             ("rows of 7, as the operation DetectionOutput returns",),
             ("class 0 is the background, the classes start at 1 (--first-class)",),
             {"colour": "bgr", "fit": "stretch"},

@@ -90,7 +90,8 @@ class YoloV5Output(_CentersOutput):
         why = f"rows of {columns}: 5 and {columns - 5} classes"
         settings: dict[str, object] = {"kind": "yolov5"}
         settings |= {"heads": heads} if heads else {"name": output.name}
-        if rows is not None and rows == cells:
+        # YOLOv6's exporter calls its output so; its objectness is 1.
+        if rows is not None and rows == cells and output.name != "outputs":
             return Guess(
                 settings,
                 columns - 5,

@@ -31,7 +31,9 @@ from .weights import Weights
 
 Array = NDArray[np.generic]
 # Errors of ONNX Runtime and of LiteRT where an operation is unknown.
-_LACKING: Final = re.compile(r"([\w.:]+)\(-?\d+\) is not a registered|custom op: ([\w.-]+\w)")
+_LACKING: Final = re.compile(
+    r"([\w.:]+)\(-?\d+\) is not a registered|custom op: ([\w.-]+\w)|(Select TensorFlow op)"
+)
 # Encoded protobuf key of a tensor that is stored in another file.
 _EXTERNAL: Final = b"\x0a\x08location"
 
@@ -109,7 +111,8 @@ def load_network(
 def missing_operation(error: Exception) -> str | None:
     """Name the operation that a back end does not know; None if its error is another."""
     found = _LACKING.search(str(error))
-    return found and f"the operation {found[1] or found[2]} is unknown; export it without that"
+    name = found and (found[1] or found[2] or "Flex, of TensorFlow itself,")
+    return found and f"the operation {name} is unknown; export it without that"
 
 
 def _missing(name: str, size_px: Size | None) -> str:
@@ -208,8 +211,9 @@ def _in_litert(weights: Weights, threads: int, size_px: Size | None) -> Network:
         backend += " without XNNPACK"
     if (unsound := _random_operation(net)) is not None:
         raise VehicleError(
-            f"{weights.name}: LiteRT computes {unsound} with int8 weights and float32 numbers from "
-            "memory that nobody has written; convert it to float16, or wholly to int8"
+            f"{weights.name}: LiteRT reads the scales of {unsound}, whose int8 weights have one "
+            "for all channels, from memory that nobody has written; convert it to float16, or to "
+            "int8 by channel"
         )
     if size_px is not None:
         first = net.get_input_details()[0]
@@ -227,11 +231,13 @@ def _in_litert(weights: Weights, threads: int, size_px: Size | None) -> Network:
 
 def _random_operation(net: Any) -> str | None:
     """Name an operation whose results in LiteRT 2.3 differ from process to process, if any."""
-    kinds = {one["index"]: one["dtype"] for one in net.get_tensor_details()}
+    tensors = {one["index"]: one for one in net.get_tensor_details()}
     for operation in net._get_ops_details():
         if operation["op_name"] == "DEPTHWISE_CONV_2D":
-            picture, weights = (kinds.get(index) for index in operation["inputs"][:2])
-            if (picture, weights) == (np.float32, np.int8):
+            picture, weights = (tensors[index] for index in operation["inputs"][:2])
+            scales = weights["quantization_parameters"]["scales"]
+            # It reads a scale for each channel, also where all channels have one.
+            if (picture["dtype"], weights["dtype"], len(scales)) == (np.float32, np.int8, 1):
                 return str(operation["op_name"])
     return None
 

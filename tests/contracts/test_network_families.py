@@ -12,7 +12,12 @@ import pytest
 
 import crosscue
 from crosscue.detectors.base import Detections, Frame
-from crosscue.detectors.catalog.recognise import guesses, plausible, read_interface
+from crosscue.detectors.catalog.recognise import (
+    _detected_classes,
+    guesses,
+    plausible,
+    read_interface,
+)
 from crosscue.detectors.decoders.base import Size, cell_grid, decoder_name
 from crosscue.detectors.decoders.table import DECODERS
 from crosscue.detectors.networks.model_detector import build
@@ -251,3 +256,36 @@ def test_decoded_yolox_with_names_gets_its_own_pixels(tmp_path: Path) -> None:
 
     assert guess.input is not None
     assert (guess.input["colour"], guess.input.get("scale")) == ("bgr", None)
+
+
+def test_yolov6_gets_its_own_pixels(tmp_path: Path) -> None:
+    """YOLOv6 has a row for each cell as YOLOX with decoding; its output is called outputs."""
+    net = tmp_path / "net.onnx"
+    rows = np.zeros((1, len(cell_grid(SIZE, (8, 16, 32))[0]), 8), np.float32)
+    net.write_bytes(constant_model((1, 3, SIZE[1], SIZE[0]), {"outputs": rows}))
+
+    (guess,) = [one for one in guesses(read_interface(net)) if one.settings["kind"] == "yolov5"]
+
+    assert guess.input is not None
+    assert (guess.input["colour"], guess.input["fit"]) == ("rgb", "letterbox-center")
+
+
+@pytest.mark.parametrize("count", [2, 90])
+def test_number_of_classes_is_read_from_detection_output(count: int) -> None:
+    """Open Model Zoo's pedestrians and vehicles are not COCO's first classes."""
+    ov = pytest.importorskip("openvino")
+    shapes = {"boxes": [1, 400], "scores": [1, 100 * (count + 1)], "priors": [1, 2, 400]}
+    given = [ov.opset8.parameter(shape, np.float32, name) for name, shape in shapes.items()]
+    settings = {
+        "background_label_id": 0,
+        "top_k": 400,
+        "keep_top_k": [200],
+        "nms_threshold": 0.45,
+        "confidence_threshold": 0.01,
+        "code_type": "caffe.PriorBoxParameter.CENTER_SIZE",
+        "normalized": True,
+        "share_location": True,
+    }
+    found = ov.opset8.detection_output(*given, settings)
+
+    assert _detected_classes(ov.Model([found], given)) == count

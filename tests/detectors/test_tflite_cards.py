@@ -16,7 +16,7 @@ from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.draft import draft_card_text
 from crosscue.detectors.catalog.recognise import _suppressed_classes, guesses
 from crosscue.detectors.decoders.base import Interface, Size, Tensor, cell_count, cell_grid
-from crosscue.detectors.networks.backends import _random_operation, load_network
+from crosscue.detectors.networks.backends import _random_operation, load_network, missing_operation
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.networks.weights import Weights
 from support.data import shared
@@ -62,6 +62,23 @@ def test_boxes_in_fractions_are_exact(tmp_path: Path, size: Size, files: dict[st
 
     output = read_card(card).output
     assert (output.kind, output.classes) == ("yolov8", CLASSES)
+    found = found_in(card, size)
+    np.testing.assert_allclose(found.boxes_px, [BOX], atol=1e-3)
+    assert found.labels == ("stop sign",)
+
+
+@SIZES
+def test_suppressed_boxes_in_fractions_are_exact(tmp_path: Path, size: Size) -> None:
+    """Ultralytics' YOLO26 as TFLite: the rows of its ONNX file, in fractions."""
+    net = tmp_path / "net.tflite"
+    rows = np.zeros((1, 300, 6), np.float32)
+    rows[0, :, :4] = np.array([0.1, 0.2, 0.3, 0.6])
+    rows[0, 0] = [*BOX / np.tile(size, 2), 0.75, 2.0]
+    net.write_bytes(constant_tflite((1, size[1], size[0], 3), {"Identity": rows}, files=NAMES))
+
+    card = crosscue.draft_card(net).path
+
+    assert read_card(card).output.kind == "end-to-end"
     found = found_in(card, size)
     np.testing.assert_allclose(found.boxes_px, [BOX], atol=1e-3)
     assert found.labels == ("stop sign",)
@@ -306,23 +323,32 @@ def test_network_with_int8_numbers_runs_without_xnnpack(kind: type[np.number[Any
 
 
 @pytest.mark.parametrize(
-    ("operation", "kinds", "is_sound"),
+    ("operation", "kinds", "scales", "is_sound"),
     [
-        ("DEPTHWISE_CONV_2D", (np.float32, np.int8, np.float32), False),
-        ("DEPTHWISE_CONV_2D", (np.int8, np.int8, np.int32), True),
-        ("DEPTHWISE_CONV_2D", (np.float32, np.float32, np.float32), True),
-        ("CONV_2D", (np.float32, np.int8, np.float32), True),
+        ("DEPTHWISE_CONV_2D", (np.float32, np.int8, np.float32), 1, False),
+        ("DEPTHWISE_CONV_2D", (np.float32, np.int8, np.float32), 128, True),
+        ("DEPTHWISE_CONV_2D", (np.int8, np.int8, np.int32), 1, True),
+        ("DEPTHWISE_CONV_2D", (np.float32, np.float32, np.float32), 0, True),
+        ("CONV_2D", (np.float32, np.int8, np.float32), 1, True),
     ],
 )
 def test_operation_with_results_at_random_is_refused(
-    operation: str, kinds: tuple[type[np.number[Any]], ...], is_sound: bool
+    operation: str, kinds: tuple[type[np.number[Any]], ...], scales: int, is_sound: bool
 ) -> None:
-    """Two segmentations with int8 weights and float32 pictures had other boxes in each process."""
+    """Two segmentations with one scale for all channels had other boxes in each process."""
+    quantised = {"scales": np.ones(scales)}
     net = SimpleNamespace(
         _get_ops_details=lambda: [{"op_name": operation, "inputs": np.array([4, 5, -1, 6])}],
         get_tensor_details=lambda: [
-            {"index": index, "dtype": kind} for index, kind in zip((4, 5, 6), kinds, strict=True)
+            {"index": index, "dtype": kind, "quantization_parameters": quantised}
+            for index, kind in zip((4, 5, 6), kinds, strict=True)
         ],
     )
 
     assert (_random_operation(net) is None) == is_sound
+
+
+def test_operations_of_tensorflow_are_named() -> None:
+    error = RuntimeError("Select TensorFlow op(s), included in the given model, is(are) not")
+
+    assert "operation Flex, of TensorFlow itself, is unknown" in (missing_operation(error) or "")
