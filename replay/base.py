@@ -35,13 +35,19 @@ class Selection:
         """Return whether ``topic`` is selected."""
         return self.topics is None or topic in self.topics
 
-    def inside(self, t_ns: Int64s) -> NDArray[np.bool_]:
+    def inside(self, t_ns: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Return a mask of the times inside the range, shape (N,)."""
-        keep = np.ones(len(t_ns), dtype=np.bool_)
+        return self.overlaps(t_ns, t_ns)
+
+    def overlaps(
+        self, first_ns: NDArray[np.integer], last_ns: NDArray[np.integer]
+    ) -> NDArray[np.bool_]:
+        """Return a mask of the stretches with a time inside the range, shape (N,)."""
+        keep = np.ones(len(first_ns), dtype=np.bool_)
         if self.start_ns is not None:
-            keep &= t_ns >= self.start_ns
+            keep &= last_ns >= self.start_ns
         if self.end_ns is not None:
-            keep &= t_ns < self.end_ns
+            keep &= first_ns < self.end_ns
         return keep
 
     @property

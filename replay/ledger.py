@@ -28,6 +28,9 @@ DETAILS_KEPT: Final = 1000
 
 NOT_ASKED_TIME: Final = "outside --from/--to"
 NOT_ASKED_TOPIC: Final = "topic not selected"
+OTHER_TYPE: Final = "another message type on the same topic"
+DAMAGED_RECORD: Final = "damaged record"
+MESSAGE_TOO_LARGE: Final = "message over the size limit"
 DIFFERS: Final = "bytes differ from the seal"
 CHANGED: Final = "files differ from the seal"
 

@@ -2,8 +2,13 @@
 
 import gc
 import os
+from collections.abc import Iterator
+from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, settings
+
+from support.range_server import Served, serving
 
 # Tests do not read or fill the user's cache; tests of the cache name a folder.
 os.environ["CROSSCUE_DBC_CACHE"] = "off"
@@ -29,3 +34,12 @@ def pytest_collection_finish() -> None:
     """Exclude imported modules and collected tests from later garbage collections."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture
+def web(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
+    """Start a web server; complete logs are stored in ``tmp_path/store``."""
+    pytest.importorskip("aiohttp", reason="aiohttp, by which fsspec reads from the web, is missing")
+    monkeypatch.setenv("CROSSCUE_STORE", str(tmp_path / "store"))
+    with serving() as served:
+        yield served

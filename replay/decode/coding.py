@@ -6,6 +6,7 @@ from crosscue.replay.columns import ImageCoding
 
 # Number of first bytes that ``coding_of`` examines.
 MAGIC_BYTES: Final = 12
+MAX_SIDE_PX: Final = 65_535
 
 # Suffixes of files that are read as images.
 IMAGE_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp")

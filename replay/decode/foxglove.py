@@ -5,6 +5,15 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+MAX_SECONDS: Final = 9_000_000_000
+
+
+def nanoseconds(seconds: int, rest: int) -> int:
+    """Return a timestamp in nanoseconds; ``ValueError`` if it is not a time."""
+    if abs(seconds) > MAX_SECONDS or not 0 <= rest < 1_000_000_000:
+        raise ValueError(f"timestamp {seconds} s + {rest} ns is not a time")
+    return seconds * 1_000_000_000 + rest
+
 
 class PictureKind(Enum):
     """Kind of picture message, which determines how the coding is found."""

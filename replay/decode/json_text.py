@@ -18,9 +18,8 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS
 
 from .coding import MAGIC_BYTES
-from .foxglove import PICTURES, TABLES, PictureKind, SourceField
+from .foxglove import PICTURES, TABLES, PictureKind, SourceField, nanoseconds
 from .pictures import PictureRow, images_of
-from .protobuf import MAX_SECONDS
 from .refuse import MISFIT, refuse
 
 MAX_DEPTH: Final = 16
@@ -76,9 +75,7 @@ def _nanoseconds(value: Any) -> int | None:
     seconds, rest = value["sec"], value["nsec"]
     if type(seconds) is not int or type(rest) is not int:
         return None
-    if abs(seconds) > MAX_SECONDS or not 0 <= rest < 1_000_000_000:
-        raise ValueError(f"timestamp {seconds} s + {rest} ns is not a time")
-    return seconds * 1_000_000_000 + rest
+    return nanoseconds(seconds, rest)
 
 
 def _flat(value: Any, path: str, depth: int) -> Iterator[tuple[str, float | int]]:
@@ -105,12 +102,13 @@ class _TableDecoder:
         if not isinstance(block.rows, Messages):
             return block
         kept, rows, stamps = [], [], []
-        standard = TABLES.get(self.type_name)
+        standard = TABLES.get(self.type_name, {})
         for i in range(len(block)):
             try:
                 value = _object(bytes(block.rows.payload(i)))
                 stamp = _nanoseconds(value.get("timestamp"))
-                row = _standard(value, standard) if standard else dict(_flat(value, "", 0))
+                row = {column: _at(value, source) for column, source in standard.items()}
+                row = row or dict(_flat(value, "", 0))
                 if len(row) > MAX_COLUMNS:
                     raise ValueError(f"over {MAX_COLUMNS} numbers")
             except _BAD as error:
@@ -132,10 +130,6 @@ class _TableDecoder:
         if rows and all(stamp is not None for stamp in stamps):
             header_ns = np.array(stamps, np.int64)
         return replace(picked, rows=Table(columns), header_ns=header_ns)
-
-
-def _standard(value: dict[str, Any], sources: Any) -> dict[str, Any]:
-    return {column: _at(value, source) for column, source in sources.items()}
 
 
 def _at(value: Any, source: SourceField) -> Any:

@@ -6,10 +6,9 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.columns import Block, Bytes, ImageCoding, Images, Messages
-from crosscue.replay.decode.ros.standard import MAX_SIDE_PX
 from crosscue.replay.ledger import Ledger
 
-from .coding import STREAMS, coding_of
+from .coding import MAX_SIDE_PX, STREAMS, coding_of
 from .foxglove import PictureKind
 from .refuse import EMPTY_PICTURE, IMAGE_CODING, MISFIT, VIDEO_CODING, refuse
 

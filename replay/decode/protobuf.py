@@ -27,13 +27,12 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS
 
 from .coding import MAGIC_BYTES
-from .foxglove import PICTURES, TABLES, PictureKind, SourceField
+from .foxglove import MAX_SECONDS, PICTURES, TABLES, PictureKind, SourceField, nanoseconds
 from .pictures import PictureRow, images_of
 from .refuse import MISFIT, refuse
 
 MAX_DEPTH: Final = 8
 MAX_LEAVES: Final = 2048
-MAX_SECONDS: Final = 9_000_000_000
 TIMES: Final = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 
 _DTYPES: Final[dict[int, str]] = {
@@ -292,9 +291,7 @@ def _stamp(payload: memoryview, place: tuple[int, int] | None) -> int | None:
             seconds = plain - (1 << 64) if plain >= 1 << 63 else plain
         elif number == 2 and plain is not None:
             nanos = plain
-    if abs(seconds) > MAX_SECONDS or not 0 <= nanos < 1_000_000_000:
-        raise ValueError(f"timestamp {seconds} s + {nanos} ns is not a time")
-    return seconds * 1_000_000_000 + nanos
+    return nanoseconds(seconds, nanos)
 
 
 def _picture_decoder(name: str, descriptor: Descriptor) -> _PictureDecoder:

@@ -2,17 +2,14 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.base import Selection
 from crosscue.replay.columns import BLOCK_ROWS, Block, Bytes, Int64s, Messages
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.ledger import MESSAGE_TOO_LARGE, Ledger
 from crosscue.replay.limits import Limits
-
-TOO_LARGE: Final = "message over the size limit"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +73,7 @@ def _one_topic(
     if len(length) and length.max() > limits.message_bytes:
         large = length > limits.message_bytes
         detail = f"{int(length.max())} bytes, limit {limits.message_bytes}"
-        ledger.skip(name, TOO_LARGE, int(large.sum()), detail, int(log_ns[large][0]))
+        ledger.skip(name, MESSAGE_TOO_LARGE, int(large.sum()), detail, int(log_ns[large][0]))
         picked, log_ns = picked[~large], log_ns[~large]
     for first in range(0, len(picked), BLOCK_ROWS):
         part = slice(first, first + BLOCK_ROWS)

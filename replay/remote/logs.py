@@ -238,18 +238,12 @@ class RemoteLog(WrappedLog):
             self._fetched.close()
 
 
-class _Partial(Protocol):
+class _Partial(Log, Protocol):
     """A log that reports whether a part of it can be read without the rest."""
 
     @property
-    def format(self) -> str: ...
-    @property
-    def topics(self) -> tuple[Topic, ...]: ...
-    @property
     def beginning(self) -> Selection: ...
     def needs_whole(self, selection: Selection) -> str: ...
-    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]: ...
-    def close(self) -> None: ...
 
 
 # Openers of the formats that can be read in byte ranges.

@@ -14,7 +14,6 @@ from crosscue.eval import cli
 from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.replay.base import report_missing
 from crosscue.replay.errors import LogError
-from crosscue.replay.formats import FORMATS
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from support.accounted import read
@@ -38,10 +37,6 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
     """A short simulated drive."""
     folder = tmp_path_factory.mktemp("drive")
     return write_drive(folder, DriveSettings(seed=3, blocks=1, block_m=60.0))
-
-
-def test_every_format_has_sample_log() -> None:
-    assert EVERY_FORMAT.keys() == FORMATS.keys()
 
 
 # Formats whose truncation ``info --quick`` cannot detect, and why.

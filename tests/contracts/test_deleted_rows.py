@@ -11,91 +11,52 @@ from typing import Final
 
 import numpy as np
 import pytest
-from mcap.writer import CompressionType, IndexType, Writer
 
 from crosscue.eval import cli
 from crosscue.replay.formats import FORMATS
 from support.accounted import read
 from support.can_files import blf, random_frames, trc
 from support.every_format import EVERY_FORMAT, FRAMES
+from support.mcap_files import McapFile, channel, schema
+from support.mcap_files import message as mcap_message
 from support.openpilot_drive import drive_messages
 from support.pictures import picture_folder
-from support.rosbag_files import START_NS, header_field, record
+from support.rosbag_files import START_NS, bag, chunk, connection, message, record, stamp, u32
 from support.videos import video
 
 DOCS: Final = Path(__file__).parents[2] / "docs" / "reference" / "formats.md"
 
 
 def _mcap(folder: Path) -> Path:
-    path = folder / "log.mcap"
-    with path.open("wb") as file:
-        writer = Writer(
-            file,
-            compression=CompressionType.NONE,
-            use_chunking=False,
-            index_types=IndexType.NONE,
-            use_summary_offsets=False,
-        )
-        writer.start()
-        channel = writer.register_channel("/a", "json", 0)
-        for k in range(40):
-            writer.add_message(channel, START_NS + k, b"message %02d" % k, START_NS + k)
-        writer.finish()  # type: ignore[no-untyped-call]
-    raw = bytearray(path.read_bytes())
-    at, size = raw.index(b"message 20") - 31, 41
-    assert raw[at] == 0x05
-    del raw[at : at + size]
-    # A checksum of 0 means that none exists; otherwise it would reveal the removal as well.
-    end = raw.rindex(b"\x0f" + struct.pack("<Q", 4))
-    raw[end + 9 : end + 13] = bytes(4)
+    """Write a file without chunks and checksums, whose statistics count one message more."""
+    messages = [mcap_message(1, START_NS + k, b"message %02d" % k) for k in range(40)]
+    file = McapFile([schema(1), channel(1, 1, "/a"), *messages], summary_crc=False)
+    raw = bytearray(file.coded().replace(messages[20], b""))
     (summary_at,) = struct.unpack_from("<Q", raw, len(raw) - 28)
-    struct.pack_into("<QQL", raw, len(raw) - 28, summary_at - size, 0, 0)
+    struct.pack_into("<Q", raw, len(raw) - 28, summary_at - len(messages[20]))
+    path = folder / "log.mcap"
     path.write_bytes(raw)
     return path
 
 
 def _bag(folder: Path) -> Path:
     """Write a bag with ten messages in its index and nine in its chunk."""
-
-    def stamp(t_ns: int) -> bytes:
-        return struct.pack("<II", *divmod(t_ns, 10**9))
-
-    def number(value: int) -> bytes:
-        return struct.pack("<I", value)
-
-    fields = {b"topic": b"/a", b"type": b"std_msgs/String", b"md5sum": b"x" * 32}
-    fields[b"message_definition"] = b"string data\n"
-    body = b"".join(header_field(name, value) for name, value in fields.items())
-    link = record(body, op=b"\x07", conn=number(0), topic=b"/a")
-    rows = [
-        record(b"message", op=b"\x02", conn=number(0), time=stamp(START_NS + k)) for k in range(10)
-    ]
-    del rows[5]
-    inside = link + b"".join(rows)
-    chunk = record(inside, op=b"\x05", compression=b"none", size=number(len(inside)))
-    head = record(
-        b" " * 64,
-        op=b"\x03",
-        index_pos=struct.pack("<Q", 0),
-        conn_count=number(1),
-        chunk_count=number(1),
-    )
-    begin = len(b"#ROSBAG V2.0\n") + len(head)
-    head = head.replace(
-        b"index_pos=" + bytes(8), b"index_pos=" + struct.pack("<Q", begin + len(chunk))
-    )
+    link = connection(0, b"/a")
+    rows = [message(0, START_NS + k, b"message") for k in range(10) if k != 5]
+    stored = chunk(link + b"".join(rows))
+    path = folder / "log.bag"
+    begin = bag(path).stat().st_size
     info = record(
-        number(0) + number(10),
+        u32(0) + u32(10),
         op=b"\x06",
-        ver=number(1),
+        ver=u32(1),
         chunk_pos=struct.pack("<Q", begin),
         start_time=stamp(START_NS),
         end_time=stamp(START_NS + 9),
-        count=number(1),
+        count=u32(1),
     )
-    path = folder / "log.bag"
-    path.write_bytes(b"#ROSBAG V2.0\n" + head + chunk + link + info)
-    return path
+    index_at = struct.pack("<Q", begin + len(stored))
+    return bag(path, stored, link, info, index_pos=index_at, conn_count=u32(1), chunk_count=u32(1))
 
 
 def _without_row(database: Path) -> None:

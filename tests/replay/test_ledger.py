@@ -23,43 +23,7 @@ from crosscue.replay.ledger import (
     warn_of,
 )
 
-_COUNTS = st.integers(0, 1000)
 NOT_FOUND = "declared by the format, not in its bytes"
-
-
-@given(
-    found=_COUNTS,
-    declared=st.none() | _COUNTS,
-    skips=st.lists(st.sampled_from("abc")),
-    dropped=_COUNTS,
-)
-def test_rows_in_file_equal_used_skipped_and_dropped(
-    found: int, declared: int | None, skips: list[str], dropped: int
-) -> None:
-    ledger = Ledger("log")
-    ledger.declare("/t", declared)
-    ledger.find("/t", found + len(skips))
-    for reason in skips:
-        ledger.skip("/t", reason)
-    ledger.drop("/t", "damaged", dropped)
-    ledger.settle("/t")
-
-    account = ledger.topic("/t")
-    assert account.in_file == account.used + account.skipped.total() + account.dropped.total()
-    assert account.in_file >= (declared or 0)
-    assert ledger.is_whole == (account.dropped.total() == 0)
-
-
-def test_missing_declared_rows_are_a_loss_and_surplus_is_a_notice() -> None:
-    ledger = Ledger("log")
-    for topic, found in (("/few", 3), ("/many", 9)):
-        ledger.declare(topic, 5)
-        ledger.find(topic, found)
-        ledger.settle(topic)
-
-    assert ledger.topic("/few").dropped.total() == 2
-    assert ledger.topic("/many").is_whole
-    assert any("/many" in sentence for sentence in ledger.notices)
 
 
 def test_loss_of_unknown_size_is_a_loss() -> None:
@@ -127,29 +91,6 @@ def test_account_that_does_not_add_up_raises(found: int, yielded: int, skipped: 
 
     with pytest.raises(AccountError, match="does not add up"):
         ledger.check()
-
-
-def test_declared_count_causes_one_detail_or_notice_on_mismatch() -> None:
-    for declared, missing, notices in ((5, 0, 0), (6, 1, 0), (4, 0, 1)):
-        ledger = Ledger("log")
-        ledger.declare("/t", declared)
-        ledger.find("/t", 5)
-        ledger.settle("/t")
-
-        assert ledger.topic("/t").dropped.total() == missing
-        assert len(ledger.details) == missing
-        assert len(ledger.notices) == notices
-
-
-def test_dropped_rows_are_not_counted_as_missing() -> None:
-    ledger = Ledger("log")
-    ledger.declare("/t", 5)
-    ledger.find("/t", 3)
-    ledger.drop("/t", "damaged", 2)
-    ledger.settle("/t")
-
-    assert ledger.topic("/t").dropped == {"damaged": 2}
-    assert not ledger.notices
 
 
 class Fate(NamedTuple):
@@ -290,19 +231,20 @@ def test_missing_rows_are_stored_with_reason_and_counts() -> None:
         Detail("/t", "no partner", "declared 7, found 3", None, 3, is_dropped=True),
     ]
     assert ledger.topic("/t").dropped == {"cut": 1, "no partner": 3}
+    assert not ledger.is_whole
 
 
 def test_surplus_rows_are_reported_with_both_counts() -> None:
-    """1 row is declared, 2 are found and 1 is dropped."""
+    """2 rows are declared, 2 are found and 1 is dropped."""
     ledger = Ledger("log")
-    ledger.declare("/t", 1)
+    ledger.declare("/t", 2)
     ledger.find("/t", 2)
     ledger.drop("/t", "cut", 1)
 
     ledger.settle("/t")
     ledger.settle("/t")
 
-    assert ledger.notices == ["/t: the file declares 1 messages, holds 3"]
+    assert ledger.notices == ["/t: the file declares 2 messages, holds 3"]
 
 
 def test_skips_and_losses_are_stored_with_place_time_and_count() -> None:

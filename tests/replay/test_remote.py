@@ -20,7 +20,7 @@ from crosscue.replay.remote import waiting
 from crosscue.replay.remote.logs import Store, fetch_log
 from support.can_files import candump, random_frames
 from support.every_format import EVERY_FORMAT
-from support.range_server import Served, serving
+from support.range_server import Served
 
 
 @pytest.fixture
@@ -156,15 +156,6 @@ def test_failed_fetch_leaves_no_file(
 
 
 SIGNED = "?X-Amz-Expires=60&X-Amz-Credential=a%2Fb&X-Amz-Signature=abc/def.mcap"
-
-
-@pytest.fixture
-def web(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
-    """Start a web server; complete logs are stored in ``tmp_path/store``."""
-    pytest.importorskip("aiohttp", reason="aiohttp, by which fsspec reads from the web, is missing")
-    monkeypatch.setenv(remote.STORE_VARIABLE, str(tmp_path / "store"))
-    with serving() as served:
-        yield served
 
 
 def test_presigned_log_is_read_like_a_local_one(

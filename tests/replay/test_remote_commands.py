@@ -1,7 +1,6 @@
 """Commands on parts of remote logs, with the transferred bytes counted by the server."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -17,11 +16,10 @@ from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.files.identity import log_identity
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.remote import logs as remote
 from crosscue.replay.write.convert import LogWriter
 from support.can_files import candump, random_frames
 from support.memory_log import GYRO, WHEELS, gyro_block, wheel_block
-from support.range_server import Served, serving
+from support.range_server import Served
 from support.rosbag_files import rows_of, write_bag
 
 MS = 1_000_000
@@ -71,15 +69,6 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
             copy.add_message(known[channel.topic], at, message.data, at, message.sequence)
         copy.finish()  # type: ignore[no-untyped-call]
     return folder / "drive.mcap"
-
-
-@pytest.fixture
-def web(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
-    """Start a web server; complete logs are stored in ``tmp_path/store``."""
-    pytest.importorskip("aiohttp", reason="aiohttp, by which fsspec reads from the web, is missing")
-    monkeypatch.setenv(remote.STORE_VARIABLE, str(tmp_path / "store"))
-    with serving() as served:
-        yield served
 
 
 def max_transfer_bytes(path: Path, start_ns: int, end_ns: int) -> int:

@@ -232,6 +232,20 @@ def _blf_object(frame: Sent, is_old: bool) -> bytes:
     return base + head + body + bytes(size % 4)
 
 
+def python_can_message(frame: Sent) -> can.Message:
+    """Convert a frame for python-can's writers."""
+    return can.Message(
+        timestamp=frame.t_ns * 1e-9,
+        arbitration_id=frame.arbitration_id,
+        is_extended_id=frame.is_extended,
+        is_remote_frame=frame.kind == REMOTE,
+        is_error_frame=frame.kind == ERROR,
+        is_fd=frame.is_fd,
+        data=frame.payload,
+        channel=int(frame.bus),
+    )
+
+
 def frames_of(columns: CanFrames, log_ns: Sequence[int], bus: str) -> Iterator[Sent]:
     """Yield the rows of a block as frames."""
     for k, t_ns in enumerate(log_ns):

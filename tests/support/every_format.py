@@ -9,7 +9,7 @@ from typing import Final
 import can
 import numpy as np
 
-from support.can_files import Sent, asc, blf, candump, random_frames, trc
+from support.can_files import Sent, asc, blf, candump, python_can_message, random_frames, trc
 from support.kitti_drive import raw_drive
 from support.kitti_odometry_drive import kitti_odometry_drive
 from support.nuscenes_drive import nuscenes_drive
@@ -38,22 +38,13 @@ def _db3(folder: Path) -> Path:
     return Path(shutil.move(str(next(bag.glob("*.db3"))), folder / "log.db3"))
 
 
-def _mf4(path: Path, frames: Sequence[Sent]) -> Path:
+def mf4(path: Path, frames: Sequence[Sent], compression: int = 2) -> Path:
+    """Write a log with python-can, which uses asammdf."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        writer = can.MF4Writer(path)
-        for f in frames:
-            writer(
-                can.Message(
-                    timestamp=f.t_ns * 1e-9,
-                    arbitration_id=f.arbitration_id,
-                    is_extended_id=f.is_extended,
-                    is_remote_frame=f.kind == 1,
-                    is_fd=f.is_fd,
-                    data=f.payload,
-                    channel=int(f.bus),
-                )
-            )
+        writer = can.MF4Writer(path, compression_level=compression)
+        for frame in frames:
+            writer(python_can_message(frame))
         writer.stop()
     return path
 
@@ -84,7 +75,7 @@ EVERY_FORMAT: Final[dict[str, Callable[[Path], Path]]] = {
     "asc": lambda folder: _bytes(folder / "can.asc", asc(random_frames(FRAMES))),
     "blf": lambda folder: _bytes(folder / "can.blf", blf(random_frames(FRAMES))),
     "trc": lambda folder: _bytes(folder / "can.trc", trc(random_frames(FRAMES))),
-    "mf4": lambda folder: _mf4(folder / "can.mf4", random_frames(FRAMES)),
+    "mf4": lambda folder: mf4(folder / "can.mf4", random_frames(FRAMES)),
     "comma2k19": lambda folder: _comma2k19(folder / "segment"),
     "kitti-raw": lambda folder: raw_drive(folder / "drive"),
     "kitti-odometry": kitti_odometry_drive,

@@ -222,3 +222,45 @@ def record(body: bytes, **fields: bytes) -> bytes:
     """One ROS 1 record."""
     header = b"".join(header_field(name.encode(), value) for name, value in fields.items())
     return struct.pack("<I", len(header)) + header + struct.pack("<I", len(body)) + body
+
+
+def u32(value: int) -> bytes:
+    """A number of 32 bits."""
+    return struct.pack("<I", value)
+
+
+def stamp(t_ns: int) -> bytes:
+    """A time, as records store it."""
+    return struct.pack("<II", t_ns // 10**9, t_ns % 10**9)
+
+
+def connection(conn: int, topic: bytes, type_name: bytes = b"std_msgs/String") -> bytes:
+    """A connection record."""
+    body = b"".join(
+        header_field(name, value)
+        for name, value in (
+            (b"topic", topic),
+            (b"type", type_name),
+            (b"md5sum", type_name * 2),
+            (b"message_definition", b"string data\n"),
+        )
+    )
+    return record(body, op=b"\x07", conn=u32(conn), topic=topic)
+
+
+def message(conn: int, t_ns: int, payload: bytes) -> bytes:
+    """A message record."""
+    return record(payload, op=b"\x02", conn=u32(conn), time=stamp(t_ns))
+
+
+def chunk(body: bytes, compression: bytes = b"none", size: int | None = None) -> bytes:
+    """A chunk record that declares ``size`` bytes, or as many as ``body`` has."""
+    declared = len(body) if size is None else size
+    return record(body, op=b"\x05", compression=compression, size=u32(declared))
+
+
+def bag(path: Path, *records: bytes, **header: bytes) -> Path:
+    """Write a bag of these records, with fields of its header other than those of no index."""
+    fields = {"op": b"\x03", "index_pos": bytes(8), "conn_count": u32(0), "chunk_count": u32(0)}
+    path.write_bytes(b"#ROSBAG V2.0\n" + record(b" " * 64, **(fields | header)) + b"".join(records))
+    return path

@@ -13,7 +13,7 @@ from typing import Final
 
 from crosscue.replay.decode.ros.type_names import ros2_spelling
 from crosscue.replay.errors import SchemaError
-from crosscue.replay.limits import DEFAULT_LIMITS, Limits
+from crosscue.replay.limits import DEFAULT_LIMITS
 
 # NumPy codes of primitive types; ``byte`` is signed and ``char`` is not, in ROS 1 and ROS 2.
 PRIMITIVES: Final[Mapping[str, str]] = {
@@ -79,25 +79,22 @@ _IDL_ANNOTATION: Final = re.compile(r"@\w{1,64}\s{0,8}\([^()]{0,4000}\)")
 _ANNOTATION: Final = re.compile(r"(?:@\w{1,64}(?:\([^)]{0,200}\))?[ \t]*){0,16}")
 
 
-def definitions_of(
-    type_name: str, schema: bytes, schema_encoding: str, limits: Limits = DEFAULT_LIMITS
-) -> Definitions:
+def definitions_of(type_name: str, schema: bytes, schema_encoding: str) -> Definitions:
     """Return all types that a schema defines, by name in ROS 2 spelling.
 
     Args:
         type_name: Message type of the schema.
         schema: Text as stored in the log.
         schema_encoding: ``ros1msg``, ``ros2msg`` or ``ros2idl``.
-        limits: ``schema_bytes`` bounds the text.
 
     Raises:
         SchemaError: The text is too large, not UTF-8, or does not parse; the message names the
             line.
     """
-    if len(schema) > limits.schema_bytes:
+    if len(schema) > DEFAULT_LIMITS.schema_bytes:
         raise SchemaError(
             f"{type_name}: definition has {len(schema)} bytes, over the limit of "
-            f"{limits.schema_bytes}"
+            f"{DEFAULT_LIMITS.schema_bytes}"
         )
     try:
         text = schema.decode("utf-8").replace("\r\n", "\n")

@@ -25,7 +25,7 @@ from crosscue.replay.decode.ros.definition import (
     well_known,
 )
 from crosscue.replay.errors import SchemaError
-from crosscue.replay.limits import DEFAULT_LIMITS, Limits
+from crosscue.replay.limits import DEFAULT_LIMITS
 
 MAX_DEPTH: Final = 32
 MAX_STEPS: Final = 20_000
@@ -132,15 +132,13 @@ class ParsingPlan:
     sequences: Mapping[str, Items]
 
 
-def compile_plan(
-    type_name: str, known: Definitions, *, is_cdr: bool, limits: Limits = DEFAULT_LIMITS
-) -> ParsingPlan:
+def compile_plan(type_name: str, known: Definitions, *, is_cdr: bool) -> ParsingPlan:
     """Compile the parsing plan of ``type_name``.
 
     Raises:
         SchemaError: A type is missing or contains itself, or every message exceeds the limits.
     """
-    steps = _Planner(type_name, known, is_cdr, limits).message(type_name, "", 0)
+    steps = _Planner(type_name, known, is_cdr).message(type_name, "", 0)
     runs = [step for step in steps if isinstance(step, FixedFields)]
     return ParsingPlan(
         type_name,
@@ -171,7 +169,6 @@ class _Planner:
     root: str
     known: Definitions
     is_cdr: bool
-    limits: Limits
     made: int = field(default=0)
 
     def message(self, name: str, prefix: str, depth: int) -> tuple[Step, ...]:
@@ -191,11 +188,12 @@ class _Planner:
             yield _Fixed(filler, 1, 1 if self.is_cdr else 0, 1, 1)
         for each in fields:
             path = f"{prefix}.{each.name}" if prefix else each.name
-            pieces = self._field(each, path, depth)
-            if not self.is_cdr and name == HEADER and each is fields[0] and each.name == "seq":
-                yield from (_without_cdr(piece) for piece in pieces)
-            else:
-                yield from pieces
+            is_counter = name == HEADER and each is fields[0] and each.name == "seq"
+            for piece in self._field(each, path, depth):
+                if not self.is_cdr and is_counter and isinstance(piece, _Fixed):
+                    yield replace(piece, cdr_align=1, cdr_width=0)
+                else:
+                    yield piece
 
     def _fields(self, name: str) -> tuple[MessageField, ...]:
         fields = self.known.get(name)
@@ -236,10 +234,10 @@ class _Planner:
 
     def _value(self, value: Value, align: int, size: int) -> _Fixed:
         self._count()
-        if size > self.limits.message_bytes:
+        if size > DEFAULT_LIMITS.message_bytes:
             raise SchemaError(
                 f"{self.root}: {value.path} alone takes {size} bytes, over the limit of "
-                f"{self.limits.message_bytes} for a message"
+                f"{DEFAULT_LIMITS.message_bytes} for a message"
             )
         return _Fixed(value, align if self.is_cdr else 1, size, align, size)
 
@@ -248,25 +246,22 @@ class _Planner:
         one = MessageField(each.name, each.type_name, text_bound=each.text_bound)
         item = tuple(_in_runs(self._one(one, path, depth)))
         min_bytes = sum(_min_bytes(step) for step in item)
-        fixed = all(isinstance(step, FixedFields) for step in item)
         is_array = each.shape is Multiplicity.ARRAY
-        if is_array and min_bytes * each.size > self.limits.message_bytes:
+        if is_array and min_bytes * each.size > DEFAULT_LIMITS.message_bytes:
             raise SchemaError(
                 f"{self.root}: {path} alone takes {min_bytes * each.size} bytes, over the limit of "
-                f"{self.limits.message_bytes} for a message"
+                f"{DEFAULT_LIMITS.message_bytes} for a message"
             )
+        runs = [step for step in item if isinstance(step, FixedFields)]
+        is_fixed = len(runs) == len(item)
         return Items(
             path,
             item,
             each.size if is_array else None,
             0 if is_array else each.size,
             PRIMITIVES.get(each.type_name, ""),
-            _jumps([step.size for step in item if isinstance(step, FixedFields)])
-            if fixed
-            else None,
-            _jumps([step.cdr_size for step in item if isinstance(step, FixedFields)])
-            if fixed
-            else None,
+            _jumps([run.size for run in runs]) if is_fixed else None,
+            _jumps([run.cdr_size for run in runs]) if is_fixed else None,
             min_bytes,
         )
 
@@ -282,10 +277,6 @@ def _min_bytes(step: Step) -> int:
     if isinstance(step, Text):
         return 4
     return 4 if step.count is None else step.count * step.item_bytes
-
-
-def _without_cdr(piece: _Piece) -> _Piece:
-    return replace(piece, cdr_align=1, cdr_width=0) if isinstance(piece, _Fixed) else piece
 
 
 def _in_runs(pieces: Iterator[_Piece]) -> Iterator[Step]:

@@ -22,7 +22,7 @@ from crosscue.replay.columns import (
     Messages,
     Table,
 )
-from crosscue.replay.decode.coding import JPEG, MAGIC_BYTES, STREAMS, coding_of
+from crosscue.replay.decode.coding import JPEG, MAGIC_BYTES, MAX_SIDE_PX, STREAMS, coding_of
 from crosscue.replay.decode.refuse import (
     BIG_ENDIAN,
     EMPTY_PICTURE,
@@ -41,7 +41,6 @@ Decoded: TypeAlias = CanFrames | Table | Images
 Doubt: TypeAlias = tuple[Bools, str]
 
 FD_BYTES: Final = 64
-MAX_SIDE_PX: Final = 65_535
 # OpenCV's largest distortion model.
 LENS_COEFFICIENTS: Final = 14
 
@@ -140,8 +139,6 @@ def _unsigned(column: NDArray[np.generic]) -> NDArray[np.unsignedinteger]:
 
 
 def _can_fd_frame(fields: FieldColumns) -> CanFrames:
-    remote = fields.number("is_rtr").astype(np.bool_)
-    error = fields.number("is_error").astype(np.bool_)
     first, length = fields.items("data")
     payload = np.zeros((len(fields), FD_BYTES), np.uint8)
     for k in range(int(length.max(initial=0))):
@@ -150,7 +147,7 @@ def _can_fd_frame(fields: FieldColumns) -> CanFrames:
     return CanFrames(
         fields.number("id").astype(np.uint32),
         fields.number("is_extended").astype(np.bool_),
-        np.where(error, ERROR, np.where(remote, REMOTE, DATA)).astype(np.uint8),
+        _frame_kinds(fields),
         length.astype(np.uint8),
         payload,
         fields.number("is_fd").astype(np.bool_),

@@ -10,7 +10,7 @@ import numpy as np
 
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block, Bytes
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.ledger import DAMAGED_RECORD, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.chunks.blocks import BlockBuilder
 from crosscue.replay.readers.mcap.chunks.load import ChunkRecords, Load, Loader
@@ -45,7 +45,6 @@ from .walk import (
 from .window import ChunkWindow, find_window
 
 DAMAGED_CHUNK: Final = "damaged chunk"
-DAMAGED_RECORD: Final = "damaged record"
 DAMAGED_SECTION: Final = "the data section does not match its checksum"
 MISSING: Final = "declared by the format, not in its bytes"
 INCOMPLETE: Final = "the file does not end as it should"

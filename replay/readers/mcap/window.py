@@ -142,15 +142,10 @@ def _doubt(segment: RecordingSegment, summary: Summary) -> str:
 
 def _in_time(chunks: ChunkTable, selection: Selection) -> NDArray[np.bool_]:
     """Return a mask of the chunks that may contain selected or impossible times."""
-    asked = np.ones(len(chunks), dtype=np.bool_)
-    if selection.start_ns is not None:
-        asked &= chunks.end >= np.uint64(min(max(selection.start_ns, 0), 1 << 63))
-    if selection.end_ns is not None:
-        asked &= chunks.start < np.uint64(min(max(selection.end_ns, 0), 1 << 63))
     is_odd = (chunks.start > chunks.end) | (chunks.end > LATEST)
     # Some writers do not set the times of a chunk.
     is_odd |= (chunks.start == 0) & (chunks.end == 0)
-    return np.logical_or(asked, is_odd)
+    return selection.overlaps(chunks.start, chunks.end) | is_odd
 
 
 def _wanted(declarations: Declarations, selection: Selection) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import BLOCK_BYTES, BLOCK_ROWS, Block, Bytes, Int64s, Topic
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.ledger import DAMAGED_RECORD, OTHER_TYPE, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mixed import MixedRows, blocks_of
 
@@ -33,8 +33,6 @@ from .window import BagWindow, find_bag_window
 # copies take.
 BATCH_BYTES: Final = BLOCK_BYTES // 2
 
-DAMAGED_RECORD: Final = "damaged record"
-OTHER_TYPE: Final = "another message type on the same topic"
 NO_CONNECTION: Final = "message of an unknown connection"
 TWO_RECORDS: Final = "the records of a connection differ"
 

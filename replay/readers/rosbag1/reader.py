@@ -14,12 +14,12 @@ from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import LogError, LogFormatError
 from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.ledger import DAMAGED_RECORD, Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.remote.ranges import RangedFile
 from crosscue.replay.seal.touched import Touched
 
-from .bag_pass import DAMAGED_RECORD, Pass, Roster
+from .bag_pass import Pass, Roster
 from .chunk import CUT
 from .index import Contents, read_index, scan_records
 from .records import BAG_HEADER, MAGIC, BagFile, BagRecord, RangedBagFile

@@ -10,6 +10,8 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
+
 from crosscue.replay.base import Selection
 from crosscue.replay.limits import Limits
 
@@ -87,11 +89,8 @@ def find_bag_window(
         return "its index has no checksum, and its chunks are not in order of time"
     if not all(info.counts.keys() <= contents.connections.keys() for info in infos):
         return "its index refers to connections that it does not describe"
-    asked = [
-        (selection.start_ns is None or info.end_ns >= selection.start_ns)
-        and (selection.end_ns is None or info.start_ns < selection.end_ns)
-        for info in infos
-    ]
+    spans = np.array([(info.start_ns, info.end_ns) for info in infos], np.int64)
+    asked = selection.overlaps(spans[:, 0], spans[:, 1]).tolist()
     is_asked = tuple(asked)
     if not any(asked):  # between two chunks, or beyond the bag's ends
         begins = selection.start_ns if selection.start_ns is not None else infos[0].start_ns

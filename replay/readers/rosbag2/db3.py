@@ -15,7 +15,7 @@ import numpy as np
 from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block, Int64s, Messages, Topic
 from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.ledger import OTHER_TYPE, Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.can_rows import keep_memory
 from crosscue.replay.readers.mixed import MixedRows, blocks_of
@@ -32,7 +32,6 @@ UNSOUND: Final = "SQLite's integrity check finds damage"
 NO_TOPIC: Final = "message without a topic"
 NOT_A_TIME: Final = "timestamp is not an integer"
 NOT_BYTES: Final = "payload is not a blob"
-OTHER_TYPE: Final = "another message type on the same topic"
 _SMALL: Final = 1 << 16
 DELETED: Final = "row numbers missing"
 INDEX_DIFFERS: Final = "row and time index disagree"

@@ -17,7 +17,7 @@ from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block, Messages, Topic
 from crosscue.replay.errors import LogError
 from crosscue.replay.files.closing import Closing
-from crosscue.replay.ledger import DETAILS_KEPT, Ledger
+from crosscue.replay.ledger import DETAILS_KEPT, OTHER_TYPE, Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 
 from .inflate import DAMAGED, inflated
@@ -28,7 +28,6 @@ from .split import PACKED, PACKED_DAMAGED, Split, examined, open_storage, stored
 MISSING: Final = "storage file is missing"
 UNREADABLE: Final = "storage file cannot be opened"
 BY_METADATA: Final = "metadata.yaml counts more"
-OTHER_TYPE: Final = "another message type on the same topic"
 
 
 class FolderLog(Closing):

@@ -158,26 +158,27 @@ def test_arxml_file_defines_frames(tmp_path: Path) -> None:
         CanDatabase.load([write_file(tmp_path, huge, "bus.arxml")])
 
 
-def test_only_message_with_oversized_signals_is_not_decodable(tmp_path: Path) -> None:
-    broken = replace(YAW, length=4)
-
-    database = CanDatabase.load([write_file(tmp_path, dbc_text([broken, WHEEL]))])
-
-    assert database.named("Yaw").problem == "signal load does not fit into 4 bytes"
-    assert not database.named("Wheel").problem
-    assert any("Yaw cannot be decoded" in notice for notice in database.notices)
-
-
-def test_message_with_branch_but_no_multiplexer_is_not_decodable(tmp_path: Path) -> None:
-    text = dbc_text([YAW, WHEEL]).replace("SG_ state ", "SG_ state m3")
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("Yaw: 8", "Yaw: 4", "signal load does not fit into 4 bytes"),
+        (
+            "SG_ state ",
+            "SG_ state m3",
+            "signal state is multiplexed, but its multiplexer is not specified",
+        ),
+    ],
+)
+def test_only_invalid_message_is_not_decodable(
+    old: str, new: str, problem: str, tmp_path: Path
+) -> None:
+    text = dbc_text([YAW, WHEEL]).replace(old, new)
 
     database = CanDatabase.load([write_file(tmp_path, text)])
 
-    assert (
-        database.named("Yaw").problem
-        == "signal state is multiplexed, but its multiplexer is not specified"
-    )
+    assert database.named("Yaw").problem == problem
     assert not database.named("Wheel").problem
+    assert any("Yaw cannot be decoded" in notice for notice in database.notices)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "utf-8-sig", "utf-16"])

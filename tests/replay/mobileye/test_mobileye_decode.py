@@ -246,14 +246,11 @@ def test_extract_inverts_place(start: int, bits: int, signed: bool, seed: int) -
     np.testing.assert_array_equal(leading_words(payloads_of(words)), words)
 
 
-MS_CLOCK = 1_000_000
-
-
 def camera(n: int, period_ms: int = 66, drift: float = 0.0) -> tuple[Int64s, Int64s]:
     """Return image times on the log's clock, and the device's counter at these times."""
-    image_ns = 10**18 + np.arange(n, dtype=np.int64) * period_ms * MS_CLOCK
-    device_ns = (np.arange(n) * period_ms * MS_CLOCK * (1 + drift)).astype(np.int64) + 77 * MS_CLOCK
-    return image_ns, device_ns // MS_CLOCK & 0xFF
+    image_ns = 10**18 + np.arange(n, dtype=np.int64) * period_ms * MS
+    device_ns = (np.arange(n) * period_ms * MS * (1 + drift)).astype(np.int64) + 77 * MS
+    return image_ns, device_ns // MS & 0xFF
 
 
 def error_without_offset(image_ns: Int64s, truth_ns: Int64s) -> Int64s:
@@ -266,14 +263,12 @@ def error_without_offset(image_ns: Int64s, truth_ns: Int64s) -> Int64s:
 def test_arrival_jitter_is_removed(seed: int, period_ms: int, jitter_ms: int) -> None:
     rng = np.random.default_rng(seed)
     image_ns, counter_ms = camera(400, period_ms)
-    latency_ns = 5 * MS_CLOCK + rng.exponential(jitter_ms * MS_CLOCK / 5 + 1, 400).clip(
-        0, jitter_ms * MS_CLOCK
-    )
+    latency_ns = 5 * MS + rng.exponential(jitter_ms * MS / 5 + 1, 400).clip(0, jitter_ms * MS)
     log_ns = np.maximum.accumulate(image_ns + latency_ns.astype(np.int64))
     found = CounterClock().feed(counter_ms, log_ns)
 
     settled = np.s_[60:]
-    assert np.abs(error_without_offset(found[settled], image_ns[settled])).max() <= 4 * MS_CLOCK
+    assert np.abs(error_without_offset(found[settled], image_ns[settled])).max() <= 4 * MS
     assert (np.diff(found) >= 0).all()
     assert (found <= log_ns).all()
 
@@ -290,7 +285,7 @@ def test_image_times_are_ordered_and_precede_their_frames(
 
     assert (np.diff(found) >= 0).all()
     assert (found <= log_ns).all()
-    assert (log_ns - found).max() < 256 * MS_CLOCK or (np.diff(found) == 0).any()
+    assert (log_ns - found).max() < 256 * MS or (np.diff(found) == 0).any()
 
 
 def test_device_restart_is_followed_and_reported() -> None:
@@ -299,7 +294,7 @@ def test_device_restart_is_followed_and_reported() -> None:
     clock = CounterClock()
     found = clock.feed(counter_ms, image_ns)
 
-    np.testing.assert_allclose(found[280:], image_ns[280:], atol=2 * MS_CLOCK)
+    np.testing.assert_allclose(found[280:], image_ns[280:], atol=2 * MS)
     assert any(n.startswith(f"{SET_ANEW} (1 times") for n in clock.notices)
 
 
@@ -309,5 +304,5 @@ def test_log_clock_set_back_restarts_image_times() -> None:
     clock = CounterClock()
     found = clock.feed(counter_ms, log_ns)
 
-    np.testing.assert_allclose(found, log_ns, atol=MS_CLOCK)
+    np.testing.assert_allclose(found, log_ns, atol=MS)
     assert clock.notices == (f"{WENT_BACK} (1 times, first at {log_ns[50]} ns)",)

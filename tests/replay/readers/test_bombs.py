@@ -20,8 +20,7 @@ from support.can_files import blf, random_frames
 from support.mcap_files import MAGIC, ChunkOf, channel, header, message, record, schema, text
 from support.measured import measured
 from support.mf4_files import unsorted
-from support.rosbag_files import header_field, rows_of, write_folder
-from support.rosbag_files import record as bag_record
+from support.rosbag_files import bag, chunk, connection, rows_of, write_folder
 
 BOMB_BYTES = 1 << 30
 # Memory limit of a process that refuses a bomb, including Python and its libraries.
@@ -53,27 +52,6 @@ def mcap(body: bytes, compression: str, declared: int) -> bytes:
     return MAGIC + header() + sound.coded() + record(6, head + struct.pack("<Q", len(body)) + body)
 
 
-def bag(body: bytes, compression: str, declared: int) -> bytes:
-    """Write a ROS 1 bag with a bomb and a connection."""
-    names = {
-        b"topic": b"/a",
-        b"type": b"std_msgs/String",
-        b"md5sum": b"x",
-        b"message_definition": b"string data\n",
-    }
-    about = b"".join(header_field(*pair) for pair in names.items())
-    return (
-        b"#ROSBAG V2.0\n"
-        + bag_record(
-            b" " * 4027, op=b"\3", index_pos=bytes(8), conn_count=bytes(4), chunk_count=bytes(4)
-        )
-        + bag_record(about, op=b"\7", conn=bytes(4), topic=b"/a")
-        + bag_record(
-            body, op=b"\5", compression=compression.encode(), size=struct.pack("<I", declared)
-        )
-    )
-
-
 CASES: dict[str, tuple[str, str, Callable[[], bytes], int]] = {
     "mcap zstd over the limit": (".mcap", "zstd", zstd_bomb, BOMB_BYTES),
     "mcap zstd more than declared": (".mcap", "zstd", zstd_bomb, 1000),
@@ -91,7 +69,10 @@ CASES: dict[str, tuple[str, str, Callable[[], bytes], int]] = {
 def test_bomb_is_refused_with_size_and_limit_in_bounded_memory(tmp_path: Path, case: str) -> None:
     suffix, compression, body, declared = CASES[case]
     path = tmp_path / f"bomb{suffix}"
-    path.write_bytes((mcap if suffix == ".mcap" else bag)(body(), compression, declared))
+    if suffix == ".mcap":
+        path.write_bytes(mcap(body(), compression, declared))
+    else:
+        bag(path, connection(0, b"/a"), chunk(body(), compression.encode(), declared))
 
     status, output, peak_mb = measured(["info", str(path)])
 
@@ -137,8 +118,6 @@ def _in_db3(content: Callable[[], bytes]) -> Callable[[Path], Path]:
 
 def _zstd_with_declared_size() -> bytes:
     """Return a zstd frame that declares its size."""
-    import zstandard
-
     packer = zstandard.ZstdCompressor().compressobj(size=BOMB_BYTES)
     return b"".join(packer.compress(PIECE) for _ in range(BOMB_BYTES >> 20)) + packer.flush()
 

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.base import Selection
+from crosscue.replay.columns import ERROR
 from crosscue.replay.ledger import NOT_ASKED_TIME
 from support.can_files import (
     START_NS,
@@ -18,6 +19,7 @@ from support.can_files import (
     blf,
     by_bus,
     damaged,
+    python_can_message,
     random_frames,
     read_back,
 )
@@ -42,22 +44,12 @@ def _read_with_python_can(path: Path) -> list[can.Message]:
 
 def test_log_written_by_python_can_matches_its_reader(tmp_path: Path) -> None:
     path = tmp_path / "x.blf"
-    frames = random_frames(3000)
     with can.BLFWriter(path) as writer:
-        for k, f in enumerate(frames):
-            is_error = k % 100 == 7
-            writer(
-                can.Message(
-                    timestamp=f.t_ns * 1e-9,
-                    arbitration_id=f.arbitration_id,
-                    is_extended_id=f.is_extended,
-                    is_remote_frame=f.kind == 1,
-                    is_error_frame=is_error,
-                    is_fd=f.is_fd and not is_error,
-                    data=f.payload[:8] if is_error else f.payload,
-                    channel=int(f.bus) - 1,
-                )
-            )
+        for k, frame in enumerate(random_frames(3000)):
+            sent = replace(frame, bus=str(int(frame.bus) - 1))
+            if k % 100 == 7:
+                sent = replace(sent, kind=ERROR, payload=frame.payload[:8], is_fd=False)
+            writer(python_can_message(sent))
     assert_equal_to_python_can(path, _read_with_python_can(path), "can/{}")
 
 

@@ -2,7 +2,6 @@
 
 import random
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,60 +16,21 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.mf4.blocks import Blocks
-from support.can_files import Sent, assert_equal_to_python_can, random_frames, read_back
+from support.can_files import assert_equal_to_python_can, random_frames, read_back
 from support.data import shared
+from support.every_format import mf4
 
 asammdf = pytest.importorskip("asammdf")
 REAL = ("can", "css_canedge", "3BA199E2", "00000164", "00000001-60FE3F04.MF4")
 
 
-def _bus_log(path: Path, frames: Sequence[Sent], compression: int = 0) -> Path:
-    """Write a log with python-can, which uses asammdf."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        writer = can.MF4Writer(path, compression_level=compression)
-        for f in frames:
-            writer(
-                can.Message(
-                    timestamp=f.t_ns * 1e-9,
-                    arbitration_id=f.arbitration_id,
-                    is_extended_id=f.is_extended,
-                    is_remote_frame=f.kind == 1,
-                    is_fd=f.is_fd,
-                    data=f.payload,
-                    channel=int(f.bus),
-                )
-            )
-        writer.stop()
-    return path
-
-
-def _signals(path: Path, count: int = 1000, compression: int = 0) -> Path:
-    """Write a log with two groups of signals: plain, converted, signed and big-endian."""
-    times = np.arange(count) * 0.01
-    signal: Any = asammdf.Signal
-    linear = {"a": 0.5, "b": -10.0}
+def _two_groups(path: Path) -> Path:
+    """Write a log with two groups of signals, of 1000 and of 10 rows."""
     with asammdf.MDF(version="4.10") as mdf:
-        mdf.append(
-            [
-                signal(
-                    np.arange(count, dtype=np.uint16),
-                    times,
-                    name="speed",
-                    unit="km/h",
-                    conversion=linear,
-                ),
-                signal(np.linspace(-1, 1, count), times, name="angle", unit="deg"),
-                signal(-np.arange(count, dtype=np.int32), times, name="torque", unit="Nm"),
-                signal(np.array([b"abc"] * count), times, name="label", encoding="utf-8"),
-            ],
-            acq_name="drive",
-        )
-        mdf.append(
-            [signal(np.arange(10, dtype=np.float32), np.arange(10) * 1.0, name="speed")],
-            acq_name="drive",
-        )
-        mdf.save(path, compression=compression, overwrite=True)
+        for count in (1000, 10):
+            signal = asammdf.Signal(np.arange(count), np.arange(count) * 0.01, name="speed")
+            mdf.append([signal], acq_name="drive")
+        mdf.save(path)
     return path
 
 
@@ -112,12 +72,12 @@ def _read_with_python_can(path: Path) -> list[can.Message]:
 @pytest.mark.parametrize("compression", [0, 2])
 def test_bus_logs_match_python_can(tmp_path: Path, compression: int) -> None:
     frames = [f for f in random_frames(500) if f.kind == 0]
-    path = _bus_log(tmp_path / "x.mf4", frames, compression)
+    path = mf4(tmp_path / "x.mf4", frames, compression)
     assert_equal_to_python_can(path, _read_with_python_can(path), "can/{}", within_ns=2_000)
 
 
 def test_unselected_rows_are_counted_but_not_read(tmp_path: Path) -> None:
-    path = _signals(tmp_path / "x.mf4")
+    path = _two_groups(tmp_path / "x.mf4")
     everything, _ = _tables(path)
     times = everything["drive"][0].log_ns
 
@@ -151,7 +111,7 @@ def test_truncation_of_real_log_is_reported(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("compression", [0, 2])
 def test_damage_raises_only_crosscue_errors(tmp_path: Path, compression: int) -> None:
-    content = _bus_log(tmp_path / "whole.mf4", random_frames(200), compression).read_bytes()
+    content = mf4(tmp_path / "whole.mf4", random_frames(200), compression).read_bytes()
     path = tmp_path / "x.mf4"
     for seed in range(150):
         chance = random.Random(seed)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from crosscue.replay.base import Selection
 from crosscue.replay.columns import BLOCK_ROWS, Block, Int64s, Messages
-from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
+from crosscue.replay.ledger import MESSAGE_TOO_LARGE, NOT_ASKED_TIME, NOT_ASKED_TOPIC, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.channels import UNKNOWN, Declarations
 from crosscue.replay.readers.mcap.checks import Checks
@@ -17,7 +17,6 @@ from crosscue.replay.readers.mcap.chunks.rows import Rows
 from crosscue.replay.readers.mcap.records import MESSAGE_HEAD, BrokenRecordError, MessageIndex
 
 UNDECLARED: Final = "message of a channel that the file does not declare"
-TOO_LARGE: Final = "message over the size limit"
 TIME_TOO_LATE: Final = "log time after the year 2262 (2^63 ns or later)"
 NO_PUBLISH_TIME: Final = (
     "publish times of 2^63 ns or later count as not available; the log time is used instead"
@@ -102,7 +101,7 @@ class BlockBuilder:
         topic = self.declarations.topic(channel_id)
         kept = self._account(topic, np.array([log], dtype=np.uint64))
         if kept is None or len(kept):
-            self._ledger.skip(topic, TOO_LARGE, 1, self._too_large(size, at), log)
+            self._ledger.skip(topic, MESSAGE_TOO_LARGE, 1, self._too_large(size, at), log)
 
     def _build_part(self, rows: Rows) -> Iterator[Block]:
         if not len(rows):
@@ -156,7 +155,7 @@ class BlockBuilder:
             small = stop - start <= self._limits.message_bytes
             for i in np.flatnonzero(~small).tolist():
                 detail = self._too_large(int(stop[i] - start[i]), None)
-                self._ledger.skip(topic, TOO_LARGE, 1, detail, int(log[i]))
+                self._ledger.skip(topic, MESSAGE_TOO_LARGE, 1, detail, int(log[i]))
             log, publish, start, stop = log[small], publish[small], start[small], stop[small]
             sequence = sequence[small]
         if len(publish) and np.maximum.reduce(publish) > LATEST:
@@ -191,12 +190,7 @@ class BlockBuilder:
 
     def _in_time(self, log: Uint64s) -> NDArray[np.bool_]:
         """Return a mask of the log times that are valid and selected."""
-        asked = log <= LATEST
-        if self._selection.start_ns is not None:
-            asked &= log >= np.uint64(min(max(self._selection.start_ns, 0), 1 << 63))
-        if self._selection.end_ns is not None:
-            asked &= log < np.uint64(min(max(self._selection.end_ns, 0), 1 << 63))
-        return asked
+        return (log <= LATEST) & self._selection.inside(log)
 
     def _too_large(self, size: int, at: int | None) -> str:
         where = "" if at is None else f" at byte {at}"
