@@ -1,40 +1,39 @@
 """Batch smoother of the pose over all of the filter's measurements.
 
-It is a factor graph of planar poses (F. Dellaert, M. Kaess, "Factor Graphs for Robot Perception",
-2017), solved by GTSAM, an optional package. Odometry connects the poses, headings and landmarks are
-measurements of them, and the start is the prior. Unlike the filter, the smoother also uses later
-measurements, and it linearises about its solution. It is a reference, not a part of the replay.
+Odometry connects the poses, headings and landmarks are measurements of them, and the start is the
+prior. Constant errors of the odometry are states, as in the filter. Unlike the filter, the smoother
+also uses later measurements, and it linearises about its solution: it is an iterated Kalman
+smoother, which is Gauss and Newton's method for the most likely track (B. Bell, *The Iterated
+Kalman Smoother as a Gauss-Newton Method*, SIAM J. Optimization 4, 1994). The backward pass is
+Bryson and Frazier's (Bierman, *Factorization Methods for Discrete Sequential Estimation*, 1977,
+chapter 10), which inverts only covariances of measurements. It is a reference, not a part of the
+replay.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import import_module
-from typing import TYPE_CHECKING, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import UsageError
 
-from .angles import wrap
-from .ekf import PoseBelief
+from .angles import wrap_all
+from .constants import NO_CONSTANTS, Constants
+from .ekf import PoseBelief, odometry_derivatives
 from .fixes import NO_FIXES, Fixes
 from .odometry import BY_NOTHING, Increments
-from .pose_filter import State, predict_pose
+from .pose_filter import HEADING, State, predict_pose
 from .pose_track import Headings
 
-if TYPE_CHECKING:
-    import gtsam
-
-# Maximum time between two poses of the graph.
+# Maximum time between two poses of the track.
 STEP_NS: Final = 1_000_000_000
-# Variance added to make the covariance of an arc, which has no sideways error, invertible: 3 mm and
-# 0.1 mrad.
-_MIN_VARIANCE: Final = np.diag([1e-5, 1e-5, 1e-8])
-RELATIVE_TOLERANCE: Final = 1e-10
-ABSOLUTE_TOLERANCE: Final = 1e-6
+# Change of any state below which the iteration ends, and the maximum number of passes.
+SETTLED: Final = 1e-7
+PASSES: Final = 30
 _AT_REST: Final = State(*(0.0,) * len(State._fields))
 
 
@@ -60,49 +59,47 @@ def smooth_poses(
     fixes: Fixes = NO_FIXES,
     at_ns: Int64s | None = None,
     lever_m: Floats | tuple[float, float] = (0.0, 0.0),
+    constants: Constants = NO_CONSTANTS,
+    by: Floats | None = None,
 ) -> Smoothed:
     """Compute the poses that fit all measurements best.
 
     Args:
-        start: The first belief, at whose time the graph starts.
+        start: The first belief, at whose time the track starts.
         increments: Odometry without gaps, from the start's time on.
         headings: Headings in use, with their variances.
         fixes: Landmarks and GNSS positions in use.
-        at_ns: Requested times; None for the graph's own, at most ``STEP_NS`` apart. Times outside
+        at_ns: Requested times; None for the track's own, at most ``STEP_NS`` apart. Times outside
             the odometry are left out.
         lever_m: Point of the car whose positions the fixes are, ahead of and to the left of the
             rear axle: one point, or shape (N, 2).
+        constants: K constant errors of the odometry at the start.
+        by: Shape (N, 2, K): ``constants.effects`` of the increments; required with constants.
 
     Raises:
-        UsageError: GTSAM is not installed.
         ValueError: The odometry has a gap or is empty.
     """
-    _need_gtsam()
-    import gtsam
-
     _check(start, increments)
     times = _times(start, increments, headings, fixes, at_ns)
-    graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    _add_start(graph, start)
-    steps = _steps(times, increments)
-    for key, (mean, cov) in enumerate(steps, start=1):
-        noise = gtsam.noiseModel.Gaussian.Covariance(_in_end_frame(cov, mean[2]))
-        graph.add(gtsam.BetweenFactorPose2(key - 1, key, gtsam.Pose2(*mean), noise))
-    for key, pose in enumerate(_guessed(start, times, steps, headings)):
-        guess.insert(key, gtsam.Pose2(*pose))
-    _add_headings(graph, times, headings)
-    _add_fixes(graph, guess, times, fixes, lever_m)
-    solved = _solved(graph, guess)
-    return _read(graph, solved, times, times if at_ns is None else at_ns)
-
-
-def _need_gtsam() -> None:
-    try:
-        import_module("gtsam")
-    except ImportError:
-        raise UsageError(
-            "the smoother needs the package gtsam; install it with: pip install gtsam"
-        ) from None
+    effects = np.zeros((len(increments), 2, 0)) if by is None else by
+    steps = _steps(times, increments, effects)
+    seen = _measured(times, headings, fixes, lever_m)
+    rows = slice(0, 3)
+    mean = np.append(start.mean[rows], constants.mean)
+    cross = constants.cross[rows]
+    cov = np.block([[start.cov[rows, rows], cross], [cross.T, constants.cov]])
+    drift = np.append(np.zeros(3), constants.drift_var_per_s)
+    found, covs = _passed(mean, cov, steps, drift, seen, None)
+    for _ in range(PASSES):
+        before = found
+        found, covs = _passed(mean, cov, steps, drift, seen, before)
+        if float(np.abs(found - before).max()) < SETTLED:
+            break
+    kept = times if at_ns is None else at_ns[(at_ns >= times[0]) & (at_ns <= times[-1])]
+    at = np.searchsorted(times, kept)
+    xyh = found[at, :3]
+    xyh[:, HEADING] = wrap_all(xyh[:, HEADING])
+    return Smoothed(kept, xyh, covs[at])
 
 
 def _check(start: PoseBelief, increments: Increments) -> None:
@@ -129,8 +126,17 @@ def _times(
     return inside
 
 
-def _steps(times: Int64s, increments: Increments) -> list[tuple[Floats, Floats]]:
-    """Relative poses between successive times, with covariances, in the earlier pose's frame."""
+class _Step(NamedTuple):
+    """Motion between two times, in the earlier pose's frame, and its derivatives by constants."""
+
+    mean: Floats
+    cov: Floats
+    by: Floats
+    dt_s: float
+
+
+def _steps(times: Int64s, increments: Increments, by: Floats) -> list[_Step]:
+    """Return the motion between successive times."""
     columns = (
         increments.distance_m,
         increments.turn_rad,
@@ -141,14 +147,19 @@ def _steps(times: Int64s, increments: Increments) -> list[tuple[Floats, Floats]]
     starts, stops = increments.start_ns.tolist(), increments.stop_ns.tolist()
     rows = list(zip(*(column.tolist() for column in columns), strict=True))
     i = int(np.searchsorted(increments.stop_ns, times[0], side="right"))
-    steps: list[tuple[Floats, Floats]] = []
+    steps: list[_Step] = []
     now = int(times[0])
     for until in times[1:].tolist():
-        state, aside_var = _AT_REST, 0.0
+        begin, state, aside_var, effect = now, _AT_REST, 0.0, np.zeros((3, by.shape[2]))
         while now < until:
             to = min(until, stops[i])
             fraction = (to - now) / (stops[i] - starts[i])
             distance, turn, distance_var, turn_var = (fraction * value for value in rows[i])
+            if effect.size:
+                by_state, by_input = odometry_derivatives(
+                    state.heading_rad, distance, turn, fraction * by[i]
+                )
+                effect = by_state[:3, :3] @ effect + by_input[:3]
             state = predict_pose(state, distance, turn, distance_var, turn_var, 0.0)
             aside_var += distance_var if is_blind[i] else 0.0
             now = to
@@ -156,130 +167,114 @@ def _steps(times: Int64s, increments: Increments) -> list[tuple[Floats, Floats]]
         x, y, heading, _, xx, xy, xh, _, yy, yh, _, hh, _, _ = state
         # In a gap the error to the side is as large as that ahead.
         cov = np.array([[xx, xy, xh], [xy, yy + aside_var, yh], [xh, yh, hh]])
-        steps.append((np.array([x, y, heading]), cov))
+        steps.append(_Step(np.array([x, y, heading]), cov, effect, (until - begin) * 1e-9))
     return steps
 
 
-def _guessed(
-    start: PoseBelief, times: Int64s, steps: list[tuple[Floats, Floats]], headings: Headings
-) -> list[tuple[float, float, float]]:
-    """Compute initial poses from odometry, with headings corrected as in a filter.
+class _Seen(NamedTuple):
+    """A heading, or the position of a point of the car."""
 
-    Odometry alone is radians and kilometres off after hours, and no solver converges from there.
-    """
-    read = dict(
-        zip(
-            headings.t_ns.tolist(),
-            zip(headings.heading_rad.tolist(), headings.var_rad2.tolist(), strict=True),
-            strict=True,
-        )
-    )
-    x, y, heading = (float(value) for value in start.mean[:3])
-    var = float(start.cov[2, 2])
-    poses = [(x, y, heading)]
-    for t_ns, (mean, cov) in zip(times[1:].tolist(), steps, strict=True):
-        c, s = math.cos(heading), math.sin(heading)
-        x, y = x + c * mean[0] - s * mean[1], y + s * mean[0] + c * mean[1]
-        heading, var = heading + mean[2], var + float(cov[2, 2])
-        if t_ns in read:
-            seen, seen_var = read[t_ns]
-            gain = var / (var + seen_var)
-            heading, var = heading + gain * wrap(seen - heading), var * (1.0 - gain)
-        poses.append((x, y, heading))
-    return poses
+    value: Floats
+    cov: Floats
+    lever_m: tuple[float, float] | None
+
+    def expected(self, at: Floats) -> tuple[Floats, Floats]:
+        """Return the expected value at a state, and its derivatives, shape (1 or 2, 3)."""
+        if self.lever_m is None:
+            return at[HEADING : HEADING + 1], np.array([[0.0, 0.0, 1.0]])
+        ahead_m, left_m = self.lever_m
+        c, s = math.cos(at[HEADING]), math.sin(at[HEADING])
+        dx_m, dy_m = c * ahead_m - s * left_m, s * ahead_m + c * left_m
+        by = np.array([[1.0, 0.0, -dy_m], [0.0, 1.0, dx_m]])
+        return at[:2] + np.array([dx_m, dy_m]), by
 
 
-def _solved(graph: gtsam.NonlinearFactorGraph, guess: gtsam.Values) -> gtsam.Values:
-    """Optimise the graph.
-
-    The position in a long drive is determined so weakly that an error of 100 m changes the total
-    error by a thousandth. GTSAM's default tolerances stop before the minimum is reached.
-    """
-    import gtsam
-
-    params = gtsam.LevenbergMarquardtParams()
-    params.setRelativeErrorTol(RELATIVE_TOLERANCE)
-    params.setAbsoluteErrorTol(ABSOLUTE_TOLERANCE)
-    params.setLinearSolverType("MULTIFRONTAL_QR")
-    return gtsam.LevenbergMarquardtOptimizer(graph, guess, params).optimize()
-
-
-def _rotation(angle_rad: float) -> Floats:
-    c, s = math.cos(angle_rad), math.sin(angle_rad)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _in_end_frame(cov: Floats, turn_rad: float) -> Floats:
-    """Rotate a covariance to the axes of the later pose, as in GTSAM."""
-    back = _rotation(-turn_rad)
-    turned: Floats = back @ cov @ back.T + _MIN_VARIANCE
-    return turned
-
-
-def _add_start(graph: gtsam.NonlinearFactorGraph, start: PoseBelief) -> None:
-    import gtsam
-
-    cov = _in_end_frame(start.cov[:3, :3], float(start.mean[2]))
-    noise = gtsam.noiseModel.Gaussian.Covariance(cov)
-    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*start.mean[:3]), noise))
-
-
-def _add_headings(graph: gtsam.NonlinearFactorGraph, times: Int64s, headings: Headings) -> None:
-    import gtsam
-
-    for t_ns, heading, var in zip(
-        headings.t_ns.tolist(),
-        headings.heading_rad.tolist(),
-        headings.var_rad2.tolist(),
-        strict=True,
-    ):
-        key = int(np.searchsorted(times, t_ns))
-        if key == len(times) or times[key] != t_ns:
-            continue
-        noise = gtsam.noiseModel.Isotropic.Sigma(1, math.sqrt(var))
-        graph.add(gtsam.PoseRotationPrior2D(key, gtsam.Rot2(heading), noise))
-
-
-def _add_fixes(
-    graph: gtsam.NonlinearFactorGraph,
-    guess: gtsam.Values,
-    times: Int64s,
-    fixes: Fixes,
-    lever_m: Floats | tuple[float, float],
-) -> None:
-    """Add each fix as a measurement of a camera or antenna pose, rigidly connected to the car's."""
-    import gtsam
-
+def _measured(
+    times: Int64s, headings: Headings, fixes: Fixes, lever_m: Floats | tuple[float, float]
+) -> list[list[_Seen]]:
+    """Return the measurements at each time."""
+    found: list[list[_Seen]] = [[] for _ in times]
     levers_m = np.broadcast_to(np.asarray(lever_m, np.float64), (len(fixes), 2))
-    rigid = gtsam.noiseModel.Gaussian.Covariance(_MIN_VARIANCE)
+    some: list[tuple[int, _Seen]] = []
+    columns = headings.t_ns.tolist(), headings.heading_rad.tolist(), headings.var_rad2.tolist()
+    for t_ns, heading, var in zip(*columns, strict=True):
+        some.append((t_ns, _Seen(np.array([heading]), np.array([[var]]), None)))
     for i, t_ns in enumerate(fixes.t_ns.tolist()):
-        key = int(np.searchsorted(times, t_ns))
-        if key == len(times) or times[key] != t_ns:
-            continue
         ahead_m, left_m = levers_m[i].tolist()
-        lever = gtsam.Pose2(ahead_m, left_m, 0.0)
-        point = len(times) + i
-        guess.insert(point, guess.atPose2(key).compose(lever))
-        graph.add(gtsam.BetweenFactorPose2(key, point, lever, rigid))
-        noise = gtsam.noiseModel.Gaussian.Covariance(fixes.cov_m2[i])
-        graph.add(gtsam.PoseTranslationPrior2D(point, fixes.xy_m[i], noise))
+        some.append((t_ns, _Seen(fixes.xy_m[i], fixes.cov_m2[i], (ahead_m, left_m))))
+    for t_ns, one in some:
+        row = int(np.searchsorted(times, t_ns))
+        if row < len(times) and times[row] == t_ns:
+            found[row].append(one)
+    return found
 
 
-def _read(
-    graph: gtsam.NonlinearFactorGraph, solved: gtsam.Values, times: Int64s, at_ns: Int64s
-) -> Smoothed:
-    import gtsam
+def _passed(
+    mean: Floats,
+    cov: Floats,
+    steps: Sequence[_Step],
+    drift_var_per_s: Floats,
+    seen: Sequence[Sequence[_Seen]],
+    about: Floats | None,
+) -> tuple[Floats, Floats]:
+    """Filter forwards and smooth backwards, linear about a track (None: about the filter's own).
 
-    # On a long drive, rounding in gtsam.Marginals (Cholesky) loses the position's information.
-    params = gtsam.ISAM2Params()
-    params.setFactorization("QR")
-    marginals = gtsam.ISAM2(params)
-    marginals.update(graph, solved)
-    found = at_ns[(at_ns >= times[0]) & (at_ns <= times[-1])]
-    xyh, covs = np.empty((len(found), 3)), np.empty((len(found), 3, 3))
-    for row, key in enumerate(np.searchsorted(times, found).tolist()):
-        pose = solved.atPose2(key)
-        xyh[row] = pose.x(), pose.y(), wrap(pose.theta())
-        out = _rotation(pose.theta())
-        covs[row] = out @ marginals.marginalCovariance(key) @ out.T
-    return Smoothed(found, xyh, covs)
+    Returns:
+        States, shape (M, 3 + K), with headings not wrapped, and covariances of the poses.
+    """
+    n, eye = len(mean), np.eye(len(mean))
+    means: list[Floats] = []
+    covs: list[Floats] = []
+    motions = [eye]
+    updates: list[list[tuple[Floats, Floats, Floats]]] = []
+    for row, measured in enumerate(seen):
+        if row:
+            step = steps[row - 1]
+            at = mean if about is None else about[row - 1]
+            to, motion, turned = _moved(at, step)
+            mean = to + motion @ (mean - at)
+            noise = np.diag(drift_var_per_s * step.dt_s)
+            noise[:3, :3] += turned @ step.cov @ turned.T
+            cov = motion @ cov @ motion.T + noise
+            motions.append(motion)
+        done = []
+        for one in measured:
+            at = mean if about is None else about[row]
+            expected, by_pose = one.expected(at)
+            by = np.zeros((len(expected), n))
+            by[:, :3] = by_pose
+            off = one.value - expected - by @ (mean - at)
+            off = wrap_all(off) if one.lever_m is None else off
+            weight = np.linalg.inv(by @ cov @ by.T + one.cov)
+            gain = cov @ by.T @ weight
+            mean, cov = mean + gain @ off, cov - gain @ by @ cov
+            cov = 0.5 * (cov + cov.T)
+            done.append((eye - gain @ by, by.T @ weight @ off, by.T @ weight @ by))
+        means.append(mean)
+        covs.append(cov)
+        updates.append(done)
+    pull, information = np.zeros(n), np.zeros((n, n))
+    smoothed, spread = np.empty((len(seen), n)), np.empty((len(seen), 3, 3))
+    for row in reversed(range(len(seen))):
+        mean, cov = means[row], covs[row]
+        smoothed[row] = mean - cov @ pull
+        spread[row] = (cov - cov @ information @ cov)[:3, :3]
+        for kept, told, known in reversed(updates[row]):
+            pull = kept.T @ pull - told
+            information = kept.T @ information @ kept + known
+        pull = motions[row].T @ pull
+        information = motions[row].T @ information @ motions[row]
+    return smoothed, spread
+
+
+def _moved(at: Floats, step: _Step) -> tuple[Floats, Floats, Floats]:
+    """Return the state after a step, its derivatives by the state before, and the rotation."""
+    c, s = math.cos(at[HEADING]), math.sin(at[HEADING])
+    turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    moved = turned @ (step.mean + step.by @ at[3:])
+    motion = np.eye(len(at))
+    motion[:2, HEADING] = -moved[1], moved[0]
+    motion[:3, 3:] = turned @ step.by
+    after = at.copy()
+    after[:3] += moved
+    return after, motion, turned

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from crosscue.eval.failures.find import failures_beside_truth
 from crosscue.eval.failures.order import diverse
@@ -88,7 +88,7 @@ class ScoringSettings:
     detection: Definition = "confirmed"
     rpe_m: Annotated[Sequence[float], Option("--rpe", metavar="M")] = (10.0, 100.0)
     has_attribution: bool = False
-    smoother: Literal["gtsam"] | None = None
+    smoother: bool = False
     any_log: bool = False
     logs: Annotated[Path | str | None, Option(metavar="DIR")] = None
     without_images: bool = False
@@ -136,7 +136,7 @@ class ScoringSettings:
             scores = pooled_scores([one], judged_by)
             metrics = metrics_of([one], scores)
             smoothed = None
-            if self.smoother is not None:
+            if self.smoother:
                 smoothed = score_smoother(folder, truth_path, smoothed_ranges(one))
                 metrics["smoother"] = asdict(smoothed)
             report = write_files(

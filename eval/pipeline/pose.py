@@ -217,7 +217,7 @@ class PoseStage:
         assert self._state is not None
         made = pose_track.advance_pose(self._state, increments, track_settings(self.vehicle))
         self._state = made.state
-        self._measured.append(odometry_rows(increments))
+        self._measured.append(odometry_rows(increments, is_visual=True))
         self.track_counts += made.counts
         yield made.poses
 

@@ -49,6 +49,6 @@ def test_hints_name_packages_that_pip_finds() -> None:
 
     # crosscue itself is on no index, so "pip install 'crosscue[onnx]'" finds nothing.
     assert "crosscue[" not in text
-    assert {"openvino", "gtsam", "ray", "mlflow-skinny"} <= hints
+    assert {"openvino", "ray", "mlflow-skinny"} <= hints
     # A database as MLflow's store needs the whole of it; see the page on scores.
     assert hints - known == {"mlflow"}

@@ -1,12 +1,14 @@
 """Tests of the batch smoother: exactness in the linear case, and consistency in simulation."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import wrap_all
+from crosscue.localization.constants import NO_CONSTANTS, Constants, effects
 from crosscue.localization.ekf import PoseBelief, update_point
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import Increments, OdometrySettings, WheelSamples, integrate
@@ -21,8 +23,6 @@ from crosscue.localization.pose_track import (
 from crosscue.localization.smoother import smooth_poses
 from crosscue.replay.columns import Floats, Int64s
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
-
-pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
 
 ODOMETRY = OdometrySettings(
     track_width_m=TRACK_M, wheel_step_mps=0.01, slip_per_sqrt_m=0.1, gyro_noise_rad_per_sqrt_s=0.01
@@ -129,6 +129,30 @@ def test_smoother_is_consistent_and_more_accurate_than_the_filter() -> None:
     assert low < np.mean(nees) < high
     assert np.sqrt(np.mean(smoother_m2)) < 0.9 * np.sqrt(np.mean(filter_m2))
     assert np.median(ends) < 0.2
+
+
+def test_constant_errors_of_the_odometry_are_states_with_true_variances() -> None:
+    """Seeds 100 to 139, with a scale and a bias that are off by their s.d. on average."""
+    names, sd = ("wheel_scale", "gyro_bias_radps"), np.array([0.05, 0.02])
+    nees: dict[str, list[float]] = {"states": [], "none": []}
+    for seed in range(100, 140):
+        rng = np.random.default_rng(seed)
+        truth, first, _, headings, fixes = simulate(seed)
+        scale, bias = rng.normal(0.0, sd).tolist()
+        car = replace(ODOMETRY, wheel_scale=1.0 - scale, gyro_bias_radps=-bias)
+        made = integrate(wheels(truth, ODOMETRY, rng), car, gyro(truth, ODOMETRY, rng)).increments
+        cov = np.diag(sd**2)
+        known = Constants(names, np.zeros(2), cov, np.zeros((4, 2)), np.zeros(2))
+        at = truth.t_ns[20::20]
+        for name, constants in (("states", known), ("none", NO_CONSTANTS)):
+            by = effects(made, car, constants.names)
+            found = smooth_poses(first, made, headings, fixes, at, (0.0, 0.0), constants, by)
+            error = errors(truth, found.t_ns, found.xyh)
+            nees[name].append(float(error[15] @ np.linalg.solve(found.cov[15], error[15])))
+
+    low, high = mean_band(3, 40)
+    assert low < np.mean(nees["states"]) < high
+    assert np.mean(nees["none"]) > 2.0 * high
 
 
 def test_gaps_and_inconsistent_shapes_are_refused() -> None:

@@ -178,6 +178,7 @@ OF_RUN: Final[Mapping[str, Columns]] = {
         "xy_m2": Column(REAL, "covariance of x and y"),
         "yy_m2": Column(REAL, "variance of y"),
         "landmark": Column(TEXT, "name of the landmark"),
+        "turn_from": Column("ENUM", "yaw rate, steering or wheels; null by pictures"),
     },
     "mobileye_obstacles": {
         **_TIME,

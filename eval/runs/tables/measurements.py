@@ -16,13 +16,15 @@ import numpy as np
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.gap import Crossed
 from crosscue.localization.landmarks.sighting import Sighting
-from crosscue.localization.odometry import Increments
+from crosscue.localization.odometry import BY_STEERING, BY_WHEELS, BY_YAW_RATE, Increments
 from crosscue.localization.pose_track import ACCEPTED, HeadingColumns
 
 from .columns import OF_RUN, REAL
 
 TABLE: Final = "measurements"
 NUMBERS: Final = tuple(name for name, one in OF_RUN[TABLE].items() if one.kind == REAL)
+# Sources of turns whose errors the filter can have as states.
+TURNS: Final = {BY_YAW_RATE: "yaw rate", BY_STEERING: "steering", BY_WHEELS: "wheels"}
 
 
 def start_rows(belief: PoseBelief) -> dict[str, object]:
@@ -46,9 +48,11 @@ def start_rows(belief: PoseBelief) -> dict[str, object]:
     )
 
 
-def odometry_rows(made: Increments) -> dict[str, object]:
-    """Return increments of odometry as rows."""
+def odometry_rows(made: Increments, *, is_visual: bool = False) -> dict[str, object]:
+    """Return increments of odometry as rows, by signals or by pictures."""
     columns: dict[str, object] = {name: getattr(made, name) for name in NUMBERS[:6]}
+    if not is_visual:
+        columns["turn_from"] = [TURNS.get(source) for source in made.turn_source.tolist()]
     return _rows("odometry", made.stop_ns, columns | {"start_ns": made.start_ns})
 
 
@@ -104,7 +108,7 @@ def position_rows(used: list[tuple[int, float, float, float, float, float]]) -> 
 def _rows(kind: str, t_ns: object, columns: Mapping[str, object]) -> dict[str, object]:
     times = np.asarray(t_ns, np.int64)
     nothing = [None] * len(times)
-    names = ("start_ns", *NUMBERS, "landmark")
+    names = ("start_ns", *NUMBERS, "landmark", "turn_from")
     return {
         "kind": [kind] * len(times),
         "t_ns": times,

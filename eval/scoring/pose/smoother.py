@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar
+from crosscue.eval.pipeline.pose import odometry_constants, odometry_settings
 from crosscue.eval.runs.folder import RunFolder
-from crosscue.eval.runs.tables.measurements import NUMBERS, TABLE
+from crosscue.eval.runs.tables.measurements import NUMBERS, TABLE, TURNS
 from crosscue.localization.angles import wrap_all
+from crosscue.localization.constants import NO_CONSTANTS, effects
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
@@ -24,10 +26,12 @@ from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import RunError, SchemaError
 from crosscue.replay.files.tree_text import strict_json
 from crosscue.replay.files.whole_file import write_text
+from crosscue.replay.signals.kinds import Signal
 
 from .errors import FilterAndSmoother, NeesSummary, pair_poses, squared_errors, summarise_nees
 from .score import COVARIANCES, MAX_DIFFERENCE_NS, at_truths_point, load_truth
 
+TURN_SIGNALS: Final = {"yaw rate": Signal.YAW_RATE, "steering": Signal.STEERING}
 MIN_STEP_NS: Final = 1_000_000_000
 UPPER: Final = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
 
@@ -47,8 +51,6 @@ class SmootherScore:
         filter_nees_xyh: Consistency of the filter.
         smoother_nees_xyh: Consistency of the smoother.
         range: Errors of the range filter and of its smoother, by reference.
-        without_constants: True if the filter had constant errors of the odometry as states, which
-            the smoother does not know.
     """
 
     poses: int
@@ -61,7 +63,6 @@ class SmootherScore:
     filter_nees_xyh: NeesSummary
     smoother_nees_xyh: NeesSummary
     range: Mapping[str, FilterAndSmoother]
-    without_constants: bool = False
 
 
 def score_smoother(
@@ -75,7 +76,6 @@ def score_smoother(
         ranges: Errors of the range filter and of its smoother, by reference.
 
     Raises:
-        UsageError: GTSAM is not installed.
         RunError: The run has no table of measurements.
         SchemaError: The truth does not fit the run.
     """
@@ -91,8 +91,16 @@ def score_smoother(
         )
     camera, antenna = (np.array([at.x_m, at.y_m]) for at in (vehicle.camera, vehicle.gnss))
     lever_m = np.where(measured.is_gnss[:, None], antenna, camera)
+    made = measured.increments
+    constants = NO_CONSTANTS
+    if measured.turn_from:
+        turn = next((TURN_SIGNALS[one] for one in measured.turn_from if one in TURN_SIGNALS), None)
+        constants = odometry_constants(vehicle, turn) or NO_CONSTANTS
+    by = effects(made, odometry_settings(vehicle), constants.names)
+    # Motion that is assumed between time segments has no such errors.
+    by[made.is_gap] = 0.0
     found = smooth_poses(
-        measured.start, measured.increments, measured.headings, measured.fixes, wanted, lever_m
+        measured.start, made, measured.headings, measured.fixes, wanted, lever_m, constants, by
     )
     rows = np.searchsorted(track.t_ns, wanted)
     x_m, y_m, _ = track.xyz_m[rows].T
@@ -110,8 +118,7 @@ def score_smoother(
         vehicle,
         truth,
     )
-    has_constants = vehicle.odometry.constants is not None
-    result = replace(_compared(true, filtered, smoothed, ranges), without_constants=has_constants)
+    result = _compared(true, filtered, smoothed, ranges)
     folder = run.file("score")
     folder.mkdir(exist_ok=True)
     write_text(folder / "smoother.json", strict_json(asdict(result)) + "\n")
@@ -175,11 +182,6 @@ def smoother_text(result: SmootherScore) -> str:
             f"  mean NEES {result.filter_nees_xyh.mean:.2f} and "
             f"{result.smoother_nees_xyh.mean:.2f} (3 is consistent)",
             *(
-                ["  the smoother does not know [odometry.constants], which the filter estimates"]
-                if result.without_constants
-                else []
-            ),
-            *(
                 f"range to {name}, filter and smoother, {one.rows} rows: rmse "
                 f"{one.filter_rmse_m:.2f} and {one.smoother_rmse_m:.2f} m, mean NEES "
                 f"{one.filter_nees:.2f} and {one.smoother_nees:.2f} (1 is consistent)"
@@ -199,6 +201,7 @@ class RunMeasurements:
         headings: Headings that the filter used.
         fixes: Positions of the camera from landmarks, and of the antenna from GNSS.
         is_gnss: Shape (N,): True for fixes from GNSS.
+        turn_from: Signals of the turns; empty for odometry by pictures.
     """
 
     start: PoseBelief
@@ -206,6 +209,7 @@ class RunMeasurements:
     headings: Headings
     fixes: Fixes
     is_gnss: NDArray[np.bool_]
+    turn_from: tuple[str, ...]
 
 
 def read_measured(run: RunFolder) -> RunMeasurements:
@@ -231,6 +235,10 @@ def read_measured(run: RunFolder) -> RunMeasurements:
     )
     if len(start["t_ns"]) != 1 or not len(odometry["t_ns"]):
         raise RunError(f"{run.path}: contains no odometry, so there is nothing to smooth")
+    is_odometry = pc.is_in(table["kind"].cast("string"), pa.array(["odometry", "gap"]))
+    turn_from = table.filter(is_odometry)["turn_from"].to_pylist()
+    codes = {name: code for code, name in TURNS.items()}
+    sources = np.array([codes.get(name, BY_YAW_RATE) for name in turn_from])
     cov = np.zeros((4, 4))
     cov[:2, :2] = _matrices(start)[0]
     cov[2, 2], cov[3, 3] = start["heading_var_rad2"][0], start["speed_var_m2ps2"][0]
@@ -246,7 +254,7 @@ def read_measured(run: RunFolder) -> RunMeasurements:
             turn_var_rad2=odometry["turn_var_rad2"],
             speed_mps=odometry["speed_mps"],
             speed_var_m2ps2=odometry["speed_var_m2ps2"],
-            turn_source=np.where(is_gap, BY_NOTHING, BY_YAW_RATE).astype(np.uint8),
+            turn_source=np.where(is_gap, BY_NOTHING, sources).astype(np.uint8),
             is_gap=is_gap,
         ),
         Headings(
@@ -258,6 +266,7 @@ def read_measured(run: RunFolder) -> RunMeasurements:
             _matrices(fixes),
         ),
         np.isin(fixes["t_ns"], of("position")["t_ns"]),
+        tuple(dict.fromkeys(name for name in turn_from if name)),
     )
 
 

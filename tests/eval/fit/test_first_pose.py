@@ -138,7 +138,6 @@ def test_fused_gnss_positions_bound_the_drift_of_odometry(tmp_path: Path) -> Non
 
 
 def test_smoother_uses_gnss_positions_of_the_filter(tmp_path: Path) -> None:
-    pytest.importorskip("gtsam", reason="the batch smoother needs the optional package gtsam")
     vehicle = with_start([straight_drive()], LONG_WHEELS, EVERYTHING, gnss="fuse")
     run = replayed(tmp_path / "run", vehicle)
     truth = write_gnss_truth([straight_drive()], Vehicle(version=1), EVERYTHING, tmp_path / "truth")

@@ -15,9 +15,7 @@ from crosscue.eval.report.opening import judged_sentences
 from crosscue.eval.report.summary import pose_summary, scores_text
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
-from crosscue.eval.scoring.pose.errors import summarise_nees
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
-from crosscue.eval.scoring.pose.smoother import SmootherScore, smoother_text
 from crosscue.eval.scoring.runs import pooled_scores
 from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.replay.columns import Block
@@ -193,13 +191,3 @@ def test_score_reports_compared_body_and_assumed_mounting(tmp_path: Path) -> Non
     assert "compared at the camera, 2.00 m ahead" in text
     assert "x_m: unknown to the truth" in text
     assert "by hand" in text
-
-
-def test_smoother_says_that_it_does_not_know_constant_errors() -> None:
-    nees = summarise_nees(np.ones(3), 3)
-    known = SmootherScore(3, 1.0, 1.0, 0.1, 0.1, 1.0, 1.0, nees, nees, {})
-
-    assert "[odometry.constants]" not in smoother_text(known)
-    assert "does not know [odometry.constants]" in smoother_text(
-        replace(known, without_constants=True)
-    )
