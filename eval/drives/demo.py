@@ -108,7 +108,8 @@ class Demo(Result):
     scored: ScoredRun = field(metadata=HIDDEN)
     recording: Path
 
-    max_lines: ClassVar = MAX_LINES
+    # Less the lines that tell of the simulation before.
+    max_lines: ClassVar = MAX_LINES - 3
     also: ClassVar = {
         **{name: f"drive.{name}" for name in ("log", "vehicle", "truth", "attribution")},
         "run": "run.path",

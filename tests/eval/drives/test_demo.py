@@ -8,6 +8,7 @@ import pytest
 
 import crosscue
 from crosscue.datasets.real import annotate_pandaset, recordings
+from crosscue.detectors import registry
 from crosscue.detectors.catalog import places
 from crosscue.eval.cli import run
 from crosscue.eval.drives.demo import fetch_drive
@@ -45,6 +46,21 @@ def test_real_demo_is_fetched_once_replayed_and_scored(
     assert len(stand_in_drive.server.gets) == requests
     assert Path(tree["log"]) == recordings.recording_folder(stand_in_drive.known)
     assert tree["metrics"]["coverage"]
+
+
+def test_simulated_demo_prints_25_lines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With those printed while it runs; the files to open are last."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "EMBEDDED", "signs")
+
+    assert run(["demo", "--width", "64"]) == 0
+
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].startswith("simulating a drive")
+    assert len(printed) <= 25
+    assert printed[-1].split() == ["look", "at", "it", "with:", "crosscue", "view", "demo/run"]
 
 
 @pytest.mark.parametrize("name", [PICTURE, "net.onnx"])
