@@ -18,7 +18,7 @@ from crosscue.eval.batch.jobs import (
 )
 from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
 from crosscue.eval.logs.log import UnopenedLog
-from crosscue.eval.pipeline.outcome import Outcome
+from crosscue.eval.pipeline.outcome import MAX_LINES, Outcome
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.runs.folder import FAILURE, create
 from crosscue.eval.runs.logs import files_named_in
@@ -51,6 +51,7 @@ class ReplayedDrives(Result):
     shard: str | None = None
 
     also: ClassVar = {"drives": "entries"}
+    max_lines: ClassVar = MAX_LINES
 
     @property
     def exit_status(self) -> int:
@@ -80,8 +81,8 @@ class ReplayedDrives(Result):
         ]
 
     def lines(self) -> Iterator[str]:
-        """Yield one line for each drive, and where the tables are."""
-        for one in self.drives:
+        """Yield one line for each drive, failed ones first."""
+        for one in sorted(self.drives, key=lambda one: one.error is None):
             if one.error is not None:
                 yield f"failed   {one.job.name}: {one.error}"
                 log = one.job.run / FAILURE
@@ -92,6 +93,9 @@ class ReplayedDrives(Result):
             else:
                 lost = "" if not one.exit_status else ", with losses"
                 yield f"done     {one.job.name}: {one.seconds:.1f} s{lost}"
+
+    def closing(self) -> Iterator[str]:
+        """Yield the number of drives, and where the tables are."""
         failed = sum(one.error is not None for one in self.drives)
         yield f"drives   {len(self.drives) - failed} of {len(self.drives)}, {failed} failed"
         if self.shard:

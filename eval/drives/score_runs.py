@@ -165,12 +165,14 @@ def _lines_together(found: ScoredRuns) -> list[str]:
         lines.append(reported_line("twice", text))
     ones = _ones(found)
     why = ones[0].why_no_pose if all(one.pose is None for one in ones) else ""
-    lines += [*_account(found), "", *_scores(found, why)]
+    lines += [] if found.is_whole else [*_account(found), ""]
+    lines += _scores(found, why)
     posed = [one for one in ones if one.pose is not None]
-    if not posed:
-        return lines
-    poses = [one.pose for one in posed if one.pose is not None]
-    return [*lines, "", poses_summary(poses, places_of_drives(posed))]
+    if posed:
+        poses = [one.pose for one in posed if one.pose is not None]
+        lines += ["", poses_summary(poses, places_of_drives(posed))]
+    lines += ["", *(_account(found) if found.is_whole else [])]
+    return [*lines, *(run.headline for run in found.runs)]
 
 
 def _account(found: ScoredRuns) -> list[str]:
@@ -246,14 +248,9 @@ def _scored(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> Scor
                 emit(CrosscueError(f"{one_line(one.error)}; this run is left out"))
         else:
             scored.append(one)
-            if is_many:
-                emit(scored[-1].headline)
         emit(Progress("scoring", len(scored) + len(failed), len(paths), "runs"))
     if not scored:
         raise next(iter(failed.values()))
-    if is_many:
-        # Between the headlines of the runs and the scores of all.
-        emit("")
     found = _together(scored, failed, settings, judged_by)
     if not bounds:
         return found

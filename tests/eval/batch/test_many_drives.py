@@ -13,6 +13,7 @@ import pytest
 from crosscue.eval.batch.jobs import (
     Engine,
     Job,
+    JobOutcome,
     JobState,
     exit_status_of,
     in_turn,
@@ -20,6 +21,8 @@ from crosscue.eval.batch.jobs import (
     state_of,
 )
 from crosscue.eval.batch.ray_jobs import Processes
+from crosscue.eval.drives.many import ReplayedDrives
+from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.replay.losses import losses_heard
 from support.drive_work import letters, write_jobs
 from support.trees import tree
@@ -131,6 +134,8 @@ from pathlib import Path
 from crosscue.eval.cli import _guarded
 from crosscue.eval.batch.jobs import run_many
 from crosscue.eval.batch.ray_jobs import Processes
+from crosscue.eval.drives.many import ReplayedDrives
+from crosscue.eval.pipeline.outcome import Outcome
 from support.drive_work import letters, write_jobs
 import argparse
 
@@ -188,3 +193,17 @@ def _wait_until(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < end, "waited 20 s"
         time.sleep(0.02)
+
+
+def test_forty_drives_print_25_lines_with_the_failed_ones_first() -> None:
+    jobs = [Job(f"d{i}", ("a.mcap",), Path(f"runs/d{i}"), "") for i in range(40)]
+    drives: tuple[JobOutcome[Outcome], ...] = tuple(
+        JobOutcome(job, 4 if job.name == "d39" else 0, "a.mcap: cut" if job.name == "d39" else None)
+        for job in jobs
+    )
+
+    printed = ReplayedDrives(drives, Path("runs/merged"), None).brief().splitlines()
+
+    assert len(printed) == 25
+    assert printed[0] == "failed   d39: a.mcap: cut"
+    assert printed[-2:] == ["drives   39 of 40, 1 failed", "tables   runs/merged"]

@@ -284,6 +284,27 @@ def test_run_that_cannot_be_scored_does_not_stop_others(
     assert list(pooled["coverage"]["failed"]) == [str(tmp_path / "runs" / "b")]
 
 
+def test_scores_of_many_runs_begin_with_the_result_in_25_lines(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in "abc":
+        drive, run = tmp_path / "drives" / name, tmp_path / "runs" / name
+        truth_folder(drive)
+        (drive / "drive.mcap").write_text(name)
+        run_folder(run, logs=_log_of(drive, run))
+    argv = ["score", str(tmp_path / "runs"), "-o", str(tmp_path / "all"), "--without-figures"]
+
+    assert cli.run(argv) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0].startswith("approaches 3 true")
+    assert len(printed) <= 25
+    assert printed[-1] == f"written to {tmp_path / 'all' / 'report.html'}"
+
+    assert cli.run([*argv, "-v"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert [one for one in printed if one.startswith(f"{tmp_path}/runs/a: detected")]
+
+
 def test_score_of_one_run_is_also_written_to_output_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
