@@ -142,10 +142,7 @@ class Outcome(Result):
 
 def _lines_of(outcome: Outcome) -> list[str]:
     account = [*account_lines(outcome.account), *details_of(_ledgers(outcome))]
-    lines = [f"run      {outcome.run.path}"]
-    lines += [] if outcome.account.is_whole else account
-    if outcome.scene is not None:
-        lines += _found(outcome.scene)
+    lines = [] if outcome.scene is None else _found(outcome.scene)
     if outcome.rows:
         lines += [
             f"pose     {outcome.rows:,} rows over {outcome.travelled_m:.0f} m in "
@@ -154,7 +151,10 @@ def _lines_of(outcome: Outcome) -> list[str]:
         ]
     else:
         lines.append("pose     none")
-    lines += account if outcome.account.is_whole else []
+    # Losses stay among the first lines, however many approaches there are.
+    is_first = not outcome.account.is_whole and len(lines) > MAX_LINES // 3
+    lines = [*account, *lines] if is_first else [*lines, *account]
+    lines.insert(0, f"run      {outcome.run.path}")
     lines += [f"  note   {sentence}" for sentence in outcome.notices]
     for log in outcome.account.reading:
         lines.append(f"log      {log.log}")
