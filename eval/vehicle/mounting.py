@@ -6,6 +6,7 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.localization.camera_delay import (
     CameraDelay,
@@ -34,6 +35,10 @@ FOCAL_SD: Final = 0.03
 HEIGHT_SD: Final = 0.05
 # Min speed at which distances by wheels and by pictures are compared.
 MOVING_MPS: Final = 2.0
+# Max acceleration over the last second in which the pitch is that of the mounting: cars nod by
+# about 0.3 degrees per m/s2.
+STEADY_MPS2: Final = 0.3
+NODS_NS: Final = 1_000_000_000
 # Smallest delay that is set, so that stamps of a run differ from those of the log only for a cause.
 DELAY_S: Final = 0.01
 # Passes over the pictures, each with the focal length and height that the last one found.
@@ -223,8 +228,12 @@ def watch_mounting(seen: PicturePass, speed: Series | None) -> MountingWatch:
         seen: The pictures.
         speed: Speed of the vehicle, m/s; without it the height is unknown.
     """
+    pitch = np.array([one.below_rad for one in seen.travel], np.float64)
+    is_steady = _is_steady(seen.travel_ns, speed)
+    if is_steady.sum() >= MIN_PAIRS:
+        pitch[~is_steady] = np.nan
     measured: dict[str, tuple[Int64s, Floats]] = {
-        "pitch": (seen.travel_ns, np.array([one.below_rad for one in seen.travel], np.float64)),
+        "pitch": (seen.travel_ns, pitch),
         "yaw": (seen.travel_ns, np.array([one.left_rad for one in seen.travel], np.float64)),
     }
     if speed is not None and len(speed) > 1:
@@ -235,6 +244,14 @@ def watch_mounting(seen: PicturePass, speed: Series | None) -> MountingWatch:
         tuple(one for name, columns in measured.items() for one in steps_of(name, *columns)),
         {name: window for name, window in entire.items() if window is not None},
     )
+
+
+def _is_steady(t_ns: Int64s, speed: Series | None) -> NDArray[np.bool_]:
+    """Return where the car has not been braking or accelerating, for which it nods."""
+    if speed is None or len(speed) < 2:
+        return np.ones(len(t_ns), np.bool_)
+    now, before = (np.interp(t_ns - at, speed.t_ns, speed.values) for at in (0, NODS_NS))
+    return np.abs(now - before) * 1e9 / NODS_NS < STEADY_MPS2
 
 
 def _heights(seen: PicturePass, speed: Series) -> tuple[Int64s, Floats]:

@@ -134,6 +134,14 @@ def test_dockerfile_copies_what_exists_and_starts_a_command(
     assert _command_fault(f"crosscue {given}", capsys) == ""
 
 
+def test_main_branch_can_take_a_worse_score_that_was_accepted() -> None:
+    """A comparison that failed there would keep the scores that it compares with for ever."""
+    workflow = YAML(typ="safe").load(ROOT / ".github/workflows/drive.yml")
+    steps = workflow["jobs"]["drive"]["steps"]
+    (act,) = [step for step in steps if step.get("uses") == "./"]
+    assert act["with"]["against"].startswith("${{ github.event_name == 'pull_request' && ")
+
+
 @pytest.mark.parametrize(
     "path", [*(ROOT / ".github/workflows").glob("*.yml")], ids=lambda p: p.name
 )

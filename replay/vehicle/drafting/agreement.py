@@ -28,8 +28,8 @@ WHEELBASE_M: Final = 2.7
 GYRO_BIAS_RADPS: Final = 1.0 * DEGREE
 # Maximum plausible steering offset on a straight road (crowned road, side wind).
 STEERING_OFF_RAD: Final = 4.0 * DEGREE
-# Maximum plausible relative difference between the radii of the left and right wheels.
-TYRES_DIFFER: Final = 0.005
+# Maximum plausible relative difference between left and right wheels: of radii, and by slip.
+TYRES_DIFFER: Final = 0.02
 # Minimum turn of a reference, in any window, that determines the sign and scale.
 TURNS: Final = 3.0 * DEGREE
 FOLLOWS: Final = 0.7
@@ -45,7 +45,7 @@ class Turning:
     Attributes:
         name: Name of the reference in facts.
         turned_rad: Shape (windows,): turn within each window; NaN where unknown.
-        off_radps: Shape (windows,): plausible constant error of its rate.
+        off_radps: Shape (windows,): plausible error of its rate.
         has_scale: True if its scale is known.
     """
 
@@ -228,6 +228,8 @@ def _judged(
         mine, other = turned[both], reference.turned_rad[both]
         follows = _correlation(mine, other)
         is_turning = float(np.abs(other - np.median(other)).max()) >= TURNS
+        by_error = reference.off_radps[both] * WINDOW_S + TURNS
+        is_explained = reference.has_scale and bool((np.abs(mine - other) < by_error).all())
         if is_turning or (abs(follows) >= FOLLOWS and both.sum() >= SURE_WINDOWS):
             text = f"correlation {follows:+.2f} with {reference.name}"
             if not is_judged and follows <= -FOLLOWS:
@@ -235,12 +237,13 @@ def _judged(
             is_judged = True
             if sign * follows < FOLLOWS:
                 facts.append(text)
-                wrong.append(f"does not follow {reference.name}")
+                wrong += [] if is_explained else [f"does not follow {reference.name}"]
                 continue
             ratio = float(np.std(mine) / np.std(other))
             facts.append(text + (f" (times {ratio:.2f})" if reference.has_scale else ""))
             if is_turning and reference.has_scale and not 0.6 <= ratio <= 1.6:
-                wrong.append(f"turns {ratio:.2g} times as far as {reference.name}")
+                text = f"turns {ratio:.2g} times as far as {reference.name}"
+                wrong += [] if is_explained else [text]
                 continue
             agrees += 1
         off = float((sign * mine - other).mean()) / WINDOW_S

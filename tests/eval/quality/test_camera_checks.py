@@ -8,10 +8,16 @@ from functools import cache
 import numpy as np
 import pytest
 
+from crosscue.datasets.simulated.drive import DriveSettings, integrated, sense
 from crosscue.eval.quality.drive import QualityDrive
 from crosscue.eval.quality.verdict import judge
+from crosscue.eval.vehicle.mounting import MountingWatch, watch_mounting
+from crosscue.eval.vehicle.picture_pass import PicturePass
 from crosscue.localization.camera_watch import steps_of, windows_of
+from crosscue.localization.visual_odometry import Travel
 from crosscue.replay.columns import Bytes, Floats
+from crosscue.replay.vehicle.drafting.agreement import judge_yaw_rate, of_wheels
+from crosscue.replay.vehicle.drafting.series import Grid, Series
 from crosscue.replay.vehicle.vehicle import Vehicle
 from support.plane_pictures import CAMERA, picture
 from support.quality_logs import Stream, Streams, examined
@@ -122,6 +128,53 @@ def test_no_step_is_reported_where_there_is_none() -> None:
     for seed in range(60):
         t_s, angle = measured(seed, 0.0)
         assert steps_of("pitch", np.round(t_s * 1e9).astype(np.int64), angle) == []
+
+
+def braking(step_rad: float = 0.0) -> MountingWatch:
+    """A car brakes, stands, and accelerates; it nods by 0.35 degrees per m/s2, as in simulation."""
+    t_s = np.arange(0.0, 40.0, 0.1)
+    acceleration = np.select(
+        [(t_s > 8.0) & (t_s < 13.0), (t_s > 15.0) & (t_s < 21.0)], [-1.9, 1.6], 0.0
+    )
+    speed = np.maximum(9.5 + np.cumsum(acceleration) * 0.1, 0.05)
+    _, angle = measured(3, 0.0)
+    angle = np.interp(t_s, np.arange(0.0, 40.0, 1.0 / 8.0), angle)
+    angle -= math.radians(0.35) * acceleration
+    angle += step_rad * (t_s >= 28.0)
+    t_ns = np.round(t_s * 1e9).astype(np.int64)
+    travel = tuple(Travel(0.0, float(one), 0.0, 200) for one in angle)
+    seen = PicturePass(t_ns, t_s, t_s, t_ns, (960, 540), CAMERA, 1.0, (), t_s[:0], t_ns, travel, 0)
+    return watch_mounting(seen, Series("speed", t_ns, speed))
+
+
+def test_camera_that_nods_while_the_car_brakes_has_not_moved() -> None:
+    watch = braking()
+
+    assert watch.steps == ()
+    for window in watch.windows:
+        if window.value == "pitch":
+            assert abs(window.mean - 0.02) < 1.96 * window.sd
+    (step,) = braking(math.radians(0.5)).steps
+    assert step.t_ns * 1e-9 == pytest.approx(28.0, abs=2.0)
+
+
+def test_wheels_of_a_straight_drive_do_not_contradict_the_gyro() -> None:
+    """Tyres differ and wheels slip: the simulated car's do so by one per cent and more."""
+    speed = np.concatenate([np.full(700, 9.5), np.linspace(9.5, 0.0, 500), np.zeros(100)])
+    speed = np.concatenate([speed, np.linspace(0.0, 9.5, 600)])
+    motion = integrated(np.zeros(len(speed)), speed)
+    grid = Grid.over(int(motion.t_ns[0]), int(motion.t_ns[-1]))
+    blamed = []
+    for seed in range(60):
+        sensed = sense(motion, DriveSettings(seed=seed))
+        left, right = (
+            Series.of(str(i), sensed.wheel_t_ns, sensed.wheels_mps[:, i]) for i in (2, 3)
+        )
+        gyro = Series.of("gyro", sensed.gyro_t_ns, sensed.gyro_radps[:, 2])
+        found = judge_yaw_rate(gyro, [of_wheels(left, right, grid)], None, grid)
+        blamed += [found.wrong] if found.wrong else []
+
+    assert blamed == []
 
 
 def test_windows_of_ten_seconds_have_intervals_that_hold_the_truth() -> None:

@@ -241,7 +241,8 @@ def _needed_px(table: str) -> float:
         ]
         for row in table.replace("&emsp;", "  ").replace("</small>", "").split("<tr")[1:]
     ]
-    return sum(7.7 * max(column) + 17.6 for column in zip(*rows, strict=True))
+    widths: list[int] = [max(column) for column in zip(*rows, strict=True)]
+    return sum(7.7 * width + 17.6 for width in widths)
 
 
 def test_tables_beside_figures_fit_their_columns(tmp_path: Path) -> None:
