@@ -236,7 +236,9 @@ def _open_raw(path: Path, limits: Limits) -> KittiDrive:
         if files is not None:
             cameras.append(camera_of(folder.name, files, touched))
     lost: list[Unreadable] = []
-    packets = _timed(path / "oxts", _packet_files, "oxts", lost, limits, touched)
+    packets = _timed(
+        path / "oxts", lambda place: list_files(place, (".txt",)), "oxts", lost, limits, touched
+    )
     unreadable += [(name, *loss[1:]) for loss in lost for name in TOPICS]
     if not cameras and packets is None:
         why = unreadable[0][3] if unreadable else "no image_0x and no oxts with files in data/"
@@ -251,10 +253,6 @@ def _open_raw(path: Path, limits: Limits) -> KittiDrive:
         unreadable=unreadable,
         notices=notices if (path / "velodyne_points").is_dir() else (),
     )
-
-
-def _packet_files(folder: Path) -> list[Path]:
-    return list_files(folder, (".txt",))
 
 
 def _timed(

@@ -213,7 +213,8 @@ def _decoded(
     decoders: dict[str, Decoder | None] = {}
     buses: dict[str, tuple[list[_BlockDecoder], list[MobileyeDecoder]]] = {}
     for block in ledger.handing_on(timed.read(ledger, selection)):
-        topic = topics.get(block.topic) or _late_topic(log, block.topic)
+        # A topic may first be found while reading.
+        topic = topics.get(block.topic) or next(t for t in log.topics if t.name == block.topic)
         if isinstance(block.rows, Messages):
             if block.topic not in decoders:
                 decoders[block.topic] = _decoder(topic, ledger)
@@ -260,11 +261,6 @@ def _decoder(topic: Topic, ledger: Ledger) -> Decoder | None:
     except SchemaError as error:
         ledger.notice(str(error))
         return None
-
-
-def _late_topic(log: Log, name: str) -> Topic:
-    """Return a topic that was first found while reading."""
-    return next(topic for topic in log.topics if topic.name == name)
 
 
 def _bus_decoders(

@@ -221,7 +221,8 @@ def replay_many(
     if nameless:
         raise UsageError(f"detectors: {nameless[0]!r}: many drives need names, as module:Class")
     check_inputs(settings)
-    found = drives if isinstance(drives, DriveList) else find_drives(*_several(drives), each=True)
+    named = [drives] if isinstance(drives, Path | str) else drives
+    found = named if isinstance(named, DriveList) else find_drives(*named, each=True)
     engine = engine_of(
         settings.workers, settings.ray, settings.cores_per_drive, settings.memory_per_drive_gib
     )
@@ -296,10 +297,6 @@ def replay(
     (drive,) = found.drives
     ours = replace(settings, vehicle=settings.vehicle_of(drive))
     return replay_with(UnopenedLog(drive.logs, settings.part, settings.limits), output, ours)
-
-
-def _several(drives: Sequence[Path | str] | Path | str) -> Sequence[Path | str]:
-    return [drives] if isinstance(drives, Path | str) else drives
 
 
 def _merge(done: Sequence[JobOutcome[Outcome]], output: Path) -> None:

@@ -135,7 +135,9 @@ class DetectStage:
             vehicle.cues.stop_sign_labels,
             is_one_size=vehicle.camera.focal_px is not None,
         )
-        is_compared = uses_pictures(drive, finds_road=_finds_road(named))
+        # Detectors of road declare that they find no objects.
+        finds_road = any(reportable(one.detector) == () for one in named)
+        is_compared = uses_pictures(drive, finds_road=finds_road)
         self.tables = DetectTables(
             run,
             self._pictures.topic.name,
@@ -206,11 +208,6 @@ class DetectStage:
                 *tables.size_notices(),
             ),
         )
-
-
-def _finds_road(named: Sequence[Named]) -> bool:
-    """Return whether a detector declares that it finds no objects, as those of road do."""
-    return any(reportable(one.detector) == () for one in named)
 
 
 class _Pictures:

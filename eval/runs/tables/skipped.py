@@ -18,10 +18,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-def _skipped_rows(ledger: Ledger) -> list[dict[str, Any]]:
-    return [asdict(detail) | {"log": ledger.log} for detail in ledger.details]
-
-
 def write_skipped(
     run: TableFolder,
     ledgers: Sequence[Ledger],
@@ -38,7 +34,7 @@ def write_skipped(
         kept: Rows of an earlier stage; those of topics that only it has read are kept.
         timeline: The drive's time segments; stamps in this table are as recorded.
     """
-    rows = [row for ledger in ledgers for row in _skipped_rows(ledger)]
+    rows = [asdict(one) | {"log": ledger.log} for ledger in ledgers for one in ledger.details]
     earlier = [] if kept is None else kept.to_pylist()
     names = OF_RUN["skipped"]
     with TableSink(run, "skipped", arrow_schema({**names, **LOG_TIME})) as sink:
