@@ -18,10 +18,7 @@ from crosscue.replay.columns import (
     Bytes,
     CanFrames,
     Floats,
-    ImageCoding,
-    Images,
     Int64s,
-    Messages,
     Table,
     Topic,
 )
@@ -79,16 +76,6 @@ def can_frames(identifiers: list[int], coded: list[Bytes]) -> CanFrames:
         payload,
         np.zeros(k * n, np.bool_),
     )
-
-
-def image_block(
-    topic: str, log_ns: Int64s, header_ns: Int64s, coded: list[bytes], coding: ImageCoding = "jpeg"
-) -> Block:
-    """Return encoded pictures as a block."""
-    stop = np.cumsum([len(one) for one in coded], dtype=np.int64)
-    start = np.concatenate([[0], stop[:-1]]).astype(np.int64)
-    rows = Messages(np.frombuffer(b"".join(coded), np.uint8), start, stop)
-    return Block(topic, log_ns, Images(rows, (coding,) * len(coded)), header_ns=header_ns)
 
 
 def _late(t_ns: Int64s, rng: np.random.Generator, min_ms: float, mean_ms: float) -> Int64s:

@@ -203,7 +203,7 @@ def _by_time(annotations: Annotations, log: LogPictures) -> PictureTimes | None:
     if any(t is None for t in asked):
         return None
     wanted = np.array(asked, np.int64)
-    found = nearest(log.t_ns, wanted)
+    found = nearest_times(log.t_ns, wanted)
     off = np.abs(found - wanted)
     period = float(np.median(np.diff(log.t_ns))) if len(log.t_ns) > 1 else math.inf
     if off.max() > FAR * period:
@@ -215,7 +215,7 @@ def _by_time(annotations: Annotations, log: LogPictures) -> PictureTimes | None:
     return PictureTimes(tuple(found.tolist()), f"by time, at most {off.max() * 1e-6:.1f} ms off")
 
 
-def nearest(t_ns: Int64s, wanted: Int64s) -> Int64s:
+def nearest_times(t_ns: Int64s, wanted: Int64s) -> Int64s:
     """Return the time of ``t_ns``, which increases, that is nearest to each wanted one."""
     after = np.clip(np.searchsorted(t_ns, wanted), 0, len(t_ns) - 1)
     before = np.maximum(after - 1, 0)

@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from crosscue.datasets.truth.annotations import Picture, nearest, time_in_name
+from crosscue.datasets.truth.annotations import Picture, nearest_times, time_in_name
 from crosscue.datasets.truth.box_labels import NO_SIZE, BoxLabels, boxes_inside
 from crosscue.detectors.base import MIN_SCORE
 from crosscue.detectors.boxes import is_best_label
@@ -226,7 +226,7 @@ def _times(
     asked = [_time_of(one) for one in labels.pictures]
     if all(t is not None for t in asked):
         wanted = np.array(asked, np.int64)
-        there = nearest(t_ns, wanted)
+        there = nearest_times(t_ns, wanted)
         period = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 1e9
         near = np.abs(there - wanted) <= FAR * period
         times = [int(t) if ok else None for t, ok in zip(there, near, strict=True)]

@@ -8,7 +8,7 @@ database. At an unnoticed landmark, the wall is not in the database. Truth is in
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +20,6 @@ from crosscue.datasets.simulated.log_files import (
     SOURCE,
     batches,
     can_frames,
-    image_block,
 )
 from crosscue.datasets.simulated.log_files import MAGNETOMETER as COMPASS
 from crosscue.datasets.truth.truth import Mounting
@@ -39,6 +38,7 @@ from crosscue.replay.can.encode import encode
 from crosscue.replay.columns import Block, Bytes, Floats, Int64s, Table, Topic
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.readers.images.files import image_block
 from crosscue.replay.write.convert import LogWriter
 
 CAMERA: Final = Topic("/camera", "crosscue/Images", "columns")
@@ -242,7 +242,8 @@ def _frames_block(row: Floats, t_ns: Int64s, number: int, seed: int) -> Block:
         done, buffer = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])
         assert done
         coded.append(buffer.tobytes())
-    return image_block(CAMERA.name, at_ns, at_ns, coded)
+    block = image_block(CAMERA.name, at_ns.tolist(), coded, ["jpeg"] * len(coded))
+    return replace(block, header_ns=at_ns)
 
 
 def _wall(seed: int, number: int) -> Bytes:
