@@ -195,17 +195,23 @@ def _shown(is_road: NDArray[np.bool_], boxes_px: Floats, away_m: Floats) -> NDAr
         away_m: Distance of level ground by row.
     """
     height, width = is_road.shape
+    columns = np.ascontiguousarray(is_road.T)
     framed = np.zeros((width + 2, height + 2), np.uint8)
-    shown = framed[1:-1, 1:-1].T
-    np.add(is_road, np.uint8(SHOWS_GROUND), out=shown)
-    # Lower end of each pixel's run without road, which goes up to the pixel.
-    next_road = np.where(is_road, np.arange(height)[:, None], height)[::-1]
-    edges = np.minimum.accumulate(next_road, axis=0)[::-1] - 1
-    shown[~is_road & (away_m[:, None] - away_m[edges] > BESIDE_M)] = SHOWS_BEHIND
+    shown = framed[1:-1, 1:-1]
+    np.add(columns, np.uint8(SHOWS_GROUND), out=shown)
+    # The run without road that goes up to each pixel begins above this row.
+    rows = np.arange(height, dtype=np.uint16)
+    road_below = np.where(columns, rows, np.uint16(height))[:, ::-1]
+    road_below = np.minimum.accumulate(road_below, axis=1)[:, ::-1]
+    # First row that is too much nearer than a row above it; so are all rows further down.
+    is_nearer = np.triu(away_m[:, None] - away_m > BESIDE_M)
+    nearer = np.where(is_nearer.any(axis=1), is_nearer.argmax(axis=1), height).astype(np.uint16)
+    is_behind = ~columns & (road_below > nearer)
+    shown += is_behind.view(np.uint8) * np.uint8(SHOWS_BEHIND - SHOWS_GROUND)
     margin = MARGIN * (boxes_px[:, 2:] - boxes_px[:, :2])
     widened = boxes_px + np.column_stack([-margin[:, 0], 0.0 * margin[:, 0], margin])
     for x0, y0, x1, y1 in np.maximum(np.rint(widened), 0).astype(int).tolist():
-        shown[y0:y1, x0:x1] = HIDDEN
+        shown[x0:x1, y0:y1] = HIDDEN
     return framed
 
 

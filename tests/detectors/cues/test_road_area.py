@@ -10,7 +10,18 @@ from numpy.typing import NDArray
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
-from crosscue.detectors.cues.road_area import CELL_M, RoadArea, RoadPlan, reach_of
+from crosscue.detectors.cues.road_area import (
+    BESIDE_M,
+    CELL_M,
+    HIDDEN,
+    SHOWS_BEHIND,
+    SHOWS_GROUND,
+    SHOWS_ROAD,
+    RoadArea,
+    RoadPlan,
+    _shown,
+    reach_of,
+)
 from crosscue.detectors.cues.road_openings import Legs, RoadOpenings, Seen
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.camera import Camera
@@ -262,3 +273,29 @@ def test_opening_begins_with_ground_in_view(start_m: float, is_found: bool) -> N
     found = [openings(plan, 0.0) for _ in range(3)][-1]
 
     assert bool(found.openings) == is_found
+
+
+@pytest.mark.parametrize("pitch_rad", [-0.05, 0.0, 0.05])
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.98])
+def test_pixels_show_what_is_behind_the_edge_below_them(pitch_rad: float, share: float) -> None:
+    rng = np.random.default_rng(7)
+    is_road = rng.random((40, 12)) < share
+    # Level ground 1.5 m below a camera of 50 px, horizon within the picture.
+    rows_px = np.arange(40) - 15.0
+    below = 50.0 * math.sin(pitch_rad) + rows_px * math.cos(pitch_rad)
+    above_px = 50.0 * math.cos(pitch_rad) - rows_px * math.sin(pitch_rad)
+    away_m = 1.5 * above_px / np.maximum(below, 1e-3)
+
+    found = _shown(is_road, np.array([[2.0, 3.0, 5.0, 9.0]]), away_m)
+
+    wanted = np.full((14, 42), HIDDEN)
+    for row, column in np.ndindex(40, 12):
+        edge = row
+        while edge + 1 < 40 and not is_road[edge + 1, column]:
+            edge += 1
+        is_behind = away_m[row] - away_m[edge] > BESIDE_M
+        no_road = SHOWS_BEHIND if is_behind else SHOWS_GROUND
+        if not (2 <= column < 5 and 3 <= row < 9):
+            wanted[column + 1, row + 1] = SHOWS_ROAD if is_road[row, column] else no_road
+    assert np.array_equal(found, wanted)
+    assert share == 0.98 or (wanted == SHOWS_BEHIND).any()
