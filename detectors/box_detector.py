@@ -154,9 +154,19 @@ class FunctionDetector:
     view: ClassVar[View] = View()
 
     def __init__(self, function: Callable[[Frame], Iterable[ScoredBox]]) -> None:
-        """Wrap a function."""
+        """Wrap a function.
+
+        Raises:
+            UsageError: Its source cannot be read, as of one typed at Python's prompt.
+        """
         self._function = function
-        self.identity = identity_of(function.__qualname__, inspect.getsource(function))
+        try:
+            source = inspect.getsource(function)
+        except OSError:
+            raise UsageError(
+                f"{function.__name__}: its source cannot be read; define it in a module"
+            ) from None
+        self.identity = identity_of(function.__qualname__, source)
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Detections]:
         """Return the detections of each frame."""

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -220,3 +221,12 @@ def test_class_without_a_name_is_named_after_itself_and_one_without_labels_is_re
         chosen([OneText], {})
     with pytest.raises(AssertionError, match="detector Unlabelled: no labels"):
         check_detector(Unlabelled)
+
+
+def test_function_without_a_source_is_refused_with_what_to_do() -> None:
+    """A function typed at the prompt of Python has no source, and so no identity."""
+    text = 'def red(frame):\n    yield "stop sign", 0.9, (1, 2, 3, 4)'
+    function = FunctionType(compile(text, "<stdin>", "exec").co_consts[0], {}, "red")
+
+    with pytest.raises(UsageError, match="red: its source cannot be read; define it in a module"):
+        make(*chosen([function], {}))
