@@ -53,7 +53,7 @@ def road_fractions(road: RoadMask, regions: Regions) -> RoadFractions:
     width, height = road.mask_size_px
     is_road = road.pixels()
     fractions = []
-    for polygon in (regions.left, regions.straight, regions.right):
+    for polygon in regions.polygons():
         inside = region_mask(polygon, (height, width))
         count = int(np.count_nonzero(inside))
         fractions.append(float(np.count_nonzero(is_road & inside) / count) if count else 0.0)

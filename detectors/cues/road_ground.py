@@ -77,9 +77,11 @@ def outlines(
 ) -> tuple[NDArray[np.float64] | None, ...]:
     """Corners of the left, straight and right region in the picture, shape (4, 2) each.
 
-    A region is None if it is at or behind the camera, or if no range is known.
+    A region is None if it is at or behind the camera, if no range is known, or without regions.
     """
-    if place is None or camera.focal_px is None or camera.z_m <= 0.0:
+    if regions.kind == "picture":
+        return tuple(np.array(one) * size_px for one in regions.polygons())
+    if regions.kind != "ground" or place is None or camera.focal_px is None or camera.z_m <= 0.0:
         return None, None, None
     ground = GroundPlane.of(camera, size_px)
     found = [_outline(one, ground) for one, _ in rectangles(regions, place)]

@@ -31,7 +31,6 @@ QUALITY: Final = 72
 # Scores from which a detection is drawn in a report: of any object, and of one whose cue was found.
 LIKELY: Final = 0.5
 COUNTED: Final = 0.3
-SIDES: Final = ("left", "straight", "right")
 
 # Callback for the time of a frame, its picture and its thumbnail, both as JPEG.
 Keep = Callable[[int, bytes, bytes], None]
@@ -63,13 +62,13 @@ def draw_pictures(
         camera = run_camera(run)
         if camera is None:
             return "the run has no camera, or several"
-        found = _found(run, wanted)
+        found, vehicle = _found(run, wanted), run.drive_manifest().settings
         places, cues = _places(run, wanted), _cues(run, wanted)
         plans = plans_of(run, wanted)
         true = {} if truth is None else true_marks(truth, run, wanted)
 
         def on_picture(t_ns: int, picture: Encoded) -> None:
-            regions = partial(_regions, run, places.get(t_ns))
+            regions = partial(outlines, vehicle.camera, vehicle.regions, places.get(t_ns))
             frame = found.get(t_ns)
             results = () if frame is None else frame.found
             counts = cues.get(t_ns, {})
@@ -136,18 +135,6 @@ def _cues(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, dict[str, int]
             if row["t_ns"] in wanted:
                 found.setdefault(row["t_ns"], {})[row["cue"]] = row["count"]
     return found
-
-
-def _regions(
-    run: RunFolder, place: Place | None, size_px: tuple[int, int]
-) -> Iterable[NDArray[np.float64]]:
-    vehicle = run.drive_manifest().settings
-    if vehicle.regions.kind == "ground":
-        polygons = outlines(vehicle.camera, vehicle.regions, place, size_px)
-        return [one for one in polygons if one is not None]
-    if vehicle.regions.kind == "area":
-        return []
-    return [np.array(getattr(vehicle.regions, side)) * size_px for side in SIDES]
 
 
 def _with_plan(canvas: Bytes, plan: Bytes) -> Bytes:

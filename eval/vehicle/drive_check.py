@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.cues.observed import Place
-from crosscue.detectors.cues.road_ground import rectangles
+from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.eval.logs.log import Log, UnopenedLog, opened
 from crosscue.eval.report.html import write_page
@@ -62,7 +62,10 @@ def draw_ground(pixels: NDArray[np.uint8], vehicle: Vehicle) -> NDArray[np.uint8
             x, below = points[0].tolist()
             if text and below < size_px[1]:
                 _write(canvas, text, (x + 4.0, below - 4.0), WHITE, scale)
-    for name, polygon in _regions(vehicle, size_px):
+    regions = outlines(camera, vehicle.regions, ASSUMED, size_px)
+    for name, polygon in zip(("left", "straight", "right"), regions, strict=True):
+        if polygon is None:
+            continue
         _line(canvas, np.vstack([polygon, polygon[:1]]), GREEN, scale)
         middle = polygon.mean(axis=0)
         _write(canvas, name, (float(middle[0]), float(middle[1])), GREEN, scale)
@@ -78,26 +81,6 @@ def _grid(camera: Camera) -> Iterator[tuple[NDArray[np.float64], str]]:
     near = camera.x_m + max(NEAREST_M, 2.0 * camera.z_m)
     for aside in ASIDE_M:
         yield np.array([[near, aside], [max(AHEAD_M), aside]], np.float64), ""
-
-
-def _regions(
-    vehicle: Vehicle, size_px: tuple[int, int]
-) -> Iterator[tuple[str, NDArray[np.float64]]]:
-    regions, camera = vehicle.regions, vehicle.camera
-    names = ("left", "straight", "right")
-    if regions.kind == "picture":
-        for name in names:
-            yield name, np.array(getattr(regions, name), np.float64) * np.array(size_px)
-        return
-    if camera.focal_px is None or camera.z_m <= 0.0 or regions.kind == "area":
-        return
-    for name, (one, _) in zip(names, rectangles(regions, ASSUMED), strict=True):
-        first, last, rightmost, leftmost = one
-        corners = [(first, rightmost), (first, leftmost), (last, leftmost), (last, rightmost)]
-        if first - camera.x_m > NEAREST_M:
-            outline = GroundPlane.of(camera, size_px).project(np.array(corners))
-            if not np.isnan(outline).any():
-                yield name, outline
 
 
 def _line(

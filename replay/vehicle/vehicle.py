@@ -162,6 +162,10 @@ class Regions(Section):
     """Minimum number of rows of the segmentation that a visible region spans. Where a road ends,
     the embedded network's mask extends up to five rows too far."""
 
+    def polygons(self) -> tuple[Polygon, Polygon, Polygon]:
+        """Return the polygons of the image, from left to right."""
+        return self.left, self.straight, self.right
+
     @model_validator(mode="after")
     def _near_before_far(self) -> Self:
         for name in ("aside_m", "beyond_m"):
