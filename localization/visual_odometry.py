@@ -23,8 +23,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.ranging.ground_plane import GroundPlane, Mounted, turned
+from crosscue.detectors.ranging.ground_plane import GroundPlane, turned
 from crosscue.replay.columns import Bytes, Floats
+from crosscue.replay.vehicle.camera import Camera
 
 # Corners followed from each picture, and their min distance in pixels of the reduced picture.
 CORNERS: Final = 500
@@ -171,7 +172,7 @@ class VisualOdometry:
             and without noise's bias at a standstill; NaN with few corners.
     """
 
-    camera: Mounted
+    camera: Camera
     _before: _View | None = None
     _pitch: float = field(init=False)
     _pitch_var: float = PITCH_SD**2

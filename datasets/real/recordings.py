@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Final, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from crosscue.detectors.catalog.card import Hash
 from crosscue.detectors.catalog.fetch import DATA
@@ -24,12 +24,10 @@ from crosscue.detectors.catalog.places import user_cache
 from crosscue.detectors.settings import Settings
 from crosscue.replay.errors import LogError, OutputError, UsageError, VehicleError
 from crosscue.replay.files.transfer import Progress, download, is_there, take
-from crosscue.replay.files.tree_text import toml_tree
 from crosscue.replay.limits import MIB
 from crosscue.replay.progress import Progress as ShownProgress
 from crosscue.replay.progress import emit
-from crosscue.replay.vehicle.section import tuples
-from crosscue.replay.vehicle.validation_errors import explain
+from crosscue.replay.vehicle.validation_errors import read_model
 from crosscue.results import Result
 from crosscue.verb import Option
 
@@ -101,11 +99,7 @@ def recording(name: str) -> Recording:
     if name not in known:
         raise UsageError(f"recording {name}: unknown; expected one of: {', '.join(known)}")
     path = FOLDER / name / "recording.toml"
-    text = path.read_text(encoding="utf-8")
-    try:
-        return Recording.model_validate(tuples(toml_tree(text)))
-    except ValidationError as error:
-        raise VehicleError(explain(error, text, str(path), Recording)) from None
+    return read_model(path, Recording, VehicleError, "install crosscue again")
 
 
 def recording_folder(known: Recording, environment: Mapping[str, str] = os.environ) -> Path:

@@ -29,7 +29,7 @@ from typing import Annotated, Final, Literal, TypeAlias
 import numpy as np
 
 from crosscue.replay.errors import AnnotationError, EmptyResultError, UsageError
-from crosscue.replay.files.bounded import read_whole
+from crosscue.replay.files.bounded import read_text
 from crosscue.replay.files.tree_text import yaml_tree
 from crosscue.replay.limits import MIB
 from crosscue.verb import Option
@@ -300,11 +300,8 @@ def _yaml_names(file: Path) -> tuple[str, ...]:
 
 def _lines(file: Path, *, is_whole: bool = False) -> list[str]:
     """Read the lines that are not empty, stripped; or all lines unchanged."""
-    try:
-        lines = read_whole(file, MAX_TEXT_BYTES).decode("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise AnnotationError(f"{file}: {why}; expected labels as text") from None
+    text = read_text(file, MAX_TEXT_BYTES, AnnotationError, "expected labels as text")
+    lines = text.splitlines()
     return lines if is_whole else [line.strip() for line in lines if line.strip()]
 
 

@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import RoadMask
-from crosscue.detectors.ranging.ground_plane import GroundPlane, Mounted, turned
+from crosscue.detectors.ranging.ground_plane import GroundPlane, turned
 from crosscue.replay.columns import Floats
+from crosscue.replay.vehicle.camera import Camera
 
 CELL_M: Final = 0.25
 # Half of the side of the square grid.
@@ -46,7 +47,7 @@ HIDDEN, SHOWS_GROUND, SHOWS_ROAD, SHOWS_BEHIND = 0, 1, 2, 3
 WEIGHTS: Final = np.array([0.0, 1.0, 1.0, BEHIND], np.float32)
 
 
-def reach_of(camera: Mounted, road: RoadMask) -> float:
+def reach_of(camera: Camera, road: RoadMask) -> float:
     """Distance up to which rows of a mask tell ground apart; 0 without a focal length."""
     focal_px = (camera.focal_px or 0.0) * road.mask_size_px[0] / road.size_px[0]
     return min(math.sqrt(max(ROW_M * camera.z_m * focal_px, 0.0)), REACH_M)
@@ -75,7 +76,7 @@ class RoadArea:
         reach_m: Distance up to which masks are used.
     """
 
-    camera: Mounted
+    camera: Camera
     reach_m: float
     _road: NDArray[np.float32] = field(init=False)
     _seen: NDArray[np.float32] = field(init=False)

@@ -27,7 +27,7 @@ from crosscue.replay.vehicle.vehicle import STOP_SIGN, TRAFFIC_LIGHT, CueSpec, V
 
 from .ground_plane import GroundPlane
 from .object_tracks import CarStep, ObjectTrack, ObjectTracks
-from .usable import is_cut, source_of
+from .usable import are_cut, source_of
 
 # Scores below this are no candidates: most of them are noise, and they would fill the tables.
 MIN_CANDIDATE: Final = 0.1
@@ -100,15 +100,16 @@ class ControlTracks:
         if not is_tracked and source_of(self.vehicle, cue.name) != "motion":
             return
         rows: list[tuple[int, int]] = []
-        heights_px = [one.heights_px for one in found]
+        whole_px = [
+            np.where(are_cut(one.boxes_px, one.size_px), 0.0, one.heights_px) for one in found
+        ]
         for k, one in enumerate(found):
             _, score = self.vehicle.threshold_of(cue)
             is_taken = one.scores >= MIN_CANDIDATE if is_tracked else one.are_sure(score)
             for i, label in enumerate(one.labels):
                 if label in labels:
                     decisions[k][i] = TOO_LITTLE_EVIDENCE
-                    is_whole = heights_px[k][i] > 0.0 and not is_cut(one.boxes_px[i], one.size_px)
-                    if is_taken[i] and (is_tracked or is_whole):
+                    if is_taken[i] and (is_tracked or whole_px[k][i] > 0.0):
                         rows.append((k, i))
         if cue.name not in self._of_cue:
             if not rows:
@@ -118,12 +119,7 @@ class ControlTracks:
         tracks(
             motion,
             np.array([found[k].boxes_px[i] for k, i in rows]).reshape(-1, 4),
-            np.array(
-                [
-                    0.0 if is_cut(found[k].boxes_px[i], found[k].size_px) else heights_px[k][i]
-                    for k, i in rows
-                ]
-            ),
+            np.array([whole_px[k][i] for k, i in rows]),
             [(*found[k].lenses[i : i + 1], "")[0] for k, i in rows],
             np.array([self._evidence(found[k], i, cue) for k, i in rows]) if is_tracked else None,
             is_new=is_new,

@@ -16,7 +16,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .ground_plane import GroundPlane
 from .height_to_range import range_of
 from .standard_sizes import VEHICLES, size_prior
-from .usable import is_cut
+from .usable import are_cut
 from .vehicle_range import GroundCamera, OneRange, size_range, vehicle_range
 
 
@@ -43,7 +43,7 @@ def detection_range(
     curve = ranges.traffic_light if label in cues.traffic_light_labels else curve
     if curve is not None:
         return OneRange(float(range_of(np.array([height_px]), curve)[0]), curve.residual_sd_m)
-    if not _has_defaults(vehicle) or is_cut(box_px, size_px):
+    if not _has_defaults(vehicle) or are_cut(box_px[None], size_px)[0]:
         return None
     found = _by_size(vehicle, label, box_px, height_px, size_px)
     return None if found is None else OneRange(found.mean_m + vehicle.camera.x_m, found.sd_m)

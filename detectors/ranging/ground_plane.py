@@ -10,54 +10,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-
-class Mounted(Protocol):
-    """Mounting of a camera, such as ``crosscue.replay.vehicle.vehicle.Camera``."""
-
-    @property
-    def focal_px(self) -> float | None:
-        """Focal length in pixels."""
-        ...
-
-    @property
-    def center_px(self) -> tuple[float, float] | None:
-        """Principal point of the picture."""
-        ...
-
-    @property
-    def x_m(self) -> float:
-        """Distance ahead of the rear axle."""
-        ...
-
-    @property
-    def y_m(self) -> float:
-        """Distance to the left of the rear axle."""
-        ...
-
-    @property
-    def z_m(self) -> float:
-        """Height above the ground."""
-        ...
-
-    @property
-    def yaw_rad(self) -> float:
-        """Yaw, positive to the left."""
-        ...
-
-    @property
-    def pitch_rad(self) -> float:
-        """Pitch, positive downwards."""
-        ...
-
-    @property
-    def roll_rad(self) -> float:
-        """Roll, positive to the right."""
-        ...
+from crosscue.replay.vehicle.camera import Camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +34,7 @@ class GroundPlane:
     to_car: NDArray[np.float64]
 
     @classmethod
-    def of(cls, camera: Mounted, size_px: tuple[int, int]) -> GroundPlane:
+    def of(cls, camera: Camera, size_px: tuple[int, int]) -> GroundPlane:
         """Build the view of a camera with known focal length.
 
         Args:

@@ -31,14 +31,14 @@ class Bin:
         to_m: End of the interval, exclusive.
         pairs: Number of pairs.
         mean_m: Mean of fitted minus true range.
-        sd_m: Root mean square of fitted minus true range.
+        rms_m: Root mean square of fitted minus true range.
     """
 
     from_m: float
     to_m: float
     pairs: int
     mean_m: float
-    sd_m: float
+    rms_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,16 +91,16 @@ def fit_range(height_px: Floats, range_m: Floats, family: Family, bin_m: float =
         EmptyResultError: There are too few pairs.
         UsageError: A number is not finite or not positive, or too few pairs are on one curve.
     """
-    model, start = _CURVES[family]
+    model, rest = _CURVES[family]
     bad = ~(np.isfinite(height_px) & np.isfinite(range_m) & (height_px > 0.0) & (range_m > 0.0))
     if bad.any():
         raise UsageError(
             f"row {int(np.flatnonzero(bad)[0]) + 1}: height and range: expected positive"
         )
-    count = 1 if family == "pinhole" else 2
+    count = 1 + len(rest)
     if len(np.unique(height_px)) <= count:
         raise EmptyResultError(f"{family}: expected more than {count} different heights to fit it")
-    guess = start(height_px, range_m)
+    guess = np.array([float(np.median(range_m * height_px)), *rest])
     from scipy.optimize import least_squares
 
     scale = np.maximum(np.abs(guess), 1.0)
@@ -115,7 +115,7 @@ def fit_range(height_px: Floats, range_m: Floats, family: Family, bin_m: float =
         off_m = model(height_px, parameters) - range_m
         is_near = np.abs(off_m) <= MIN_OUTLIER * range_m
         before, keep = keep, _inliers(off_m) | _inliers(off_m / range_m) | is_near
-        if len(np.unique(height_px[keep])) <= len(guess):
+        if len(np.unique(height_px[keep])) <= count:
             raise UsageError(f"{family}: too few of {len(range_m)} pairs are on one curve")
         near_px, near_m = height_px[keep], range_m[keep]
         fitted = least_squares(_residual_of(model, near_px, near_m, scale), parameters / scale)
@@ -123,7 +123,7 @@ def fit_range(height_px: Floats, range_m: Floats, family: Family, bin_m: float =
         if np.array_equal(before, keep):
             break
     residual = model(near_px, parameters) - near_m
-    freedom = len(near_m) - len(guess)
+    freedom = len(near_m) - count
     sd = max(float(np.sqrt(np.sum(residual**2) / freedom)), 1e-6)
     curve = RangeCurve(family=family, parameters=tuple(parameters.tolist()), residual_sd_m=sd)
     bins = _bins(near_m, residual, bin_m)
@@ -169,33 +169,9 @@ def _bins(range_m: Floats, residual: Floats, bin_m: float) -> tuple[Bin, ...]:
     return tuple(bins)
 
 
-def _pinhole(height_px: Floats, p: Floats) -> Floats:
-    return np.asarray(p[0] / height_px, np.float64)
-
-
-def _pinhole_offset(height_px: Floats, p: Floats) -> Floats:
-    return np.asarray(p[0] / height_px + p[1], np.float64)
-
-
-def _power(height_px: Floats, p: Floats) -> Floats:
-    return np.asarray(p[0] * height_px ** p[1], np.float64)
-
-
-def _linear_start(height_px: Floats, range_m: Floats) -> Floats:
-    return np.array([float(np.median(range_m * height_px))])
-
-
-def _offset_start(height_px: Floats, range_m: Floats) -> Floats:
-    return np.array([float(np.median(range_m * height_px)), 0.0])
-
-
-def _power_start(height_px: Floats, range_m: Floats) -> Floats:
-    return np.array([float(np.median(range_m * height_px)), -1.0])
-
-
-_Curve = tuple[Callable[[Floats, Floats], Floats], Callable[[Floats, Floats], Floats]]
-_CURVES: Final[Mapping[str, _Curve]] = {
-    "pinhole": (_pinhole, _linear_start),
-    "pinhole-offset": (_pinhole_offset, _offset_start),
-    "power": (_power, _power_start),
+# By family: range of a height, and the first guess of the parameters after the first.
+_CURVES: Final[Mapping[str, tuple[Callable[[Floats, Floats], Floats], list[float]]]] = {
+    "pinhole": (lambda height_px, p: p[0] / height_px, []),
+    "pinhole-offset": (lambda height_px, p: p[0] / height_px + p[1], [0.0]),
+    "power": (lambda height_px, p: p[0] * height_px ** p[1], [-1.0]),
 }

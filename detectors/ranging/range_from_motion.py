@@ -21,7 +21,7 @@ The scale of the errors is estimated with the range, from residuals and a weak p
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from statistics import median
 from typing import Final, NamedTuple, TypeAlias
@@ -122,9 +122,7 @@ def range_from_motion(
     angle = median(seen.log_angle[-5:].tolist())
     before_m2 = _var_of_one_m2(angle, float(seen.var[-1]), size, (nearest_m, furthest_m))
     by_motion = min(max(1.0 - post.var_m2 / before_m2, 0.0), 1.0)
-    return MotionRange(
-        post.mean_m, post.var_m2, post.height_m, by_motion, post.log_height, post.log_height_var
-    )
+    return replace(post, by_motion=by_motion)
 
 
 def range_from_size(height_px: float, focal_px: float, size: SizePrior) -> MotionRange:
@@ -160,15 +158,6 @@ class _Observations:
         """Log height by each observation if the last range is ``range_m``, shape (G, N)."""
         depth = np.maximum(range_m[:, None] + self.ahead_m[None, :], 1e-3)
         return np.asarray(self.log_angle[None, :] + np.log(depth), np.float64)
-
-
-@dataclass(frozen=True, slots=True)
-class _Posterior:
-    mean_m: float
-    var_m2: float
-    height_m: float
-    log_height: float
-    log_height_var: float
 
 
 def _checked(
@@ -262,7 +251,7 @@ def _trust(squares: Floats) -> Floats:
     return OUTLIER**2 / np.maximum(squares, OUTLIER**2)
 
 
-def _refined(seen: _Observations, grid: _Grid, weights: Floats, size: SizePrior) -> _Posterior:
+def _refined(seen: _Observations, grid: _Grid, weights: Floats, size: SizePrior) -> MotionRange:
     """Compute the posterior on successively finer grids; it can be narrower than a grid's steps."""
     post = _posterior(seen, grid, weights, size)
     for _ in range(2):
@@ -277,7 +266,7 @@ def _refined(seen: _Observations, grid: _Grid, weights: Floats, size: SizePrior)
     return post
 
 
-def _posterior(seen: _Observations, grid: _Grid, weights: Floats, size: SizePrior) -> _Posterior:
+def _posterior(seen: _Observations, grid: _Grid, weights: Floats, size: SizePrior) -> MotionRange:
     """Posterior of the range, with the size integrated out."""
     precision = float(weights.sum()) + 1.0 / size.log_var
     pull = grid.off @ weights
@@ -291,4 +280,4 @@ def _posterior(seen: _Observations, grid: _Grid, weights: Floats, size: SizePrio
     log_heights = size.log_mean + pull / precision
     log_height = float(density @ log_heights)
     log_height_var = float(density @ (log_heights - log_height) ** 2) + 1.0 / precision
-    return _Posterior(mean_m, max(var_m2, 1e-12), height_m, log_height, log_height_var)
+    return MotionRange(mean_m, max(var_m2, 1e-12), height_m, 0.0, log_height, log_height_var)

@@ -11,7 +11,7 @@ from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.candidates import BELOW_SCORE, NO_CURVE
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-# Margin at the picture's edge; the height of a sign within it is truncated.
+# Margin at the picture's edge; the height of a box within it is truncated.
 BORDER_PX: Final = 2.0
 
 Source = Literal["curve", "motion"]
@@ -27,12 +27,10 @@ def source_of(vehicle: Vehicle, cue: str) -> Source | None:
     return None if chosen == "curve" or vehicle.camera.focal_px is None else "motion"
 
 
-def is_cut(box_px: NDArray[np.float64], size_px: tuple[int, int]) -> bool:
-    """Return whether the edge of a picture of this width and height cuts a box."""
-    width, height = size_px
-    x0, y0, x1, y1 = box_px.tolist()
-    is_outside = x1 > width - BORDER_PX or y1 > height - BORDER_PX
-    return bool(min(x0, y0) < BORDER_PX or is_outside)
+def are_cut(boxes_px: NDArray[np.float64], size_px: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return whether the picture's edge cuts boxes, shape (N, 4)."""
+    are_near: NDArray[np.bool_] = boxes_px[:, :2].min(axis=1) < BORDER_PX
+    return are_near | (boxes_px[:, 2:] > np.array(size_px) - BORDER_PX).any(axis=1)
 
 
 def why_not(
@@ -46,6 +44,6 @@ def why_not(
         return BELOW_SCORE
     if found.heights_px[i] <= 0.0:
         return NO_HEIGHT
-    if is_cut(found.boxes_px[i], found.size_px):
+    if are_cut(found.boxes_px[[i]], found.size_px)[0]:
         return CUT
     return NO_CURVE if source is None else None

@@ -30,7 +30,7 @@ from typing import Final, NamedTuple
 
 from crosscue.eval.runs.folder import MANIFEST
 from crosscue.replay.errors import LogError, UnknownFormatError, UsageError
-from crosscue.replay.files.bounded import read_whole
+from crosscue.replay.files.bounded import read_text
 from crosscue.replay.files.identity import identity_of_all, log_identity
 from crosscue.replay.files.log_identity import SHORT
 from crosscue.replay.formats import format_of, known_formats
@@ -182,12 +182,9 @@ def _stem(name: str) -> str:
 
 
 def _listed(path: Path, *, each: bool) -> Iterator[_Found]:
-    try:
-        lines = read_whole(path, LIST_BYTES).decode("utf-8", "surrogateescape").splitlines()
-    except OSError as error:
-        raise UsageError(f"@{path}: {error.strerror}; expected a text file") from None
+    text = read_text(path, LIST_BYTES, UsageError, "expected a list of logs", "surrogateescape")
     count = 0
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(text.splitlines(), 1):
         try:
             words = shlex.split(line, comments=True)
         except ValueError as error:

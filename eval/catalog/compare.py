@@ -25,7 +25,7 @@ from crosscue.eval.scoring.by_drive import (
     direction,
     no_longer_scored,
 )
-from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW
+from crosscue.eval.scoring.intervals import MIN_CLUSTERS, between
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.replay.errors import UnreadableRunError, UsageError
 from crosscue.replay.files import door
@@ -473,9 +473,7 @@ def _markdown_lines(found: Comparison) -> Iterator[str]:
         yield f"| {_cell(path)} | | | | | **worse**: no longer scored |"
     kept = max(MAX_LINES, sum(counts))
     for one in shown[:kept]:
-        ends = TOO_FEW
-        if not math.isnan(one.low):
-            ends = f"{one.low:+.3g} to {one.high:+.3g}"
+        ends = between(one.low, one.high, "+.3g")
         verdict = "**worse**" if one.verdict == "worse" else one.verdict
         more = _more_text(one)
         yield (
@@ -548,7 +546,8 @@ def _table_lines(one: TableChange) -> Iterator[str]:
 def _judged_lines(one: PairedMetric) -> Iterator[str]:
     label = {"worse": "WORSE", "too few places": "too few"}.get(one.verdict, one.verdict)
     yield f"{label:11}{visible(one.path)}: {_value(one.before)} -> {_value(one.after)}"
-    ends = TOO_FEW if math.isnan(one.low) else f"95 % {one.low:+.3g} to {one.high:+.3g}"
+    ends = "" if math.isnan(one.low) else "95 % "
+    ends += between(one.low, one.high, "+.3g")
     seen = "" if not math.isfinite(one.could_see) else f"; detectable: {one.could_see:.3g}"
     allowed = f"; allowed {one.allowed:.3g}" if one.allowed else ""
     drives, places = counted(one.drives, "drive"), counted(one.places, "place")

@@ -11,7 +11,7 @@ from typing import Final
 from crosscue.eval.batch.merge import is_merged
 from crosscue.eval.runs.folder import FAILURE, LOCK, MANIFEST, RunFolder
 from crosscue.replay.errors import RunError, UnreadableRunError, UsageError
-from crosscue.replay.files.bounded import read_whole
+from crosscue.replay.files.bounded import read_text
 from crosscue.replay.remote.address import is_remote
 
 from .query.local import LocalRuns, is_cut_short
@@ -97,10 +97,8 @@ def _is_merged(folder: Path) -> bool:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        lines = read_whole(path, LIST_BYTES).decode("utf-8", "surrogateescape").splitlines()
-    except OSError as error:
-        raise UsageError(f"@{path}: {error.strerror}; expected a text file") from None
+    text = read_text(path, LIST_BYTES, UsageError, "expected a list of runs", "surrogateescape")
+    lines = text.splitlines()
     named = [line.strip() for line in lines if line.strip() and not line.startswith("#")]
     if not named:
         raise UsageError(f"@{path}: names no run; expected a line for each")

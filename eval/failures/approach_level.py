@@ -67,10 +67,9 @@ def flips_without_truth(
     found: list[Failure] = []
     for number, (first, last) in sorted(run_spans(belief).items()):
         rows = np.flatnonzero(belief.approach == number)
-        rows = rows[np.argsort(belief.t_ns[rows], kind="stable")]
-        features = {name: values[rows] for name, values in belief.features.items()}
+        steps = belief.take(rows[np.argsort(belief.t_ns[rows], kind="stable")])
         unknown = np.full(len(rows), np.nan)
-        curve = Curve(run, number, "", belief.t_ns[rows], unknown, features)
+        curve = Curve(run, number, "", steps.t_ns, unknown, steps.features)
         found += flips(curve, positives, About(run, number, "", (), first, last), threshold)
     return found
 

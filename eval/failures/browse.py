@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +14,6 @@ from crosscue.eval.pipeline.run import moved_to, open_run
 from crosscue.eval.recording.view import save_recording
 from crosscue.eval.runs import owned
 from crosscue.replay.errors import CrosscueError, EmptyResultError, UsageError
-from crosscue.replay.files.whole_file import cannot_write
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
@@ -124,11 +122,9 @@ def browse(
     if not chosen:
         raise EmptyResultError(f"{folder}: no failure to show; nothing was written")
     entries = site_entries(chosen)
-    made = folder.with_name(f".{folder.name}.partial")
-    try:
-        shutil.rmtree(made, ignore_errors=True)
+    with owned.new_folder(folder, MARKER) as made:
         for part in ("f", "p", "t", "by", *(["r"] if has_recordings else [])):
-            (made / part).mkdir(parents=True)
+            (made / part).mkdir()
         truth = None if settings.truth is None else Path(settings.truth)
         work = RunWork(made, len(entries), moved, has_recordings, settings.limits, truth)
         groups, pictures, reasons = by_run(entries), frozenset[str](), []
@@ -142,11 +138,6 @@ def browse(
                 run = open_run(one.failure.run, moved, limits=settings.limits)
                 save_recording(run, path, settings.truth, at=f"{one.failure.t_ns}ns")
         write_lists(made, entries, pictures)
-        owned.replace_folder(made, folder, owned.of_list(folder / MARKER))
-    except OSError as error:
-        raise cannot_write(Path(error.filename or folder), error) from None
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
     bare = sum(one.picture not in pictures for one in entries)
     return Site(
         folder / "index.html", len(entries), len(pictures), bare, tuple(sorted(set(reasons))), found

@@ -320,9 +320,7 @@ def _write(
     objects = output.parent / OBJECTS_FILE
     write_imported(objects, annotations, placed, cues)
     write_text(output, strict_json(truth.model_dump(mode="json")) + "\n")
-    there: dict[str, int] = {}
-    for one in truth.cues:
-        there[one.cue] = there.get(one.cue, 0) + one.present
+    there = {one.cue: 0 for one in truth.cues} | Counter(c.cue for c in truth.cues if c.present)
     return ImportedTruth(
         output,
         objects,

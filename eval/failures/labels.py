@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +17,7 @@ from crosscue.eval.runs import owned
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.runs.stored_images import pictures_at, run_camera
 from crosscue.eval.runs.tables.stored_frames import stored_frames
+from crosscue.eval.scoring.pooling import sum_counts
 from crosscue.replay.errors import (
     CrosscueError,
     EmptyResultError,
@@ -25,7 +25,7 @@ from crosscue.replay.errors import (
     UsageError,
 )
 from crosscue.replay.files.tree_text import spelled
-from crosscue.replay.files.whole_file import cannot_write, write_bytes
+from crosscue.replay.files.whole_file import write_bytes
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits, LimitsGiven
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.safe_text import counted, visible
@@ -123,15 +123,13 @@ def export(
     folder, kind = Path(output), LABEL_FORMATS[to]
     owned.check_place(folder, INDEX, overwrite=overwrite)
     moved = moved_to(logs)
-    made = folder.with_name(f".{folder.name}.partial")
     by_run: dict[str, set[int]] = {}
     for one in chosen:
         by_run.setdefault(one.run, set()).add(one.t_ns)
     runs: list[ExportedRun] = []
     failed: dict[str, CrosscueError] = {}
-    try:
-        shutil.rmtree(made, ignore_errors=True)
-        (made / kind.pictures).mkdir(parents=True)
+    with owned.new_folder(folder, INDEX) as made:
+        (made / kind.pictures).mkdir(exist_ok=True)
         for done, (run, times) in enumerate(by_run.items(), 1):
             try:
                 images = made / kind.pictures
@@ -151,15 +149,7 @@ def export(
         file = kind.write(made, found)
         index = [one.as_index(folder) for one in runs if one.pictures]
         owned.write_marker(made / INDEX, {"format": 1, "to": to, "drives": index})
-        owned.replace_folder(made, folder, owned.of_list(folder / INDEX))
-    except OSError as error:
-        raise cannot_write(Path(error.filename or folder), error) from None
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
-    left_out: dict[str, int] = {}
-    for part in runs:
-        for why, count in part.left_out.items():
-            left_out[why] = left_out.get(why, 0) + count
+    left_out = sum_counts(part.left_out for part in runs)
     boxes = sum(len(one.things) for one in found.pictures)
     return ExportedLabels(
         folder / file.name, to, len(found.pictures), boxes, found.labels, left_out, failed

@@ -12,6 +12,7 @@ import hashlib
 import json
 import re
 import shlex
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -206,10 +207,7 @@ def _facets(entries: Sequence[Entry]) -> Mapping[str, Mapping[str, tuple[str, in
     """Return the page name and number of failures by facet and value, the largest first."""
     found: dict[str, dict[str, tuple[str, int]]] = {}
     for facet in FACETS:
-        counts: dict[str, int] = {}
-        for one in entries:
-            for value in one.facets(facet):
-                counts[value] = counts.get(value, 0) + 1
+        counts = Counter(value for one in entries for value in one.facets(facet))
         found[facet] = {}
         for value, count in sorted(counts.items(), key=lambda pair: (-pair[1], pair[0])):
             plain = re.sub(r"[^a-z0-9]+", "-", value.lower()).strip("-")[:40]

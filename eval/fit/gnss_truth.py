@@ -50,21 +50,8 @@ def truth_from_gnss(
     """
     settings = vehicle_given(vehicle)
     with opened(log) as drive:
-        found = write_gnss_truth(drive.logs, settings, drive.selection, Path(output))
-    return WrittenTruth(found)
-
-
-def write_gnss_truth(
-    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, folder: Path
-) -> Path:
-    """Write ``truth.json`` and the antenna's track.
-
-    Raises:
-        EmptyResultError: No GNSS position exists, or none has a heading.
-        OutputError: A file cannot be written.
-    """
-    truth, track = gnss_truth(logs, vehicle, selection)
-    return save_with_track(truth, track, folder)
+        truth, track = gnss_truth(drive.logs, settings, drive.selection)
+    return WrittenTruth(save_with_track(truth, track, Path(output)))
 
 
 def save_with_track(truth: Truth, track: Trajectory, folder: Path) -> Path:

@@ -14,7 +14,7 @@ import numpy as np
 from crosscue.eval.fit.annotated_runs import annotated_approaches, read_annotated
 from crosscue.eval.fit.vehicle_output import FittedSection, new_file, section_text
 from crosscue.eval.pipeline.run import Run
-from crosscue.eval.scoring.intervals import TOO_FEW, Interval, mean_by_cluster, wilson
+from crosscue.eval.scoring.intervals import Interval, between, mean_by_cluster, wilson
 from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.fusion.fit.message_fit import fit_messages as fit_approaches
@@ -129,12 +129,10 @@ def _unlearned_text(one: RateFit) -> str:
 
 def _side_text(side: Side) -> str:
     reported = _rates_of(side)
-    low, high = reported.places
-    by_place = TOO_FEW if math.isnan(low) else f"{low:.2f} to {high:.2f}"
     return (
         f"{reported.rate:.2f} ({reported.wilson.low:.2f} to {reported.wilson.high:.2f} by "
-        f"{side.observations:.0f} independent frames of {side.frames}; {by_place} by {side.places} "
-        "places)"
+        f"{side.observations:.0f} independent frames of {side.frames}; "
+        f"{between(*reported.places)} by {side.places} places)"
     )
 
 

@@ -16,16 +16,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, Literal
 
-from pydantic import ValidationError
-
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.bounded import read_whole
-from crosscue.replay.files.tree_text import toml_tree
 from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.limits import MIB
 from crosscue.replay.logs.log_summary import LogSummary, TopicSummary
-from crosscue.replay.vehicle.section import Positive, Section, tuples
-from crosscue.replay.vehicle.validation_errors import explain
+from crosscue.replay.vehicle.section import Positive, Section
+from crosscue.replay.vehicle.validation_errors import read_model
 
 # Margins of a specification that is written from a good log.
 RATE_MARGIN: Final = 0.8
@@ -59,16 +54,7 @@ def read_spec(path: Path | str) -> LogSpec:
     Raises:
         UsageError: It cannot be read, or is not valid.
     """
-    path = Path(path)
-    try:
-        text = read_whole(path, MIB).decode()
-        return LogSpec.model_validate(tuples(toml_tree(text)))
-    except ValidationError as error:
-        raise UsageError(explain(error, text, str(path), LogSpec)) from None
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror or error}; expected a specification") from None
-    except ValueError as error:
-        raise UsageError(f"{path}: not TOML: {error}; write it with --init") from None
+    return read_model(Path(path), LogSpec, UsageError, "expected a specification, as of --init")
 
 
 def spec_faults(spec: LogSpec, summaries: Sequence[LogSummary]) -> Iterator[tuple[str, str]]:

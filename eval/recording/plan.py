@@ -10,6 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
+from crosscue.localization.ellipse import ellipses, position_cov
 from crosscue.replay.colours import END, FOUND, LANDMARK, SIGMA, START, TRUTH
 
 from .columns import DriveTime, Shapes, strips_above
@@ -40,7 +41,9 @@ def log_pose(
     )
     some = _every(t_ns, ELLIPSES_PER_S)
     times = time.column(t_ns[some])
-    rings = _rings(flat[some], _position_cov(pose, some))
+    xx, xy, yy = (pose[f"cov_{name}"][some] for name in ("xx_m2", "xy_m2", "yy_m2"))
+    rings = ellipses(flat[some, :2], position_cov(xx, xy, yy), 33)
+    rings = np.pad(rings, ((0, 0), (0, 0), (0, 1)))
     recording.send_columns(
         "plan/ellipse", indexes=times, columns=rr.LineStrips3D.columns(strips=list(rings))
     )
@@ -135,23 +138,3 @@ def _every(t_ns: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
     slots = (t_ns - t_ns[0]) // round(1e9 / rate_hz)
     first = np.flatnonzero(np.diff(slots, prepend=-1))
     return np.union1d(first, [len(t_ns) - 1]).astype(np.int64)
-
-
-def _position_cov(
-    pose: Mapping[str, NDArray[np.float64]], rows: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    xx, xy, yy = (pose[f"cov_{name}"][rows] for name in ("xx_m2", "xy_m2", "yy_m2"))
-    return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
-
-
-def _rings(
-    centre: NDArray[np.float64], cov: NDArray[np.float64], points: int = 33
-) -> NDArray[np.float64]:
-    """Return 2-sigma ellipses, shape (N, points, 3)."""
-    angle = np.linspace(0.0, 2.0 * np.pi, points)
-    circle = np.stack([np.cos(angle), np.sin(angle)])
-    values, vectors = np.linalg.eigh(cov)
-    axes = vectors * (2.0 * np.sqrt(np.maximum(values, 0.0)))[:, None, :]
-    rings = np.zeros((len(cov), points, 3))
-    rings[:, :, :2] = np.swapaxes(axes @ circle, 1, 2)
-    return rings + centre[:, None, :]

@@ -163,11 +163,10 @@ def curves_of(run: RunFolder) -> tuple[list[Curve], list[CueFrames]]:
     curves = []
     for number in _approaches(tables):
         assert tables.belief is not None
-        mine = tables.belief.approach == number
-        values = {name: p[mine] for name, p in tables.belief.features.items()}
-        unknown_m = np.full(int(mine.sum()), np.nan)
+        mine = tables.belief.take(tables.belief.approach == number)
+        unknown_m = np.full(len(mine.t_ns), np.nan)
         name = f"approach {number}"
-        curves.append(Curve("", number, name, tables.belief.t_ns[mine], unknown_m, values))
+        curves.append(Curve("", number, name, mine.t_ns, unknown_m, mine.features))
     found = tables.cues
     cues = [] if found is None else [_unjudged(found, name) for name in CUES]
     return curves, [one for one in cues if len(one.t_ns)]
@@ -319,9 +318,8 @@ def _approaches(tables: RunTables) -> list[int]:
 def _established(tables: RunTables, approach: int, threshold: float) -> dict[str, int]:
     """Return the time at which each feature first exceeds the threshold; 0 if it never does."""
     assert tables.belief is not None
-    mine = tables.belief.approach == approach
-    times = tables.belief.t_ns[mine]
-    above = {name: times[p[mine] > threshold] for name, p in tables.belief.features.items()}
+    mine = tables.belief.take(tables.belief.approach == approach)
+    above = {name: mine.t_ns[p > threshold] for name, p in mine.features.items()}
     return {name: int(at[0]) if len(at) else 0 for name, at in above.items()}
 
 

@@ -13,6 +13,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.log_time import ClockGap, broken_at
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.scoring.pose.score import ScoredPoses
+from crosscue.localization.ellipse import ellipses, position_cov
 from crosscue.replay.columns import Floats, Int64s
 
 from .scene_figures import WIDTH, shade
@@ -111,8 +112,7 @@ def track_figures(run: RunFolder, gaps: Sequence[ClockGap]) -> tuple[Figure, ...
         return ()
     t_ns = table["t_ns"].to_numpy()
     x, y, xx, xy, yy, travelled_m, axis_m = (table[name].to_numpy() for name in names)
-    cov_m2 = np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
-    track = Track(t_ns, np.stack([x, y], axis=1), None, cov_m2, gaps)
+    track = Track(t_ns, np.stack([x, y], axis=1), None, position_cov(xx, xy, yy), gaps)
     return (
         Figure(draw_map(track), "Estimated track, with twelve 2-sigma ellipses."),
         Figure(draw_ellipse(t_ns, travelled_m, axis_m, gaps), "Length of the 2-sigma ellipse."),
@@ -150,9 +150,9 @@ def draw_map(track: Track) -> Markup:
         if points is not None:
             x, y = (np.insert(points[rows, i], breaks, np.nan) for i in (0, 1))
             drawing.curve(panel, x, y, style)
-    for row in np.unique(np.linspace(0, len(track.t_ns) - 1, ELLIPSES).astype(int)):
-        x, y = _ellipse(track.estimate_m[row], track.cov_m2[row])
-        drawing.curve(panel, x, y, "line sigma")
+    rows = np.unique(np.linspace(0, len(track.t_ns) - 1, ELLIPSES).astype(int))
+    for ring in ellipses(track.estimate_m[rows], track.cov_m2[rows]):
+        drawing.curve(panel, ring[:, 0], ring[:, 1], "line sigma")
     drawing.legend(8, 14, [*named, ("line found", "estimate"), ("line sigma", "2 sigma")])
     return drawing.svg()
 
@@ -228,11 +228,3 @@ def _distances(travelled_m: Floats) -> tuple[float, float]:
 
 def _thinned(rows: int) -> np.typing.NDArray[np.intp]:
     return np.unique(np.linspace(0, rows - 1, min(rows, POINTS)).astype(np.intp))
-
-
-def _ellipse(centre: Floats, cov_m2: Floats) -> Floats:
-    angle = np.linspace(0.0, 2.0 * np.pi, 41)
-    values, vectors = np.linalg.eigh(cov_m2)
-    axes = vectors * (2.0 * np.sqrt(np.maximum(values, 0.0)))
-    ring: Floats = axes @ np.stack([np.cos(angle), np.sin(angle)]) + centre[:, None]
-    return ring

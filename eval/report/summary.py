@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from textwrap import wrap
 from typing import Final
@@ -11,7 +12,14 @@ import numpy as np
 
 from crosscue.eval.scoring.drives import PooledScores
 from crosscue.eval.scoring.gates import GateResult
-from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW, Mean, Proportion, mean
+from crosscue.eval.scoring.intervals import (
+    MIN_CLUSTERS,
+    TOO_FEW,
+    Mean,
+    Proportion,
+    between,
+    mean,
+)
 from crosscue.eval.scoring.metric_values import MetricValue
 from crosscue.eval.scoring.pose.score import PlaneMounting, PoseErrorSummary, PoseScore
 from crosscue.eval.scoring.scene.approaches import ApproachScore
@@ -179,10 +187,7 @@ def _approaches(one: ApproachScore) -> list[str]:
 
 
 def _spurious(one: ApproachScore) -> str:
-    reasons: dict[str, int] = {}
-    for result in one.results:
-        if result.why_spurious:
-            reasons[result.why_spurious] = reasons.get(result.why_spurious, 0) + 1
+    reasons = Counter(result.why_spurious for result in one.results if result.why_spurious)
     reported = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
     detections = counted(one.spurious, "detection as published does", "detections as published do")
     return f"{detections} not count: {reported}"
@@ -192,10 +197,8 @@ def _distance(found: Proportion, distance: Mean) -> str:
     text = f"{found.right} of {found.of}"
     if not distance.of:
         return text
-    text += f", {distance.value:.1f} m away on average"
-    if math.isnan(distance.low):
-        return f"{text} ({TOO_FEW})"
-    return f"{text} ({distance.low:.1f} to {distance.high:.1f})"
+    ends = between(distance.low, distance.high, ".1f")
+    return f"{text}, {distance.value:.1f} m away on average ({ends})"
 
 
 def _belief(belief: Mapping[str, BeliefScore]) -> list[str]:
@@ -287,8 +290,8 @@ def poses_summary(poses: Sequence[PoseScore], places: Int64s) -> str:
         ("NEES of x, y, heading", ", 3 is consistent", [one.nees_xyh.mean for one in poses]),
     ):
         found = mean(np.array(values), places)
-        ends = TOO_FEW if math.isnan(found.low) else f"{found.low:.2f} to {found.high:.2f}"
         if found.of:
+            ends = between(found.low, found.high)
             lines.append(_line("", f"{name:22} {found.value:.2f} ({ends}){unit}"))
     return "\n".join(lines)
 

@@ -6,8 +6,9 @@ Those of a run are known from its stage (``folder.own_files``); an export and a 
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, TypeAlias
 
@@ -44,16 +45,28 @@ def write_marker(marker: Path, content: dict[str, object]) -> None:
     write_text(marker, strict_json(tree) + "\n")
 
 
-def replace_folder(made: Path, folder: Path, is_ours: IsOurs) -> None:
-    """Delete the files of ours from a folder, and move the finished folder ``made`` there.
+@contextmanager
+def new_folder(folder: Path, marker: str) -> Iterator[Path]:
+    """Yield an empty folder, which takes the place of ``folder`` when it is complete.
+
+    Call ``check_place`` first. Files of ours, which the marker lists, are deleted then.
 
     Raises:
-        OSError: Something else is there, or it cannot be written.
+        OutputError: Something else is there, or it cannot be written.
     """
-    if folder.is_dir():
-        remove(folder, is_ours)
-        folder.rmdir()
-    made.rename(folder)
+    made = folder.with_name(f".{folder.name}.partial")
+    try:
+        shutil.rmtree(made, ignore_errors=True)
+        made.mkdir(parents=True)
+        yield made
+        if folder.is_dir():
+            remove(folder, of_list(folder / marker))
+            folder.rmdir()
+        made.rename(folder)
+    except OSError as error:
+        raise cannot_write(Path(error.filename or folder), error) from None
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
 
 
 def check_place(folder: Path, marker: str, *, overwrite: bool) -> None:

@@ -59,6 +59,11 @@ class BeliefRows:
     features: Mapping[str, NDArray[np.float64]]
     established: NDArray[np.bool_]
 
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> BeliefRows:
+        """Return some of the steps."""
+        features = {name: values[rows] for name, values in self.features.items()}
+        return BeliefRows(self.t_ns[rows], self.approach[rows], features, self.established[rows])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunTables:

@@ -18,19 +18,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.bounded import read_whole
-from crosscue.replay.files.tree_text import toml_tree
-from crosscue.replay.limits import MIB
-from crosscue.replay.vehicle.validation_errors import explain
+from crosscue.replay.vehicle.validation_errors import read_model
 
 from .metric_values import MetricValue
 
-MAX_BYTES: Final = 1 * MIB
 Bound = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -93,15 +89,7 @@ def load_gates(path: Path) -> tuple[Gate, ...]:
     Raises:
         UsageError: The file is missing, not TOML, or not a gate file of version 1.
     """
-    try:
-        text = read_whole(path, MAX_BYTES).decode("utf-8")
-        tree = toml_tree(text)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path}: not readable as TOML ({error}); correct it") from None
-    try:
-        return GateFile.model_validate(tree).gate
-    except ValidationError as error:
-        raise UsageError(explain(error, text, str(path), GateFile)) from None
+    return read_model(path, GateFile, UsageError, "expected a gate file").gate
 
 
 def check_gates(

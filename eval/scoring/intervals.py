@@ -49,6 +49,11 @@ class Interval(NamedTuple):
 UNKNOWN: Final = Interval(math.nan, math.nan)
 
 
+def between(low: float, high: float, digits: str = ".2f") -> str:
+    """Return the ends of an interval as text, in a format of digits, or why it is missing."""
+    return TOO_FEW if math.isnan(low) else f"{low:{digits}} to {high:{digits}}"
+
+
 @dataclass(frozen=True, slots=True)
 class Proportion:
     """``right`` out of ``of``.
@@ -116,6 +121,19 @@ def _wilson(fraction: float, of: float, z: float) -> Interval:
     return Interval(
         0.0 if fraction == 0.0 else middle - half, 1.0 if fraction == 1.0 else middle + half
     )
+
+
+def lower_bound(right: int, of: int, confidence: float) -> float:
+    """Return Clopper and Pearson's one-sided lower bound of a fraction.
+
+    Args:
+        right: Number of successes.
+        of: Number of trials.
+        confidence: Confidence in (0, 1).
+    """
+    from scipy.stats import beta
+
+    return 0.0 if right == 0 else float(beta.ppf(1.0 - confidence, right, of - right + 1))
 
 
 def fraction(is_right: np.typing.NDArray[np.bool_], clusters: NDArray[np.int64]) -> Proportion:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Final
@@ -15,11 +16,7 @@ BINS_M: Final = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
 
 def sum_counts(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     """Return the sums of counts by reason."""
-    total: dict[str, int] = {}
-    for one in counts:
-        for reason, count in one.items():
-            total[reason] = total.get(reason, 0) + count
-    return total
+    return dict(sum(map(Counter, counts), Counter[str]()))
 
 
 def first_reasons(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -13,20 +12,18 @@ import numpy as np
 
 from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.coco import read_coco
+from crosscue.datasets.truth.csv_rows import csv_rows
 from crosscue.datasets.truth.truth import Approach, CueTruth, Truth, read_truth
 from crosscue.datasets.truth.tum import read_tum
 from crosscue.detectors.overlay import TrueMarks
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.moments import frame_times
-from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.columns import ColumnSet, Floats, Int64s
 from crosscue.replay.errors import AnnotationError
-from crosscue.replay.limits import MIB
 
 from .columns import NONE
 from .places import places_of
 
-COLUMNS: Final = ("t_ns", "approach", "start_m", "end_m")
-MAX_BYTES: Final = 256 * MIB
 # Max time between a moment and the true ranges it is interpolated from.
 NEAREST_NS: Final = 500_000_000
 # Time after entering during which the car is assumed to be in the intersection. Nothing is judged
@@ -36,7 +33,7 @@ FEATURES: Final = ("intersection", "left", "right", "straight")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TrueRanges:
+class TrueRanges(ColumnSet):
     """N true ranges of the rear axle, sorted by time.
 
     Attributes:
@@ -148,19 +145,9 @@ def read_scored_truth(path: Path, drive: str) -> DriveTruth:
 
 def _read_ranges(path: Path, truth: Truth) -> TrueRanges:
     known = {one.id for one in truth.approaches}
-    rows: list[tuple[int, int, float, float]] = []
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise AnnotationError(f"{path}: over {MAX_BYTES // MIB} MiB; split the drive")
-        with path.open(encoding="utf-8", newline="") as file:
-            reader = csv.DictReader(file)
-            if set(COLUMNS) - set(reader.fieldnames or ()):
-                raise AnnotationError(f"{path}:1: expected the columns {','.join(COLUMNS)}")
-            for row in reader:
-                rows.append(_range_row(row, known, f"{path}:{reader.line_num}"))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise AnnotationError(f"{path}: {error}; the truth names it under ranges") from None
-    rows.sort()
+    remedy = "the truth names it under ranges"
+    table = csv_rows(path, "t_ns,approach,start_m,end_m", remedy=remedy)
+    rows = sorted(_range_row(row, known, where) for where, row in table)
     t_ns, approach, start, end = zip(*rows, strict=True) if rows else ((), (), (), ())
     return TrueRanges(
         np.array(t_ns, np.int64),
@@ -191,7 +178,8 @@ def _ranges_along(path: Path, truth: Truth) -> TrueRanges:
     track = read_tum(path)
     steps = np.linalg.norm(np.diff(track.xyz_m[:, :2], axis=0), axis=1)
     gone = np.concatenate([[0.0], np.cumsum(steps)])
-    parts: list[TrueRanges] = []
+    empty = np.empty(0, np.int64)
+    found = TrueRanges(empty, empty, np.empty(0), np.empty(0))
     for one in truth.approaches:
         inside = (track.t_ns >= one.start_ns) & (track.t_ns <= one.enter_ns)
         enter_m = _between(np.array([one.enter_ns]), track.t_ns, gone)[0]
@@ -200,16 +188,8 @@ def _ranges_along(path: Path, truth: Truth) -> TrueRanges:
         start = enter_m - gone[inside]
         end = start + (math.nan if one.length_m is None else one.length_m)
         ids = np.full(len(start), one.id, np.int64)
-        parts.append(TrueRanges(track.t_ns[inside], ids, start, end))
-    if not parts:
-        empty = np.empty(0, np.int64)
-        return TrueRanges(empty, empty, np.empty(0), np.empty(0))
-    return TrueRanges(
-        np.concatenate([part.t_ns for part in parts]),
-        np.concatenate([part.approach for part in parts]),
-        np.concatenate([part.start_m for part in parts]),
-        np.concatenate([part.end_m for part in parts]),
-    )
+        found += TrueRanges(track.t_ns[inside], ids, start, end)
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,14 +15,19 @@ DPI: Final = 130
 COLOURS: Final = ("#2ca02c", "#1f77b4", "#d62728", "#7f7f7f", "#9467bd", "#8c564b", "#e377c2")
 
 
-def figure(columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """Return a figure with axes side by side."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+def bare_figure(size: tuple[float, float], *grid: int, **shared: Any) -> tuple[Figure, Any]:
+    """Return a figure and its axes; ``grid`` and ``shared`` are those of ``Figure.subplots``."""
     from matplotlib.figure import Figure
 
-    made = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(made)
-    axes = made.subplots(1, columns, squeeze=False)[0]
+    made = Figure(figsize=size, layout="constrained")
+    axes: Any = made.subplots(*grid, **shared)
+    return made, axes
+
+
+def figure(columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a grid in axes side by side."""
+    made, rows = bare_figure((width, height), 1, columns, squeeze=False)
+    axes = rows[0]
     for one in axes:
         one.grid(alpha=0.3)
         for side in ("top", "right"):

@@ -54,3 +54,23 @@ def read_pieces(file: IO[bytes], max_bytes: int) -> bytes | None:
             return None
         pieces.append(piece)
     return b"".join(pieces)
+
+
+def read_text(
+    path: Path, max_bytes: int, refused: type[Exception], remedy: str, errors: str = "strict"
+) -> str:
+    """Return the text of a file in UTF-8.
+
+    Args:
+        path: The file.
+        max_bytes: Max size of the file.
+        refused: Error that is raised if the file cannot be read, is larger, or is not UTF-8.
+        remedy: End of its message: what was expected, or what to do.
+        errors: How bytes that are not UTF-8 are decoded.
+    """
+    try:
+        return read_whole(path, max_bytes).decode("utf-8", errors)
+    except OSError as error:
+        raise refused(f"{path}: {error.strerror or error}; {remedy}") from None
+    except UnicodeDecodeError:
+        raise refused(f"{path}: not UTF-8 text; {remedy}") from None

@@ -7,15 +7,42 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Final, get_args, get_origin
+from pathlib import Path
+from typing import Any, Final, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
-if TYPE_CHECKING:
-    from pydantic import ValidationError
+from crosscue.replay.files.bounded import read_text
+from crosscue.replay.files.tree_text import toml_tree
+from crosscue.replay.limits import MIB
+
+from .section import tuples
 
 # Maximum number of characters of an invalid value in a message.
 GIVEN_CHARACTERS: Final = 80
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read_model(path: Path, model: type[Model], refused: type[Exception], remedy: str) -> Model:
+    """Read and check a settings file in TOML, of at most 1 MiB.
+
+    Args:
+        path: The file.
+        model: Model of the file.
+        refused: Error that is raised if the file cannot be read, or a key or value is invalid.
+        remedy: End of the message if it cannot be read: what was expected, or what to do.
+    """
+    return parse_model(read_text(path, MIB, refused, remedy), str(path), model, refused)
+
+
+def parse_model(text: str, where: str, model: type[Model], refused: type[Exception]) -> Model:
+    """Parse and check a text in TOML; ``where`` names it in errors, of the kind ``refused``."""
+    try:
+        return model.model_validate(tuples(toml_tree(text)))
+    except ValidationError as error:
+        raise refused(explain(error, text, where, model)) from None
+    except ValueError as error:
+        raise refused(f"{where}: not TOML: {error}; correct that line") from None
 
 
 def explain(error: ValidationError, text: str | None, where: str, root: type[BaseModel]) -> str:

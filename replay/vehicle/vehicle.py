@@ -12,12 +12,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from crosscue.replay.errors import VehicleError
-from crosscue.replay.files.bounded import read_whole
-from crosscue.replay.files.tree_text import toml_tree, unspelled
+from crosscue.replay.files.bounded import read_text
+from crosscue.replay.files.tree_text import unspelled
 from crosscue.replay.limits import MIB
 
 from .camera import Camera as Camera
@@ -32,9 +32,9 @@ from .cue_table import TRAFFIC_LIGHT as TRAFFIC_LIGHT
 from .fusion import Fusion, RangeFilter
 from .mobileye_cues import Past
 from .pose import DEGREE, Gnss, Odometry, Start
-from .section import Finite, Name, NotNegative, Positive, Section, tuples
+from .section import Finite, Name, NotNegative, Positive, Section
 from .time import Time
-from .validation_errors import explain
+from .validation_errors import parse_model
 
 VERSION: Final = 1
 MAX_BYTES: Final = 1 * MIB
@@ -452,12 +452,8 @@ def load(path: Path) -> Vehicle:
         VehicleError: The file is missing, not TOML, or has an invalid key or value; the message
             names the line.
     """
-    try:
-        text = read_whole(path, MAX_BYTES).decode("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise VehicleError(f"{path}: {why}; make one with: crosscue vehicle init LOG") from None
-    vehicle = parse(text, str(path))
+    remedy = "make one with: crosscue vehicle init LOG"
+    vehicle = parse(read_text(path, MAX_BYTES, VehicleError, remedy), str(path))
     return vehicle.with_files(lambda name: str((path.parent / unspelled(name)).resolve()))
 
 
@@ -474,11 +470,4 @@ def parse(text: str, where: str) -> Vehicle:
     Raises:
         VehicleError: As for ``load``.
     """
-    try:
-        tree = toml_tree(text)
-    except ValueError as error:
-        raise VehicleError(f"{where}: not TOML: {error}; correct that line") from None
-    try:
-        return Vehicle.model_validate(tuples(tree))
-    except ValidationError as error:
-        raise VehicleError(explain(error, text, where, Vehicle)) from None
+    return parse_model(text, where, Vehicle, VehicleError)

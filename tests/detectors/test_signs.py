@@ -133,6 +133,10 @@ def test_fit_signs_measures_on_frames_not_used_for_the_choice(
     assert capsys.readouterr().out == reported
 
 
+def size_of(grey: Bytes) -> dict[str, int]:
+    return {"width": grey.shape[1], "height": grey.shape[0]}
+
+
 def coco(folder: Path, seeds: range) -> Path:
     """Write a COCO file and pictures with alternating left and right one-way signs."""
     kinds: tuple[Kind, Kind] = ("one way left", "one way right")
@@ -143,7 +147,7 @@ def coco(folder: Path, seeds: range) -> Path:
         ok, encoded = cv2.imencode(".png", grey)
         assert ok
         (folder / "images" / f"{seed}.png").write_bytes(encoded.tobytes())
-        images.append({"id": seed, "file_name": f"{seed}.png"})
+        images.append({"id": seed, "file_name": f"{seed}.png"} | size_of(grey))
         annotations.append(
             {
                 "id": seed,
@@ -167,7 +171,7 @@ def drive(folder: Path, seeds: range) -> Path:
         grey, (x0, y0, x1, y1) = scene("one way left", seed)
         has_sign = number % 2 == 0
         pictures.append(cv2.imencode(".png", grey if has_sign else clutter(seed))[1].ravel())
-        images.append({"id": number, "t_ns": t_ns, "file_name": f"{t_ns}.jpg"})
+        images.append({"id": number, "t_ns": t_ns, "file_name": f"{t_ns}.jpg"} | size_of(grey))
         if has_sign:
             annotations.append(
                 {
@@ -198,7 +202,7 @@ def test_fit_signs_on_drives_reports_an_interval_by_drive(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fitted = coco(tmp_path / "a", range(4))
-    drives = [str(drive(tmp_path / f"d{i}", range(10 * i, 10 * i + 2))) for i in range(5)]
+    drives = [str(drive(tmp_path / f"d{i}", range(10 * i, 10 * i + 2))) for i in range(6)]
     left = ["--label", "one way left", "--json"]
 
     assert run(["fit", "signs", str(fitted), "--test", *drives, *left]) == 0
@@ -206,7 +210,7 @@ def test_fit_signs_on_drives_reports_an_interval_by_drive(
     assert run(["fit", "signs", drives[0], "--test", *drives, *left, "--test-every", "2"]) == 0
     half = json.loads(capsys.readouterr().out)
 
-    assert whole["signs"] == half["other_frames"]["signs"] == 5
+    assert whole["signs"] == half["other_frames"]["signs"] == 6
     assert half["chosen_on"]["signs"] == 1
     low, high = whole["recall_interval_by_drive"]
     assert 0.0 <= low <= whole["recall"] <= high <= 1.0

@@ -119,11 +119,6 @@ def motions_of(
     return [_motion(seen, *fit) for seen, fit in zip(cars, fits, strict=True)]
 
 
-def motion_of(seen: Sequence[Observation], aside_mps: float = USUAL_MPS) -> CarMotion:
-    """Fit a constant velocity to one car, as in ``motions_of``."""
-    return motions_of([seen], aside_mps)[0]
-
-
 def _motion(
     seen: Sequence[Observation],
     speed_mps: Sequence[Sequence[float]],

@@ -29,6 +29,7 @@ from crosscue.detectors.cues.tracked.motion import (
 )
 from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.detectors.ranging.object_tracks import CarStep, iou
+from crosscue.detectors.ranging.usable import are_cut
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
 # Constant part of the standard deviation of a box's height.
@@ -54,7 +55,6 @@ ERRORS: Final = 2.0
 # Maximum ratio of one car's heights in consecutive frames.
 GROWTH: Final = 1.4
 # Distance to the picture's edge within which a box counts as cut.
-BORDER_PX: Final = 2.0
 # Fraction of a box's lower end behind another car above which its height is not the car's.
 MAX_COVERED: Final = 0.3
 
@@ -189,8 +189,7 @@ class CarTracks:
         ends_px = np.column_stack([x0, middle, x1, middle]).reshape(-1, 2)
         rays = GroundPlane.of(self._camera, size_px).rays(ends_px).reshape(-1, 2, 3)
         high = y1 - y0
-        is_cut = (np.minimum(x0, y0) < BORDER_PX) | (x1 > size_px[0] - BORDER_PX)
-        is_cut |= (y1 > size_px[1] - BORDER_PX) | (high <= 0.0) | (x1 <= x0)
+        is_cut = are_cut(boxes_px, size_px) | (high <= 0.0) | (x1 <= x0)
         are_whole = ~is_cut & (rays[:, :, 0].min(axis=1) > 0.0) & (focal_px > 0.0)
         with np.errstate(divide="ignore"):
             away_m = focal_px * CAR_HEIGHT_M / high * rays[:, :, 0].mean(axis=1)

@@ -13,7 +13,7 @@ bound from one short drive means little for other drives.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from crosscue.detectors.catalog.class_scores import ClassScores, Isotonic, Platt
 from crosscue.detectors.training.operating_point import fit_isotonic, fit_platt
 from crosscue.eval.scoring.boxes.reliability import class_calibration
-from crosscue.eval.scoring.intervals import Interval, wilson
+from crosscue.eval.scoring.intervals import Interval, lower_bound, wilson
 from crosscue.replay.safe_text import counted
 
 CalibrationKind: TypeAlias = Literal["platt", "isotonic", "none"]
@@ -163,13 +163,12 @@ def fit_class(
     """
     n, right = len(chosen_on.scores), int(chosen_on.is_right.sum())
     unit = chosen_on.unit
+    base = ClassFit(name, members, chosen_on.labels, n, right, None, math.nan, None, (), unit)
     if not chosen_on.labels + held_out.labels:
-        return ClassFit(name, members, 0, n, right, None, math.nan, None, (NOT_LABELLED,), unit)
+        return replace(base, notes=(NOT_LABELLED,))
     if chosen_on.labels < MIN_LABELS:
         why = f"{_labels(chosen_on.labels, unit)}, {MIN_LABELS} needed: not fitted"
-        return ClassFit(
-            name, members, chosen_on.labels, n, right, None, math.nan, None, (why,), unit
-        )
+        return replace(base, notes=(why,))
     notes = []
     calibration = _calibration(chosen_on, kind)
     if calibration is None and kind != "none":
@@ -182,23 +181,11 @@ def fit_class(
         notes.append(_why_none(chosen_on, precision, confidence))
         scores = None if calibration is None else ClassScores(calibration=calibration)
         held = None if scores is None else _held_out(held_out, scores, confidence)
-        return ClassFit(
-            name, members, chosen_on.labels, n, right, scores, math.nan, held, tuple(notes), unit
-        )
+        return replace(base, scores=scores, held_out=held, notes=tuple(notes))
     low, high = _applied(calibration, np.array([found.score, found.next_score])).tolist()
     scores = ClassScores(threshold=round_between(low, high), calibration=calibration)
-    return ClassFit(
-        name,
-        members,
-        chosen_on.labels,
-        n,
-        right,
-        scores,
-        found.bound,
-        _held_out(held_out, scores, confidence),
-        tuple(notes),
-        unit,
-    )
+    held = _held_out(held_out, scores, confidence)
+    return replace(base, scores=scores, bound=found.bound, held_out=held, notes=tuple(notes))
 
 
 def _calibration(judged: ClassDetections, kind: CalibrationKind) -> Platt | Isotonic | None:
@@ -255,19 +242,6 @@ class Threshold:
     right: int
     of: int
     bound: float
-
-
-def lower_bound(right: int, of: int, confidence: float) -> float:
-    """Return Clopper and Pearson's one-sided lower bound of a fraction.
-
-    Args:
-        right: Number of successes.
-        of: Number of trials.
-        confidence: Confidence in (0, 1).
-    """
-    from scipy.stats import beta
-
-    return 0.0 if right == 0 else float(beta.ppf(1.0 - confidence, right, of - right + 1))
 
 
 def fewest_detections(precision: float, confidence: float) -> int:

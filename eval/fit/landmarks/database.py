@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -13,19 +11,20 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from crosscue.datasets.truth.csv_rows import csv_rows
 from crosscue.datasets.truth.tum import heading_rad
 from crosscue.detectors.images import Encoded, lose
 from crosscue.eval.logs.log import Log as Drive
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.pose.score import load_truth, track_mounting
 from crosscue.localization.angles import interpolate_angle
+from crosscue.localization.ellipse import position_cov
 from crosscue.localization.landmarks.database import LandmarkPosition, LandmarkWriter
 from crosscue.localization.landmarks.features import Matcher
 from crosscue.localization.landmarks.images import copy_picture, grey_of, read_encoded
 from crosscue.replay.base import Log, Selection
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import AnnotationError, LogError, MissingTopicError, UsageError
-from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import chosen_camera
@@ -34,7 +33,6 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 # Min number of points of a landmark; pictures of a blank wall or at night have fewer.
 MIN_POINTS: Final = 20
 MAX_GAP_NS: Final = 500_000_000
-MAX_COORDINATE_BYTES: Final = 256 << 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,8 +112,12 @@ def _run_poses(path: Path) -> CameraPoses:
     table = run.table("pose", names)
     x, y, heading, xx, xy, yy = (table[name].to_numpy() for name in names[1:])
     offset = _turned((vehicle.camera.x_m, vehicle.camera.y_m), heading)
-    cov = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
-    return CameraPoses(table["t_ns"].to_numpy(), np.column_stack([x, y]) + offset, heading, cov)
+    return CameraPoses(
+        table["t_ns"].to_numpy(),
+        np.column_stack([x, y]) + offset,
+        heading,
+        position_cov(xx, xy, yy),
+    )
 
 
 def _turned(lever_m: tuple[float, float], heading: Floats) -> Floats:
@@ -267,7 +269,6 @@ def add_from_images(
     return counts
 
 
-_PLACE_COLUMNS: Final = {"image", "x_m", "y_m"}
 _COV_COLUMNS: Final = ("var_x_m2", "cov_xy_m2", "var_y_m2")
 
 
@@ -277,23 +278,9 @@ def read_coordinates(path: Path, source: str) -> Iterator[tuple[str, LandmarkPos
     Raises:
         AnnotationError: The table is invalid; the message names the line.
     """
-    try:
-        content = read_whole(path, MAX_COORDINATE_BYTES)
-        with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file)
-            known = set(rows.fieldnames or ())
-            missing = _PLACE_COLUMNS - known
-            if missing or not ("sd_m" in known or known.issuperset(_COV_COLUMNS)):
-                raise AnnotationError(
-                    f"{path}:1: expected columns image,x_m,y_m,sd_m (or "
-                    f"{','.join(_COV_COLUMNS)} for sd_m), "
-                    f"got {','.join(rows.fieldnames or ())}; correct the header"
-                )
-            for row in rows:
-                yield str(row["image"]), _place_of(row, f"{path}:{rows.line_num}", source)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        why = error.strerror if isinstance(error, OSError) else str(error)
-        raise AnnotationError(f"{path}: {why}; give a CSV file in UTF-8") from None
+    with_cov = f"image,x_m,y_m,{','.join(_COV_COLUMNS)}"
+    for where, row in csv_rows(path, "image,x_m,y_m,sd_m", with_cov):
+        yield str(row["image"]), _place_of(row, where, source)
 
 
 def _place_of(row: dict[str, str], where: str, source: str) -> LandmarkPosition:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterator
 from dataclasses import KW_ONLY, dataclass, field
@@ -13,6 +11,7 @@ from typing import Annotated, ClassVar, Final
 
 import numpy as np
 
+from crosscue.datasets.truth.csv_rows import csv_rows
 from crosscue.eval.fit.landmarks.database import (
     PosedPictures,
     drop_picture,
@@ -21,24 +20,20 @@ from crosscue.eval.fit.landmarks.database import (
     place_at,
     read_poses,
 )
+from crosscue.eval.fit.landmarks.threshold import LandmarkFit, Rate, ScoredPairs, fit_threshold
 from crosscue.eval.fit.vehicle_output import check_output, with_section, write_fit
 from crosscue.eval.logs.log import DriveIfGiven, opened
 from crosscue.eval.pipeline.landmarks import matcher_for, open_for
 from crosscue.localization.angles import wrap
 from crosscue.localization.landmarks.database import LandmarkDatabase, Nearby
 from crosscue.localization.landmarks.features import Keypoints, Matcher
-from crosscue.localization.landmarks.fit import LandmarkFit, Rate, ScoredPairs
-from crosscue.localization.landmarks.fit import fit_landmarks as fit_threshold
 from crosscue.localization.landmarks.images import grey_of, read_encoded
 from crosscue.replay.errors import AnnotationError, LogError, SchemaError, UsageError
-from crosscue.replay.files.bounded import read_whole
-from crosscue.replay.limits import MIB
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
 
 MAX_PAIRS: Final = 1_000_000
-MAX_PAIR_BYTES: Final = 256 * MIB
 # Near pictures whose directions differ by more than this are not used as a pair.
 SAME_TURN_RAD: Final = math.pi / 4
 _LABELS: Final = {"1": True, "0": False, "true": True, "false": False}
@@ -220,25 +215,14 @@ def landmark_pairs(path: Path, matcher: Matcher) -> ScoredPairs:
 
 
 def _labelled(path: Path) -> Iterator[tuple[str, str, bool]]:
-    try:
-        content = read_whole(path, MAX_PAIR_BYTES)
-        with io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="") as file:
-            table = csv.DictReader(file)
-            if not {"query", "known", "same"} <= set(table.fieldnames or ()):
-                raise AnnotationError(
-                    f"{path}:1: expected columns query,known,same; correct the header"
-                )
-            for row in table:
-                label = _LABELS.get(str(row["same"]).strip().lower())
-                if label is None or table.line_num > MAX_PAIRS:
-                    raise AnnotationError(
-                        f"{path}:{table.line_num}: same: expected 1 or 0 (and at most "
-                        f"{MAX_PAIRS:,} lines), got {row['same']!r}; correct it"
-                    )
-                yield str(row["query"]), str(row["known"]), label
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        why = error.strerror if isinstance(error, OSError) else str(error)
-        raise AnnotationError(f"{path}: {why}; give a CSV file in UTF-8") from None
+    for number, (where, row) in enumerate(csv_rows(path, "query,known,same"), 2):
+        label = _LABELS.get(str(row["same"]).strip().lower())
+        if label is None or number > MAX_PAIRS:
+            raise AnnotationError(
+                f"{where}: same: expected 1 or 0 (and at most "
+                f"{MAX_PAIRS:,} lines), got {row['same']!r}; correct it"
+            )
+        yield str(row["query"]), str(row["known"]), label
 
 
 def pairs_of_drive(

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from crosscue.datasets.truth.csv_rows import csv_rows
 from crosscue.datasets.truth.truth import FILE, read_truth
 from crosscue.detectors.ranging.height_to_range import (
     FAMILIES,
@@ -106,28 +106,17 @@ def _pairs_text(fit: RangeFit) -> str:
 def _bins(bins: tuple[Bin, ...]) -> list[str]:
     return [
         f"  {b.from_m:5.0f} to {b.to_m:5.0f} m  {b.pairs:6} pairs  mean {b.mean_m:+6.2f} m  "
-        f"r.m.s. {b.sd_m:5.2f} m"
+        f"r.m.s. {b.rms_m:5.2f} m"
         for b in bins
     ]
 
 
 def _as_json(fit: RangeFit) -> dict[str, object]:
     return {
-        "family": fit.curve.family,
-        "parameters": list(fit.curve.parameters),
-        "residual_sd_m": fit.curve.residual_sd_m,
+        **fit.curve.model_dump(),
         "pairs": fit.pairs,
         "outliers": fit.outliers,
-        "bins": [
-            {
-                "from_m": b.from_m,
-                "to_m": b.to_m,
-                "pairs": b.pairs,
-                "mean_m": b.mean_m,
-                "rms_m": b.sd_m,
-            }
-            for b in fit.bins
-        ],
+        "bins": [asdict(one) for one in fit.bins],
     }
 
 
@@ -258,10 +247,6 @@ def range_pairs(path: Path) -> RangePairs:
             f"{path}: {error.strerror or error}; give a table (CSV or Parquet) with height_px and "
             "range_m"
         ) from None
-    except UnicodeDecodeError:
-        raise AnnotationError(
-            f"{path}: is not text; give a table (CSV or .parquet) with height_px and range_m"
-        ) from None
     except (KeyError, ValueError):
         raise AnnotationError(
             f"{path}: expected the columns height_px and range_m, all numbers"
@@ -341,7 +326,7 @@ def _true_ranges(truth: Path, cue: str) -> tuple[Int64s, Floats]:
     path = _folder(truth) / name
     try:
         t_ns, range_m = _csv(path, ("t_ns", REFERENCES[cue]))
-    except (OSError, UnicodeDecodeError, KeyError, ValueError) as error:
+    except ValueError as error:
         raise AnnotationError(f"{path}: no table of true ranges ({error}); repair it") from None
     order = np.argsort(t_ns, kind="stable")
     return t_ns[order].astype(np.int64), range_m[order]
@@ -363,11 +348,7 @@ def _folder(truth: Path) -> Path:
 
 
 def _csv(path: Path, names: tuple[str, ...]) -> tuple[Floats, ...]:
-    content = read_whole(path, MAX_BYTES)
-    reader = csv.DictReader(content.decode("utf-8").splitlines())
-    if set(names) - set(reader.fieldnames or ()):
-        raise KeyError(names)
-    rows = list(reader)
+    rows = [row for _, row in csv_rows(path, ",".join(names))]
     # As float64, nanoseconds since 1970 are exact to 256 ns, enough to identify a picture.
     return tuple(np.array([float(row[name] or "nan") for row in rows]) for name in names)
 
@@ -413,7 +394,7 @@ def draw_range_fits(
     for of, label, colour in ((best, "fitted to", COLOURS[0]), (tested, "others", COLOURS[1])):
         if of is not None:
             middle = [(b.from_m + b.to_m) / 2 for b in of.bins]
-            right.plot(middle, [b.sd_m for b in of.bins], "o-", color=colour, label=label)
+            right.plot(middle, [b.rms_m for b in of.bins], "o-", color=colour, label=label)
     right.set(xlabel="range [m]", ylabel="r.m.s. residual [m]", title=best.curve.family)
     right.set_ylim(bottom=0.0)
     right.legend(fontsize=8)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from crosscue.datasets.truth.coco import OBJECTS_FILE
+from crosscue.datasets.truth.annotations import Picture, check_boxes
+from crosscue.datasets.truth.coco import OBJECTS_FILE, read_coco
+from crosscue.datasets.truth.csv_rows import csv_rows
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.images import Encoded, decode, encoded, lose, read_file
 from crosscue.detectors.training.operating_point import Verdicts, concatenate_verdicts, match_boxes
@@ -27,22 +28,18 @@ from crosscue.replay.errors import (
     MissingTopicError,
     UsageError,
 )
-from crosscue.replay.files.bounded import read_whole
-from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.ledger import Ledger, warn_of
-from crosscue.replay.limits import DEFAULT_LIMITS, MIB, Limits
+from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.logs.opening import open_log, unless_damaged
 from crosscue.replay.signals.extractor import pictures_of
 from crosscue.replay.signals.plan import chosen_camera
 from crosscue.replay.vehicle.vehicle import Vehicle, load
 
 COLUMNS: Final = ("picture", "label", "x0", "y0", "x1", "y1")
-MAX_BYTES: Final = 64 * MIB
 _WANTED: Final = "give a CSV or COCO file of boxes, or a drive's folder"
 
 # Boxes (x0, y0, x1, y1) in pixels by label.
 Boxes = dict[str, list[tuple[float, float, float, float]]]
-MAX_OBJECTS_BYTES: Final = 512 * MIB
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,71 +65,33 @@ def read_sign_labels(path: Path) -> list[SignPicture]:
     Raises:
         AnnotationError: The file does not exist or is invalid; the message names the line.
     """
-    text = read_text(path)
-    return _of_coco(text, path) if path.suffix == ".json" else _of_csv(text, path)
-
-
-def read_text(path: Path, max_bytes: int = MAX_BYTES) -> str:
-    """Read a file of labels.
-
-    Raises:
-        AnnotationError: It cannot be read, is larger than ``max_bytes``, or is not text.
-    """
-    try:
-        return read_whole(path, max_bytes).decode("utf-8")
-    except OSError as error:
-        raise AnnotationError(f"{path}: {error.strerror}; {_WANTED}") from None
-    except UnicodeDecodeError:
-        raise AnnotationError(f"{path}: is not text; {_WANTED}") from None
-
-
-def _of_coco(text: str, path: Path) -> list[SignPicture]:
-    """Read a COCO file whose pictures are next to it or in a folder ``images`` next to it."""
+    if path.suffix != ".json":
+        return _of_csv(path)
     found = []
-    for image, boxes in coco_boxes(text, path):
-        try:
-            place = path.parent / image["file_name"]
-            place = place if place.exists() else path.parent / "images" / image["file_name"]
-        except (KeyError, TypeError) as error:
-            raise AnnotationError(f"{path}: no COCO file ({error!r}); correct it") from None
+    for picture, boxes in _coco_boxes(path):
+        # Pictures are next to the file, or in a folder ``images`` next to it.
+        place = path.parent / picture.name
+        place = place if place.exists() else path.parent / "images" / picture.name
         found.append(SignPicture(str(place), place, boxes))
     return found
 
 
-def coco_boxes(text: str, path: Path) -> list[tuple[dict[str, Any], Boxes]]:
-    """Return the images of a COCO file with their boxes, by id.
-
-    Raises:
-        AnnotationError: The file is not COCO, has no image, or has an invalid box.
-    """
-    try:
-        tree = json_tree(text)
-        names = {one["id"]: str(one["name"]) for one in tree["categories"]}
-        found: dict[int, tuple[dict[str, Any], Boxes]] = {
-            image["id"]: (image, {}) for image in tree["images"]
-        }
-        for one in tree["annotations"]:
-            x, y, wide, high = (float(number) for number in one["bbox"])
-            box = (x, y, x + wide, y + high)
-            if not all(map(math.isfinite, box)) or wide <= 0.0 or high <= 0.0:
-                raise AnnotationError(
-                    f"{path}: annotation {one['id']}: box {box}: expected positive width and height"
-                )
-            found[one["image_id"]][1].setdefault(names[one["category_id"]], []).append(box)
-    except (ValueError, KeyError, TypeError) as error:
-        raise AnnotationError(f"{path}: no COCO file ({error!r}); correct it") from None
-    if not found:
+def _coco_boxes(path: Path) -> Iterator[tuple[Picture, Boxes]]:
+    """Yield the pictures of a COCO file with their boxes."""
+    read = read_coco(path)
+    check_boxes(read)
+    if not read.pictures:
         raise EmptyResultError(f"{path}: no picture in it; add some")
-    return [found[number] for number in sorted(found)]
+    for picture in read.pictures:
+        boxes: Boxes = {}
+        for thing, box_px in picture.boxes():
+            boxes.setdefault(thing.label, []).append(box_px)
+        yield picture, boxes
 
 
-def _of_csv(text: str, path: Path) -> list[SignPicture]:
-    reader = csv.DictReader(text.splitlines())
-    if reader.fieldnames is None or set(COLUMNS) - set(reader.fieldnames):
-        raise AnnotationError(f"{path}:1: expected the columns {','.join(COLUMNS)}")
+def _of_csv(path: Path) -> list[SignPicture]:
     found: dict[str, SignPicture] = {}
-    for row in reader:
-        where = f"{path}:{reader.line_num}"
+    for where, row in csv_rows(path, ",".join(COLUMNS), remedy=_WANTED):
         name = row["picture"] or ""
         place = path.parent / name
         one = found.setdefault(name, SignPicture(str(place), place, {}))
@@ -169,10 +128,10 @@ def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[Si
 
 def _boxes(path: Path) -> dict[int, Boxes]:
     found: dict[int, Boxes] = {}
-    for image, boxes in coco_boxes(read_text(path, MAX_OBJECTS_BYTES), path):
-        if not isinstance(image.get("t_ns"), int):
+    for picture, boxes in _coco_boxes(path):
+        if picture.t_ns is None:
             raise AnnotationError(f"{path}: images without t_ns; crosscue truth import adds them")
-        found[image["t_ns"]] = boxes
+        found[picture.t_ns] = boxes
     return found
 
 

@@ -19,7 +19,7 @@ from crosscue.detectors.training.operating_point import (
     threshold_at_precision,
 )
 from crosscue.eval.fit.signs.labels import ScoringRules, judged_pictures
-from crosscue.eval.scoring.intervals import TOO_FEW, Proportion, fraction
+from crosscue.eval.scoring.intervals import Proportion, between, fraction
 from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.progress import Progress, emit
@@ -221,9 +221,8 @@ def _fraction(counts: Sequence[tuple[int, int]]) -> Proportion:
 def _proportion_text(name: str, part: Proportion) -> str:
     if not part.of:
         return f"{name:9} none (0 of 0)"
-    interval = f"95 % interval {part.low:.2f} to {part.high:.2f}"
-    by_drive = f"{part.clusters_low:.2f} to {part.clusters_high:.2f}"
-    interval += f", by drive {TOO_FEW if math.isnan(part.clusters_low) else by_drive}"
+    interval = f"95 % interval {between(part.low, part.high)}"
+    interval += f", by drive {between(part.clusters_low, part.clusters_high)}"
     return f"{name:9} {part.value:.2f} ({part.right} of {part.of}; {interval})"
 
 

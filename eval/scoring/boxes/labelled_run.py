@@ -97,8 +97,8 @@ class LabelledRun:
     def part(self, is_chosen: np.typing.NDArray[np.bool_]) -> tuple[LabelledBoxes, LabelledBoxes]:
         """Return labels and detections of the chosen pictures, shape (P,), renumbered."""
         return (
-            self.truth.taken(is_chosen[self.truth.picture]),
-            self.found.taken(is_chosen[self.found.picture]),
+            self.truth.take(is_chosen[self.truth.picture]),
+            self.found.take(is_chosen[self.found.picture]),
         )
 
 
@@ -342,7 +342,7 @@ def _as_boxes(
         np.array(is_ignored, np.bool_),
         np.array(range_m, np.float64),
     )
-    return found.taken(found.label >= NOBODY)
+    return found.take(found.label >= NOBODY)
 
 
 def _found(

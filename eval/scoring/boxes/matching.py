@@ -15,11 +15,10 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Floats: TypeAlias = NDArray[np.float64]
-Int64s: TypeAlias = NDArray[np.int64]
-
+from crosscue.replay.columns import ColumnSet, Floats, Int64s
 
 Bools: TypeAlias = NDArray[np.bool_]
+
 # COCO's overlap thresholds; average precision is the mean over them.
 OVERLAPS: Final = np.linspace(0.5, 0.95, 10)
 # Max detections of one class in one picture, as in COCO; those of lower scores are left out.
@@ -28,7 +27,7 @@ NOBODY: Final = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LabelledBoxes:
+class LabelledBoxes(ColumnSet):
     """N boxes in labelled pictures, as columns.
 
     Attributes:
@@ -56,24 +55,10 @@ class LabelledBoxes:
             if getattr(self, name).shape != (n,):
                 raise ValueError(f"{name}: expected ({n},), got {getattr(self, name).shape}")
 
-    def __len__(self) -> int:
-        return len(self.picture)
-
     @property
     def areas_px2(self) -> Floats:
         """Areas, shape (N,)."""
         return np.asarray(np.prod(self.boxes_px[:, 2:] - self.boxes_px[:, :2], axis=1))
-
-    def taken(self, rows: Bools | Int64s) -> LabelledBoxes:
-        """Return the boxes of some rows."""
-        return LabelledBoxes(
-            self.picture[rows],
-            self.label[rows],
-            self.boxes_px[rows],
-            self.scores[rows],
-            self.is_ignored[rows],
-            self.range_m[rows],
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,6 +18,7 @@ from crosscue.eval.runs.tables.measurements import NUMBERS, TABLE, TURNS
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.constants import NO_CONSTANTS, effects
 from crosscue.localization.ekf import PoseBelief
+from crosscue.localization.ellipse import position_cov
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
 from crosscue.localization.pose_track import Headings
@@ -271,5 +272,4 @@ def read_measured(run: RunFolder) -> RunMeasurements:
 
 
 def _matrices(columns: Mapping[str, Floats]) -> Floats:
-    xx, xy, yy = (columns[name] for name in ("xx_m2", "xy_m2", "yy_m2"))
-    return np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
+    return position_cov(*(columns[name] for name in ("xx_m2", "xy_m2", "yy_m2")))

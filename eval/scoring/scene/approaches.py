@@ -216,12 +216,7 @@ def judge_approaches(
     finite = np.ones(len(belief.t_ns), np.bool_)
     for values in belief.features.values():
         finite &= np.isfinite(values)
-    kept = BeliefRows(
-        belief.t_ns[finite],
-        belief.approach[finite],
-        {name: values[finite] for name, values in belief.features.items()},
-        belief.established[finite],
-    )
+    kept = belief.take(finite)
     spans = run_spans(kept)
     pairs = associate(truth.truth.approaches, spans)
     criteria = _Criteria(threshold, RULES[definition], not_looked_for)
@@ -276,11 +271,7 @@ def _steps_of(belief: BeliefRows, number: int | None, approach: Approach) -> Bel
     mine = belief.approach == number if number is not None else np.zeros(len(belief.t_ns), bool)
     mine = mine & (belief.t_ns >= approach.start_ns) & (belief.t_ns < approach.enter_ns)
     order = np.flatnonzero(mine)
-    order = order[np.argsort(belief.t_ns[order], kind="stable")]
-    features = {name: values[order] for name, values in belief.features.items()}
-    return BeliefRows(
-        belief.t_ns[order], belief.approach[order], features, belief.established[order]
-    )
+    return belief.take(order[np.argsort(belief.t_ns[order], kind="stable")])
 
 
 class _Criteria(NamedTuple):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from crosscue.eval.report.html import write_page
 from crosscue.eval.report.scene_figures import PUBLISHED_DETECTED_M, PUBLISHED_FULL_M
 from crosscue.eval.scoring.drives import PooledScores
 from crosscue.eval.scoring.files import write_scores
-from crosscue.eval.scoring.intervals import TOO_FEW, Mean, Proportion, mean, wilson
+from crosscue.eval.scoring.intervals import Mean, Proportion, between, mean, wilson
 from crosscue.eval.scoring.runs import RunScored, metrics_of
 from crosscue.eval.scoring.scene.approaches import ApproachResult, ApproachScore, places_of_results
 from crosscue.eval.scoring.scene.belief import BeliefDifference
@@ -78,7 +79,7 @@ def write_study(
         out / PAGE,
         TEMPLATE,
         content,
-        {"number": _number, "signed": _signed, "between": _between},
+        {"number": _number, "signed": _signed, "between": _difference},
     )
     write_sheet(scored.scored, out / SHEET)
     return _text_tables(tables, approaches)
@@ -203,14 +204,11 @@ def _cue_cells(row: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
-def _between(mean: Mapping[str, Any], digits: int = 1) -> str:
+def _difference(mean: Mapping[str, Any], digits: int = 1) -> str:
     """Return a difference with its interval as text, from the result of ``asdict``."""
     value, low, high = mean["value"], mean["low"], mean["high"]
-    if math.isnan(value):
-        return "-"
-    if math.isnan(low):
-        return f"{value:+.{digits}f} ({TOO_FEW})"
-    return f"{value:+.{digits}f} ({low:+.{digits}f} to {high:+.{digits}f})"
+    sign = f"+.{digits}f"
+    return "-" if math.isnan(value) else f"{value:{sign}} ({between(low, high, sign)})"
 
 
 def _of(some: Proportion) -> str:
@@ -308,10 +306,6 @@ def intersection_rows(results: Sequence[ApproachResult]) -> list[Row]:
         mine = [one for one in results if one.intersection == name]
         found = [one.detected_m for one in mine if one.detected_m is not None]
         full = [one.full_m for one in mine if one.full_m is not None]
-        reasons: dict[str, int] = {}
-        for one in mine:
-            if one.why_not_full:
-                reasons[one.why_not_full] = reasons.get(one.why_not_full, 0) + 1
         rows.append(
             {
                 "intersection": name,
@@ -322,7 +316,7 @@ def intersection_rows(results: Sequence[ApproachResult]) -> list[Row]:
                 "full_m": _mean(full),
                 "nearest_full_m": min(full, default=math.nan),
                 "false_features": sum(bool(one.false_features) for one in mine),
-                "why_not_full": reasons,
+                "why_not_full": dict(Counter(one.why_not_full for one in mine if one.why_not_full)),
             }
         )
     return rows
@@ -385,9 +379,7 @@ def mean_text(mean: Mean) -> str:
     """Return a mean with its interval as text."""
     if math.isnan(mean.value):
         return "none"
-    if math.isnan(mean.low):
-        return f"{mean.value:.1f} m ({TOO_FEW})"
-    return f"{mean.value:.1f} m ({mean.low:.1f} to {mean.high:.1f})"
+    return f"{mean.value:.1f} m ({between(mean.low, mean.high, '.1f')})"
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,9 +24,9 @@ from crosscue.eval.fit.annotated_runs import (
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.scene.variants import scene_tables
 from crosscue.eval.runs.folder import RunFolder, open_run
-from crosscue.eval.scoring.intervals import TOO_FEW, Mean
+from crosscue.eval.scoring.intervals import Mean, between
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, read_scored_truth
-from crosscue.eval.studies.pictures import save_png
+from crosscue.eval.studies.pictures import bare_figure, save_png
 from crosscue.eval.studies.simulated_drives import SPARSE_AND_EMBEDDED, run_drives
 from crosscue.eval.studies.study import PageTable, StudyResult, Written, without_nan
 from crosscue.fusion.fit.annotated_approach import AnnotatedApproach
@@ -268,10 +268,8 @@ def text(value: Mean, digits: int = 3, *, signed: bool = False) -> str:
     """Return a mean with its interval as text."""
     if math.isnan(value.value):
         return "-"
-    shown = f"{{:{'+' if signed else ''}.{digits}f}}".format
-    if math.isnan(value.low):
-        return f"{shown(value.value)} ({TOO_FEW})"
-    return f"{shown(value.value)} ({shown(value.low)} to {shown(value.high)})"
+    shown = f"{'+' if signed else ''}.{digits}f"
+    return f"{value.value:{shown}} ({between(value.low, value.high, shown)})"
 
 
 def draw_trade_off(kinds: Mapping[str, LayoutScore], path: Path) -> None:
@@ -280,10 +278,7 @@ def draw_trade_off(kinds: Mapping[str, LayoutScore], path: Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
-    axes = figure.subplots()
+    made, axes = bare_figure((6.4, 4.0))
     for number, (kind, score) in enumerate(kinds.items()):
         full = [one.full for one in score.trade]
         axes.errorbar(
@@ -304,7 +299,7 @@ def draw_trade_off(kinds: Mapping[str, LayoutScore], path: Path) -> None:
     axes.set_ylim(-0.02, 1.02)
     axes.tick_params(labelsize=7)
     axes.legend(fontsize=7)
-    save_png(figure, path)
+    save_png(made, path)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

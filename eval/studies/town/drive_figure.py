@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.eval.studies.pictures import figure, save_figure
+from crosscue.localization.ellipse import ellipses, position_cov
 from crosscue.localization.town.drive import (
     GOAL_SET,
     LANDMARK_MISSED,
@@ -49,9 +49,10 @@ def draw_drive(settings: TownDrive, traced: Traced, seed: int, folder: Path) -> 
     x, y = traced.steps[:, 0], traced.steps[:, 1]
     axes.plot(x, y, color=TRUTH, lw=3.0, alpha=0.6, label="truth")
     axes.plot(traced.steps[:, 7], traced.steps[:, 8], color=ESTIMATE, lw=1.2, label="estimate")
-    for i, row in enumerate(np.unique(np.linspace(0, len(x) - 1, ELLIPSES).astype(int))):
-        ring = _ellipse(traced.steps[row])
-        axes.plot(*ring, color=ELLIPSE, lw=1.0, label="2-sigma ellipse" if i == 0 else None)
+    rows = traced.steps[np.unique(np.linspace(0, len(x) - 1, ELLIPSES).astype(int))]
+    cov_m2 = position_cov(rows[:, 10], rows[:, 11], rows[:, 13])
+    for i, ring in enumerate(ellipses(rows[:, 7:9], cov_m2, 61)):
+        axes.plot(*ring.T, color=ELLIPSE, lw=1.0, label="2-sigma ellipse" if i == 0 else None)
     _places(axes, traced, GOAL_SET, "*", "#d62728", 13, "goal")
     _places(axes, traced, LANDMARK_SET, "s", "0.45", 4, "landmark")
     _places(axes, traced, LANDMARK_TAKEN, "s", "k", 7, "landmark used")
@@ -111,11 +112,3 @@ def _draw_streets(axes: Axes, streets: Streets) -> None:
     axes.add_collection(
         LineCollection(single, colors="0.78", linewidths=1.0, linestyles=":", zorder=0)
     )
-
-
-def _ellipse(row: NDArray[np.float64]) -> NDArray[np.float64]:
-    angle = np.linspace(0.0, 2.0 * np.pi, 61)
-    values, vectors = np.linalg.eigh(np.array([[row[10], row[11]], [row[11], row[13]]]))
-    axes = vectors * (2.0 * np.sqrt(np.maximum(values, 0.0)))
-    ring: NDArray[np.float64] = axes @ np.stack([np.cos(angle), np.sin(angle)]) + row[7:9, None]
-    return ring

@@ -17,21 +17,21 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, ClassVar, Final, Literal, NamedTuple, Self, TypeVar
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from crosscue.localization.town.settings import City, Proportion, TownDrive
 from crosscue.replay.errors import StudyFileError, UsageError
-from crosscue.replay.files.bounded import read_whole
+from crosscue.replay.files.bounded import read_text
 from crosscue.replay.files.tree_text import toml_tree
-from crosscue.replay.vehicle.section import Section, tuples
-from crosscue.replay.vehicle.validation_errors import explain
+from crosscue.replay.limits import MIB
+from crosscue.replay.vehicle.section import Section
+from crosscue.replay.vehicle.validation_errors import parse_model
 from crosscue.verb import Option
 
 VERSION: Final = 1
 UNTIL_LOST: Final = 1_000_000
 VARIED: Final = "set by the study; remove it from the file"
-LARGEST_FILE: Final = 1 << 20
 
 StrategyName = Literal["straight to goal", "landmark to landmark", "hybrid"]
 Degrees = Annotated[float, Field(gt=0.0, le=180.0)]
@@ -220,13 +220,9 @@ def load_study(path: Path, kind: type[Study]) -> Study:
         StudyFileError: The file is missing, not TOML or of another kind, or a key or value is not
             valid; the message names the line.
     """
+    text = read_text(path, MIB, StudyFileError, "expected a study file")
     try:
-        text = read_whole(path, LARGEST_FILE).decode("utf-8")
         tree = toml_tree(text)
-    except OSError as error:
-        raise StudyFileError(f"{path}: {error.strerror}; check the path") from None
-    except UnicodeDecodeError:
-        raise StudyFileError(f"{path}: not UTF-8 text; expected a study file") from None
     except ValueError as error:
         raise StudyFileError(f"{path}: not TOML: {error}; correct that line") from None
     wanted = kind.model_fields["kind"].default
@@ -234,10 +230,7 @@ def load_study(path: Path, kind: type[Study]) -> Study:
         raise StudyFileError(f'{path}: kind: expected "{wanted}" here, got {tree.get("kind")!r}')
     if "version" not in tree:
         raise StudyFileError(f"{path}:1: version: missing; add version = {VERSION}")
-    try:
-        return TypeAdapter(kind).validate_python(tuples(tree))
-    except ValidationError as error:
-        raise StudyFileError(explain(error, text, str(path), kind)) from None
+    return parse_model(text, str(path), kind, StudyFileError)
 
 
 def study_of(kind: type[Study], settings: Path | None, **given: object) -> Study:

@@ -12,7 +12,7 @@ import pytest
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
-from crosscue.detectors.cues.tracked.motion import CarMotion, Observation, motion_of
+from crosscue.detectors.cues.tracked.motion import CarMotion, Observation, motions_of
 from crosscue.detectors.cues.tracked.tracks import CarTracks, are_hidden, past_within_m
 from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.detectors.ranging.object_tracks import CarStep
@@ -85,7 +85,7 @@ def test_car_seen_twice_has_place_box_and_step() -> None:
     assert (made.number, made.frames, made.box_px) == (1, 2, wider)
     assert made.distance_m == 20.0
     assert made.bearing == pytest.approx((-50.0 + 84.0) / 1600.0)
-    expected = motion_of([observation(1, CAR), observation(2, wider)])
+    (expected,) = motions_of([[observation(1, CAR), observation(2, wider)]])
     assert same_motion(made, expected._replace(number=1, box_px=wider, step_px=(-5.0, 4.0)))
 
 
@@ -104,7 +104,7 @@ def test_car_is_placed_with_the_cameras_pose() -> None:
 
     (made,) = followed(found(CAR), found(CAR), ego=ego)
 
-    expected = motion_of([observation(k + 1, CAR, pose=pose) for k, pose in enumerate(poses)])
+    (expected,) = motions_of([[observation(k + 1, CAR, pose=pose) for k, pose in enumerate(poses)]])
     assert same_motion(made, expected._replace(number=1, box_px=CAR))
 
 
@@ -393,7 +393,7 @@ def test_motion_uses_the_newest_frames_and_fewer_if_it_is_unsteady(moves: int) -
 
     def fitted(counts: Sequence[int], aside_mps: float) -> CarMotion:
         for count in counts:
-            made = motion_of(seen[-count:], aside_mps)
+            (made,) = motions_of([seen[-count:]], aside_mps)
             if made.is_steady:
                 break
         return made._replace(number=1, box_px=boxes[-1], step_px=(60.0, 0.0))
@@ -404,8 +404,8 @@ def test_motion_uses_the_newest_frames_and_fewer_if_it_is_unsteady(moves: int) -
     assert tracks.standing()[0].frames == (3 if moves == 2 else 4)
     assert same_motion(tracks.longer()[0], fitted([13, 6, 3], 0.3))
     assert same_motion(tracks.standing()[0], fitted([8, 4, 3], 10.0))
-    assert not motion_of(seen[-13:], 0.3).is_steady
-    assert not motion_of(seen[-8:], 10.0).is_steady
+    assert not motions_of([seen[-13:]], 0.3)[0].is_steady
+    assert not motions_of([seen[-8:]], 10.0)[0].is_steady
 
 
 def test_nose_and_cover_of_a_car_are_observed() -> None:
@@ -421,8 +421,8 @@ def test_nose_and_cover_of_a_car_are_observed() -> None:
     assert (behind.nose, behind.is_hidden) == (-1.0, True)
     assert (ahead.nose, ahead.is_hidden) == (0.0, False)
     error = math.hypot(1.0 / 62.0, 0.15)
-    expected = motion_of(
-        [observation(k, CAR, nose=-1, is_hidden=True, error=error) for k in (1, 2)]
+    (expected,) = motions_of(
+        [[observation(k, CAR, nose=-1, is_hidden=True, error=error) for k in (1, 2)]]
     )
     assert same_motion(behind, expected._replace(number=1, box_px=CAR))
 

@@ -18,7 +18,7 @@ from crosscue.detectors.cues.tracked.judge import (
     is_past,
     parked,
 )
-from crosscue.detectors.cues.tracked.motion import CarMotion, Observation, motion_of, place_of_end
+from crosscue.detectors.cues.tracked.motion import CarMotion, Observation, motions_of, place_of_end
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
 RULES = Cars(
@@ -247,7 +247,7 @@ def test_end_of_a_car_is_placed_relative_to_the_newest_pose(
 def fitted(
     seen: Sequence[Observation], side: int, aside_mps: float
 ) -> tuple[float, float, float, float, float]:
-    """Fit as ``motion_of`` does one end, by least squares of rows divided by their errors.
+    """Fit as ``motions_of`` does one end, by least squares of rows divided by their errors.
 
     Each observation has a row along its line of sight, with the error of the distance, and a row
     across it, with that of 1.55 m; two more rows are the prior speeds.
@@ -335,7 +335,7 @@ def test_motion_is_the_least_squares_fit_of_both_ends(
     doubt_mps = 0.15 * way_m / passed_s if frames > 1 else 10.0
     noses = [one.nose for one in seen if one.nose != 0]
 
-    made = motion_of(seen, aside_mps)
+    made = motions_of([seen], aside_mps)[0]
 
     slower = min(left[0], right[0], key=abs)
     assert made.right_mps == pytest.approx(slower if left[0] * right[0] > 0 else 0.0, rel=1e-5)
@@ -355,6 +355,6 @@ def test_motion_is_the_least_squares_fit_of_both_ends(
 
 
 def test_newest_observation_decides_whether_a_car_is_hidden() -> None:
-    assert motion_of([observed(0.0), observed(0.1, is_hidden=True)]).is_hidden
-    assert not motion_of([observed(0.0, is_hidden=True), observed(0.1)]).is_hidden
+    hidden = [observed(0.0), observed(0.1, is_hidden=True)]
+    assert [one.is_hidden for one in motions_of([hidden, hidden[::-1]])] == [True, False]
     assert car(box_px=(1.0, 2.0, 5.0, 10.0)).center_px == (3.0, 6.0)

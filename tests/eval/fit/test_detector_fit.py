@@ -17,9 +17,9 @@ from crosscue.eval.fit.detector.class_fit import (
     TRIED,
     bounded_threshold,
     fewest_detections,
-    lower_bound,
 )
 from crosscue.eval.scoring.boxes.reliability import class_calibration
+from crosscue.eval.scoring.intervals import lower_bound
 from crosscue.replay.errors import FitError, SchemaError, UsageError
 from support.onnx_models import bright_box_model, constant_model
 

@@ -15,7 +15,7 @@ from crosscue.datasets.geodesy import (
 from crosscue.datasets.truth.truth import read_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.eval.fit.first_pose import with_start, with_start_of
-from crosscue.eval.fit.gnss_truth import write_gnss_truth
+from crosscue.eval.fit.gnss_truth import gnss_truth, save_with_track
 from crosscue.eval.pipeline.whole_run import replay_drive
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
@@ -76,9 +76,13 @@ def test_estimate_keeps_the_first_pose_of_a_run_unless_the_vehicle_file_has_one(
     assert with_start_of(own, bare) == bare
 
 
+def truth_file(folder: Path, vehicle: Vehicle = Vehicle(version=1)) -> Path:  # noqa: B008
+    return save_with_track(*gnss_truth([straight_drive()], vehicle, EVERYTHING), folder)
+
+
 def test_gnss_truth_records_accuracy_antenna_and_origin(tmp_path: Path) -> None:
     vehicle = Vehicle(version=1, gnss=Gnss(x_m=1.2, y_m=-0.3))
-    path = write_gnss_truth([straight_drive()], vehicle, EVERYTHING, tmp_path)
+    path = truth_file(tmp_path, vehicle)
     truth = read_truth(path)
     track = read_tum(tmp_path / str(truth.pose))
 
@@ -92,7 +96,7 @@ def test_gnss_truth_records_accuracy_antenna_and_origin(tmp_path: Path) -> None:
 
 
 def test_truth_file_determines_first_pose_in_its_map(tmp_path: Path) -> None:
-    path = write_gnss_truth([straight_drive()], Vehicle(version=1), EVERYTHING, tmp_path)
+    path = truth_file(tmp_path)
     start = with_start([straight_drive()], Vehicle(version=1), EVERYTHING, start=str(path)).start
 
     assert start.heading_rad == pytest.approx(HEADING_RAD, abs=1e-4)
@@ -108,7 +112,7 @@ def test_three_numbers_specify_the_first_pose() -> None:
 
 
 def test_truth_without_observable_heading_is_refused(tmp_path: Path) -> None:
-    path = write_gnss_truth([straight_drive()], Vehicle(version=1), EVERYTHING, tmp_path)
+    path = truth_file(tmp_path)
 
     with pytest.raises(VehicleError, match="does not show the first pose"):
         with_start([straight_drive(0.0)], Vehicle(version=1), EVERYTHING, start=str(path))
@@ -140,6 +144,6 @@ def test_fused_gnss_positions_bound_the_drift_of_odometry(tmp_path: Path) -> Non
 def test_smoother_uses_gnss_positions_of_the_filter(tmp_path: Path) -> None:
     vehicle = with_start([straight_drive()], LONG_WHEELS, EVERYTHING, gnss="fuse")
     run = replayed(tmp_path / "run", vehicle)
-    truth = write_gnss_truth([straight_drive()], Vehicle(version=1), EVERYTHING, tmp_path / "truth")
+    truth = truth_file(tmp_path / "truth")
 
     assert score_smoother(run, truth, {}).smoother_rmse_m < 1.0

@@ -9,13 +9,7 @@ import pytest
 from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.eval import cli
-from crosscue.localization.landmarks.fit import (
-    Rate,
-    ScoredPairs,
-    clopper_pearson,
-    fit_landmarks,
-    wilson,
-)
+from crosscue.eval.fit.landmarks.threshold import Rate, ScoredPairs, fit_threshold
 from crosscue.replay.vehicle.vehicle import load
 from support.data import shared
 from support.landmark_files import encoded, seen_from, wall
@@ -32,7 +26,7 @@ def simulated_pairs(seed: int, false: int = 4000, same: int = 400) -> ScoredPair
 @pytest.mark.parametrize("required", [0.0, 0.002, 0.05])
 def test_threshold_is_the_lowest_that_meets_the_required_rate(required: float) -> None:
     pairs = simulated_pairs(1)
-    fitted = fit_landmarks(pairs, required)
+    fitted = fit_threshold(pairs, required)
 
     assert fitted.fitted_false.hits <= required * fitted.fitted_false.of
     assert fitted.fitted_false.hits + 1 > required * fitted.fitted_false.of - 1
@@ -41,17 +35,14 @@ def test_threshold_is_the_lowest_that_meets_the_required_rate(required: float) -
 
 
 def test_intervals_equal_published_values() -> None:
-    """Clopper-Pearson 0 of 100: 1 - 0.025^(1/100); 10 of 100 and Wilson from published tables."""
+    """Clopper and Pearson's of 10 of 100, from published tables; all is possible without pairs."""
+    pairs = ScoredPairs(np.arange(200.0), np.zeros(200, bool), np.arange(200))
+    fitted = fit_threshold(pairs, 0.1)
 
-    def ends(rate: Rate) -> tuple[float, float]:
-        return rate.low, rate.high
-
-    none_of_100 = (0.0, 1.0 - 0.025 ** (1 / 100))
-    assert ends(clopper_pearson(0, 100)) == pytest.approx(none_of_100, abs=1e-9)
-    assert ends(clopper_pearson(10, 100)) == pytest.approx((0.0490047, 0.1762226), abs=1e-6)
-    assert ends(clopper_pearson(5, 5)) == pytest.approx((0.025 ** (1 / 5), 1.0), abs=1e-9)
-    assert ends(wilson(10, 100)) == pytest.approx((0.0552291, 0.1743657), abs=1e-6)
-    assert ends(clopper_pearson(0, 0)) == ends(wilson(0, 0)) == (0.0, 1.0)
+    false = fitted.fitted_false
+    assert (false.hits, false.of) == (10, 100)
+    assert (false.low, false.high) == pytest.approx((0.0490047, 0.1762226), abs=1e-6)
+    assert fitted.fitted_found == fitted.held_out_found == Rate(0, 0, 0.0, 1.0)
 
 
 def test_threshold_fitted_to_a_table_of_pairs_is_written(

@@ -110,7 +110,7 @@ def test_gates_set_exit_status_and_write_junit_file(tmp_path: Path) -> None:
             'metric = "a"\nmin = 0.9\n[[gate]]\nmetric = "b"\nmin = 1\nwarn = true',
             "gates.toml:8: gate.1.warn: no such key; there are: max, metric, min, min_count, use",
         ),
-        ("metric = [", "not readable as TOML"),
+        ("metric = [", "not TOML"),
     ],
 )
 def test_invalid_gate_is_refused(

@@ -10,18 +10,17 @@ of found places is Wilson's (JASA 22, 1927).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-Z_95: Final = 1.959963984540054
+from crosscue.eval.scoring.intervals import lower_bound, wilson
+from crosscue.replay.columns import ColumnSet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ScoredPairs:
+class ScoredPairs(ColumnSet):
     """N pairs of pictures.
 
     Attributes:
@@ -33,21 +32,6 @@ class ScoredPairs:
     score: NDArray[np.float64]
     is_same: NDArray[np.bool_]
     query: NDArray[np.int64]
-
-    def __post_init__(self) -> None:
-        """Reject columns of unequal length.
-
-        Raises:
-            ValueError: A shape is wrong; the message has column, expected and actual shape.
-        """
-        for name in ("is_same", "query"):
-            if getattr(self, name).shape != self.score.shape:
-                raise ValueError(
-                    f"{name}: expected {self.score.shape}, got {getattr(self, name).shape}"
-                )
-
-    def __len__(self) -> int:
-        return len(self.score)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,19 +77,17 @@ class LandmarkFit:
         return self.held_out_false.high <= self.wanted_rate
 
 
-def fit_landmarks(pairs: ScoredPairs, wanted_rate: float, seed: int = 0) -> LandmarkFit:
+def fit_threshold(pairs: ScoredPairs, wanted_rate: float, seed: int = 0) -> LandmarkFit:
     """Fit the threshold on one half of the queries, and measure the rates on the other.
 
     Args:
         pairs: Labelled and scored pairs.
-        wanted_rate: Maximum fraction of two-place pairs that match.
+        wanted_rate: Maximum fraction of two-place pairs that match, 0 or more, below 1.
         seed: Seed of the split.
 
     Raises:
-        ValueError: The rate is out of range, or a half has no two-place pairs.
+        ValueError: A half has no two-place pairs.
     """
-    if not 0.0 <= wanted_rate < 1.0:
-        raise ValueError(f"wanted_rate: expected 0 to 1, got {wanted_rate}")
     queries = np.unique(pairs.query)
     chosen = np.random.default_rng(seed).permutation(queries)[: len(queries) // 2]
     is_fit = np.isin(pairs.query, chosen)
@@ -119,10 +101,10 @@ def fit_landmarks(pairs: ScoredPairs, wanted_rate: float, seed: int = 0) -> Land
     return LandmarkFit(
         min_score,
         wanted_rate,
-        _rate(pairs, min_score, is_fit & ~pairs.is_same, clopper_pearson),
-        _rate(pairs, min_score, is_fit & pairs.is_same, wilson),
-        _rate(pairs, min_score, ~is_fit & ~pairs.is_same, clopper_pearson),
-        _rate(pairs, min_score, ~is_fit & pairs.is_same, wilson),
+        _false(pairs, min_score, is_fit),
+        _found(pairs, min_score, is_fit),
+        _false(pairs, min_score, ~is_fit),
+        _found(pairs, min_score, ~is_fit),
     )
 
 
@@ -137,54 +119,15 @@ def _threshold(
     return below + (0.5 * (float(above.min()) - below) if len(above) else 1.0)
 
 
-def _rate(
-    pairs: ScoredPairs,
-    min_score: float,
-    which: NDArray[np.bool_],
-    interval: Callable[[int, int], Rate],
-) -> Rate:
-    return interval(int((which & (pairs.score >= min_score)).sum()), int(which.sum()))
+def _false(pairs: ScoredPairs, min_score: float, half: NDArray[np.bool_]) -> Rate:
+    hits, of = _counts(pairs, min_score, half & ~pairs.is_same)
+    return Rate(hits, of, lower_bound(hits, of, 0.975), 1.0 - lower_bound(of - hits, of, 0.975))
 
 
-def wilson(count: int, of: int) -> Rate:
-    """Wilson's 95 % score interval of a fraction; 0 to 1 without trials."""
-    if of == 0:
-        return Rate(0, 0, 0.0, 1.0)
-    fraction, z2 = count / of, Z_95**2
-    middle = (fraction + z2 / (2 * of)) / (1 + z2 / of)
-    half = Z_95 / (1 + z2 / of) * math.sqrt(fraction * (1 - fraction) / of + z2 / (4 * of * of))
-    low = 0.0 if count == 0 else middle - half
-    return Rate(count, of, low, 1.0 if count == of else middle + half)
+def _found(pairs: ScoredPairs, min_score: float, half: NDArray[np.bool_]) -> Rate:
+    hits, of = _counts(pairs, min_score, half & pairs.is_same)
+    return Rate(hits, of, *(wilson(hits, of) if of else (0.0, 1.0)))
 
 
-def clopper_pearson(count: int, of: int) -> Rate:
-    """Exact 95 % interval of a fraction; 0 to 1 without trials."""
-    if of == 0:
-        return Rate(0, 0, 0.0, 1.0)
-    low = 0.0 if count == 0 else _fraction_at(count - 1, of, 0.975)
-    high = 1.0 if count == of else _fraction_at(count, of, 0.025)
-    return Rate(count, of, low, high)
-
-
-def _fraction_at(count: int, of: int, probability: float) -> float:
-    """Fraction at which at most ``count`` of ``of`` trials succeed with the given probability."""
-    low, high = 0.0, 1.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if _at_most(count, of, middle) > probability:
-            low = middle
-        else:
-            high = middle
-    return 0.5 * (low + high)
-
-
-def _at_most(count: int, of: int, fraction: float) -> float:
-    """Binomial distribution function."""
-    if fraction <= 0.0 or fraction >= 1.0:
-        return 1.0 if fraction <= 0.0 else 0.0
-    k = np.arange(count + 1)
-    steps = np.log(of - k[:-1]) - np.log(k[1:])
-    log_choose = np.concatenate([[0.0], np.cumsum(steps)])
-    logs = log_choose + k * math.log(fraction) + (of - k) * math.log1p(-fraction)
-    peak = float(logs.max())
-    return min(math.exp(peak) * float(np.exp(logs - peak).sum()), 1.0)
+def _counts(pairs: ScoredPairs, min_score: float, which: NDArray[np.bool_]) -> tuple[int, int]:
+    return int((which & (pairs.score >= min_score)).sum()), int(which.sum())
