@@ -12,9 +12,9 @@ A reader yields ``Block``s. The rows of a block have one of these types:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Final, Literal, Self, TypeAlias, TypeVar
+from typing import Any, Final, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -313,3 +313,31 @@ class Block:
             header_ns=None if self.header_ns is None else self.header_ns[index],
             sequence=None if self.sequence is None else self.sequence[index],
         )
+
+
+def image_block(
+    topic: str,
+    log_ns: Int64s,
+    pictures: Sequence[bytes],
+    codings: Sequence[str],
+    header_ns: Int64s | None = None,
+) -> Block:
+    """Return a block of encoded images, copied into one buffer."""
+    stop = np.cumsum([len(picture) for picture in pictures], dtype=np.int64)
+    start = np.concatenate([np.zeros(1, dtype=np.int64), stop[:-1]])
+    rows = Messages(np.frombuffer(b"".join(pictures), np.uint8), start, stop)
+    return Block(topic, log_ns, Images(rows, tuple(codings)), header_ns=header_ns)
+
+
+def raw_block(topic: str, t_ns: int, pixels: NDArray[Any], pixel_format: str) -> Block:
+    """Return a block of one image; its bytes, shape (H, W, 3), are not copied."""
+    height, width = pixels.shape[:2]
+    images = Images(
+        Messages(pixels.ravel(), np.zeros(1, np.int64), np.array([pixels.size], np.int64)),
+        ("raw",),
+        width_px=np.array([width], np.int32),
+        height_px=np.array([height], np.int32),
+        step_bytes=np.array([3 * width], np.int32),
+        pixel_format=(pixel_format,),
+    )
+    return Block(topic, np.array([t_ns], np.int64), images)

@@ -30,7 +30,7 @@ from crosscue.datasets.simulated.drive import (
 from crosscue.datasets.simulated.log_files import SOURCE, sensor_blocks, true_track
 from crosscue.datasets.truth.truth import Approach, Features, Mounting
 from crosscue.datasets.truth.tum import write_track_truth
-from crosscue.replay.columns import Block, ImageCoding, Int64s, Messages, Topic
+from crosscue.replay.columns import Block, ImageCoding, Int64s, Messages, Topic, image_block
 from crosscue.replay.encode.outgoing import standard_type
 from crosscue.replay.encode.template import filled, template_of
 from crosscue.replay.files import door
@@ -38,7 +38,6 @@ from crosscue.replay.files.made_of import SIMULATED, made_of, refuse_another
 from crosscue.replay.files.tree_text import json_tree, strict_json
 from crosscue.replay.files.whole_file import sha256_of, write_bytes, write_text
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.readers.images.files import image_block
 from crosscue.replay.write.convert import LogWriter
 from crosscue.results import Result
 
@@ -284,8 +283,7 @@ class _Record:
         log_ns = times + 9_000_000 + np.rint(late.exponential(2e6, len(times))).astype(np.int64)
         coded = [self._imager.encode(picture, self.settings.picture) for _, picture in batch]
         codings = [self._imager.coding] * len(coded)
-        block = image_block(IMAGES, np.maximum.accumulate(log_ns).tolist(), coded, codings)
-        yield replace(block, header_ns=times)
+        yield image_block(IMAGES, np.maximum.accumulate(log_ns), coded, codings, times)
         yield _calibration(times, log_ns, self.settings.camera)
         yield device.frames(times, [picture for _, picture in batch], MOBILEYE_BUS)
 

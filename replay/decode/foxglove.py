@@ -8,7 +8,7 @@ from typing import Final
 MAX_SECONDS: Final = 9_000_000_000
 
 
-def nanoseconds(seconds: int, rest: int) -> int:
+def stamp_ns(seconds: int, rest: int) -> int:
     """Return a timestamp in nanoseconds; ``ValueError`` if it is not a time."""
     if abs(seconds) > MAX_SECONDS or not 0 <= rest < 1_000_000_000:
         raise ValueError(f"timestamp {seconds} s + {rest} ns is not a time")

@@ -18,7 +18,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS
 
 from .coding import MAGIC_BYTES
-from .foxglove import PICTURES, TABLES, PictureKind, SourceField, nanoseconds
+from .foxglove import PICTURES, TABLES, PictureKind, SourceField, stamp_ns
 from .pictures import PictureRow, images_of
 from .refuse import MISFIT, refuse
 
@@ -75,7 +75,7 @@ def _nanoseconds(value: Any) -> int | None:
     seconds, rest = value["sec"], value["nsec"]
     if type(seconds) is not int or type(rest) is not int:
         return None
-    return nanoseconds(seconds, rest)
+    return stamp_ns(seconds, rest)
 
 
 def _flat(value: Any, path: str, depth: int) -> Iterator[tuple[str, float | int]]:

@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
-from crosscue.replay.columns import Block, Images, Messages
+from crosscue.replay.columns import Block, Images, raw_block
 from crosscue.replay.errors import one_line
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.readers.can_rows import keep_memory
@@ -91,19 +89,10 @@ class PacketDecoder:
         """Yield each picture as a block, so that its pixels are not copied."""
         frames, self._waiting = self._waiting, []
         for frame in frames:
+            assert frame.pts is not None
             self._shown += 1
             converted = self._converter.reformat(frame, format="bgr24")
-            pixels = np.asarray(converted.to_ndarray(), np.uint8)
-            height, width = pixels.shape[:2]
-            images = Images(
-                Messages(pixels.ravel(), np.zeros(1, np.int64), np.array([pixels.size], np.int64)),
-                ("raw",),
-                np.array([width], np.int32),
-                np.array([height], np.int32),
-                np.array([3 * width], np.int32),
-                ("bgr8",),
-            )
-            yield Block(self._topic, np.array([frame.pts], np.int64), images)
+            yield raw_block(self._topic, frame.pts, converted.to_ndarray(), "bgr8")
 
 
 def _context(coding: str) -> Any:

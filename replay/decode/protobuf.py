@@ -27,7 +27,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS
 
 from .coding import MAGIC_BYTES
-from .foxglove import MAX_SECONDS, PICTURES, TABLES, PictureKind, SourceField, nanoseconds
+from .foxglove import MAX_SECONDS, PICTURES, TABLES, PictureKind, SourceField, stamp_ns
 from .pictures import PictureRow, images_of
 from .refuse import MISFIT, refuse
 
@@ -291,7 +291,7 @@ def _stamp(payload: memoryview, place: tuple[int, int] | None) -> int | None:
             seconds = plain - (1 << 64) if plain >= 1 << 63 else plain
         elif number == 2 and plain is not None:
             nanos = plain
-    return nanoseconds(seconds, nanos)
+    return stamp_ns(seconds, nanos)
 
 
 def _picture_decoder(name: str, descriptor: Descriptor) -> _PictureDecoder:

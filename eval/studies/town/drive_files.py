@@ -8,7 +8,7 @@ database. At an unnoticed landmark, the wall is not in the database. Truth is in
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -35,10 +35,9 @@ from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import TownDrive
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
-from crosscue.replay.columns import Block, Bytes, Floats, Int64s, Table, Topic
+from crosscue.replay.columns import Block, Bytes, Floats, Int64s, Table, Topic, image_block
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.readers.images.files import image_block
 from crosscue.replay.write.convert import LogWriter
 
 CAMERA: Final = Topic("/camera", "crosscue/Images", "columns")
@@ -242,8 +241,7 @@ def _frames_block(row: Floats, t_ns: Int64s, number: int, seed: int) -> Block:
         done, buffer = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])
         assert done
         coded.append(buffer.tobytes())
-    block = image_block(CAMERA.name, at_ns.tolist(), coded, ["jpeg"] * len(coded))
-    return replace(block, header_ns=at_ns)
+    return image_block(CAMERA.name, at_ns, coded, ["jpeg"] * len(coded), at_ns)
 
 
 def _wall(seed: int, number: int) -> Bytes:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.base import EVERYTHING, Selection
-from crosscue.replay.columns import BLOCK_BYTES, Block, Images, Messages, Topic
+from crosscue.replay.columns import BLOCK_BYTES, Block, Topic, image_block
 from crosscue.replay.decode.coding import IMAGE_SUFFIXES, MAGIC_BYTES, coding_of
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
@@ -79,49 +79,38 @@ class PictureFiles:
         wanted = selection.inside(self.files.t_ns) & (self.files.t_ns >= 0)
         outside = len(self.files.paths) - without - int(np.count_nonzero(wanted))
         selection.leave(name, outside, ledger)
-        batch = _Batch(name)
+        batch = PictureBatch(name)
         for i in np.flatnonzero(wanted):
             t_ns = int(self.files.t_ns[i])
             picture = _read_picture(self.files.paths[i], name, t_ns, ledger, limits, self.touched)
             if picture is None:
                 continue
-            if batch.size and batch.size + len(picture[0]) > BLOCK_BYTES:
-                yield batch.block()
-                batch = _Batch(name)
-            batch.add(t_ns, *picture)
-        if batch.size:
-            yield batch.block()
+            yield from batch.add(t_ns, *picture)
+        yield from batch.flush()
 
 
-class _Batch:
-    """Images collected for the next block."""
+class PictureBatch:
+    """Encoded images of one topic, collected for the next block."""
 
     def __init__(self, topic: str) -> None:
+        """Begin a batch without images."""
         self._topic = topic
-        self._t_ns: list[int] = []
-        self._pictures: list[bytes] = []
-        self._codings: list[str] = []
-        self.size = 0
+        self._rows: list[tuple[int, bytes, str]] = []
+        self._size = 0
 
-    def add(self, t_ns: int, picture: bytes, coding: str) -> None:
-        self._t_ns.append(t_ns)
-        self._pictures.append(picture)
-        self._codings.append(coding)
-        self.size += len(picture)
+    def add(self, t_ns: int, picture: bytes, coding: str) -> Iterator[Block]:
+        """Add an image; yield those before it if the block would be too large."""
+        if self._size + len(picture) > BLOCK_BYTES:
+            yield from self.flush()
+        self._rows.append((t_ns, picture, coding))
+        self._size += len(picture)
 
-    def block(self) -> Block:
-        return image_block(self._topic, self._t_ns, self._pictures, self._codings)
-
-
-def image_block(
-    topic: str, t_ns: Sequence[int], pictures: Sequence[bytes], codings: Sequence[str]
-) -> Block:
-    """Return a block of encoded images, copied into one buffer."""
-    stop = np.cumsum([len(picture) for picture in pictures], dtype=np.int64)
-    start = np.concatenate([np.zeros(1, dtype=np.int64), stop[:-1]])
-    buffer = np.frombuffer(b"".join(pictures), dtype=np.uint8)
-    rows = Images(Messages(buffer, start, stop), tuple(codings))
-    return Block(topic, np.array(t_ns, dtype=np.int64), rows)
+    def flush(self) -> Iterator[Block]:
+        """Yield the collected images."""
+        rows, self._rows, self._size = self._rows, [], 0
+        if rows:
+            t_ns, pictures, codings = zip(*rows, strict=True)
+            yield image_block(self._topic, np.array(t_ns, np.int64), pictures, codings)
 
 
 def _read_picture(

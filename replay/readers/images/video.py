@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final, cast
 import numpy as np
 
 from crosscue.replay.base import EVERYTHING, Selection
-from crosscue.replay.columns import BLOCK_BYTES, Block, Images, Int64s, Messages, Topic
+from crosscue.replay.columns import Block, Int64s, Topic, raw_block
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.closing import Closing
 from crosscue.replay.files.time_file_names import time_file_of_video
@@ -30,7 +30,7 @@ from crosscue.replay.ledger import NOT_ASKED_TIME, Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.time_file import SECOND_NS, TimeFile, read_time_file
 
-from .files import image_block
+from .files import PictureBatch
 
 if TYPE_CHECKING:
     from av import Packet, VideoFrame, VideoStream
@@ -224,9 +224,7 @@ class Video(Closing):
     def _packets(self, index: _Index, wanted: list[bool], ledger: Ledger) -> Iterator[Block]:
         """Yield blocks of packets as stored."""
         name, coding = self.topics[0].name, CODINGS[self._codec]
-        t_ns: list[int] = []
-        payloads: list[bytes] = []
-        size = 0
+        batch = PictureBatch(name)
         with self._container() as container:
             stream = _video_stream(container, self.path)
             convert = _annex_b(stream)
@@ -240,14 +238,8 @@ class Video(Closing):
                     ledger.drop(name, "packet damaged", 1, _words(error), int(index.t_ns[i]))
                     continue
                 ledger.find(name, 1)
-                if payloads and size + len(payload) > BLOCK_BYTES:
-                    yield image_block(name, t_ns, payloads, [coding] * len(payloads))
-                    t_ns, payloads, size = [], [], 0
-                t_ns.append(int(index.t_ns[i]))
-                payloads.append(payload)
-                size += len(payload)
-        if payloads:
-            yield image_block(name, t_ns, payloads, [coding] * len(payloads))
+                yield from batch.add(int(index.t_ns[i]), payload, coding)
+        yield from batch.flush()
 
     def _usable(self, index: _Index, i: int, size: int, wanted: bool, ledger: Ledger) -> bool:
         """Account for a packet, and return whether it is yielded."""
@@ -279,7 +271,8 @@ class Video(Closing):
                 size = frame.width * frame.height * 3
                 if self._usable(index, i, size, wanted[i], ledger):
                     ledger.find(name, 1)
-                    yield _raw_block(name, int(index.t_ns[i]), frame)
+                    pixels = frame.to_ndarray(format="rgb24")
+                    yield raw_block(name, int(index.t_ns[i]), pixels, "rgb8")
         for i in sorted(set(range(len(wanted))) - shown):
             t_ns = int(index.t_ns[i])
             at_ns = None if t_ns == NO_TIME else t_ns
@@ -384,21 +377,6 @@ def _annex_b(stream: VideoStream) -> BitStreamFilterContext | None:
     if name is None or not extra or extra[0] != 1:
         return None
     return BitStreamFilterContext(name, stream)
-
-
-def _raw_block(topic: str, t_ns: int, frame: VideoFrame) -> Block:
-    rgb = np.ascontiguousarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8)
-    height, width = rgb.shape[:2]
-    zero, size = np.zeros(1, dtype=np.int64), np.array([rgb.size], dtype=np.int64)
-    pictures = Images(
-        Messages(rgb.reshape(-1), zero, size),
-        ("raw",),
-        width_px=np.array([width], dtype=np.int32),
-        height_px=np.array([height], dtype=np.int32),
-        step_bytes=np.array([3 * width], dtype=np.int32),
-        pixel_format=("rgb8",),
-    )
-    return Block(topic, np.array([t_ns], dtype=np.int64), pictures)
 
 
 def _failures() -> tuple[type[Exception], ...]:

@@ -134,11 +134,11 @@ class _Batch:
     """Rows of several chunks, collected for the next blocks.
 
     Attributes:
-        parts: Shape (4, N) each: connection, log time, start and stop of the payload.
+        parts: Columns of rows: connection, log time, start and stop of the payload.
     """
 
     buffer: Bytes | None = None
-    parts: list[Int64s] = field(default_factory=list)
+    parts: list[tuple[Int64s, ...]] = field(default_factory=list)
     size: int = 0
     count: int = 0
 
@@ -155,7 +155,7 @@ class _Batch:
         if self.buffer is not content:
             self.buffer[self.size : self.size + len(raw)] = content
         starts, stops = rows.start + self.size, rows.stop + self.size
-        self.parts.append(np.stack((rows.conn, rows.log_ns, starts, stops)))
+        self.parts.append((rows.conn, rows.log_ns, starts, stops))
         self.size += len(raw)
         self.count += len(rows.conn)
 
@@ -464,8 +464,7 @@ class Pass:
         batch, self._batch = self._batch, _Batch()
         if batch.buffer is None or not batch.count:
             return
-        columns = np.concatenate(batch.parts, axis=1)
-        conn = columns[0]
+        conn, *columns = (np.concatenate(parts) for parts in zip(*batch.parts, strict=True))
         names: list[str] = []
         place: dict[int, int] = {}
         for number, count in tally(conn).items():
@@ -479,7 +478,7 @@ class Pass:
                 place[number] = names.index(name)
         topic = _looked_up(conn, place)
         keep = topic >= 0
-        rows = MixedRows(batch.buffer[: batch.size], topic[keep], *columns[1:, keep])
+        rows = MixedRows(batch.buffer[: batch.size], topic[keep], *(each[keep] for each in columns))
         yield from blocks_of(rows, names, self._selection, self._limits, self._ledger)
 
 

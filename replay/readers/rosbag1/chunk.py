@@ -49,7 +49,7 @@ _FIRST_RUN: Final = 16
 _IN_A_ROW: Final = 3
 _DAY_NS: Final = 86_400 * 10**9
 _LONGEST_RUN: Final = 65_536
-_NO_STEPS: Final = np.empty((5, 0), np.int64)
+_NO_STEPS: Final = (np.empty(0, np.int64),) * 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,17 +272,17 @@ class _Steps:
     """Rows collected while stepping through a chunk.
 
     Attributes:
-        parts: Shape (5, N) each: record, connection, log time, start and stop of the payload.
+        parts: Columns of rows: record, connection, log time, start and stop of the payload.
         connections: Connection records.
     """
 
-    parts: list[Int64s] = field(default_factory=list)
+    parts: list[tuple[Int64s, ...]] = field(default_factory=list)
     connections: list[Connection] = field(default_factory=list)
 
     def last(self, stop: int) -> int | None:
         """Return the offset of the last row if it ends at ``stop``, else None."""
         part = self.parts[-1] if self.parts else _NO_STEPS
-        return int(part[0, -1]) if part.shape[1] and part[4, -1] == stop else None
+        return int(part[0][-1]) if len(part[0]) and part[4][-1] == stop else None
 
 
 def _by_steps(
@@ -313,11 +313,13 @@ def _by_steps(
             fault, fault_at = fault or DAMAGED_BYTES, at
         is_confirmed = entries is not None and at in entries.offset
         if not is_tail_of_cut and not is_confirmed and steps.last(at) is not None:
-            steps.parts[-1] = steps.parts[-1][:, :-1]  # its length is not confirmed
+            # Its length is not confirmed.
+            steps.parts[-1] = tuple(column[:-1] for column in steps.parts[-1])
         if onward is None:
             break
         at = onward
-    offsets, conn, log_ns, start, stop = np.concatenate([_NO_STEPS, *steps.parts], axis=1)
+    columns = (np.concatenate(parts) for parts in zip(_NO_STEPS, *steps.parts, strict=True))
+    offsets, conn, log_ns, start, stop = columns
     rows = ChunkRows(conn, log_ns, start, stop, tuple(steps.connections), fault, fault_at)
     if entries is None or inflated.is_checked:
         return rows
@@ -344,7 +346,7 @@ def _run_of_messages(raw: bytes, at: int, steps: _Steps, max_count: int) -> tupl
     heads = _heads(np.frombuffer(raw, dtype=np.uint8), offsets, layout)
     good = len(places) if heads.fits.all() else int(np.argmin(heads.fits))
     columns = (offsets, heads.conn, heads.log_ns, offsets + _HEAD, heads.stop)
-    steps.parts.append(np.stack(columns)[:, :good])
+    steps.parts.append(tuple(column[:good] for column in columns))
     return good, int(heads.stop[good - 1])
 
 
@@ -355,7 +357,7 @@ def _one_record(raw: bytes, at: int, steps: _Steps, largest: int) -> int | None:
         return None
     if record.op == MESSAGE:
         columns = (at, record.u32(b"conn"), record.time_ns(b"time"), record.body, record.end)
-        steps.parts.append(np.array(columns, dtype=np.int64)[:, None])
+        steps.parts.append(tuple(np.array([value], np.int64) for value in columns))
         return record.end
     if record.op != CONNECTION:
         return None
@@ -385,7 +387,7 @@ def _next_plausible(raw: bytes, at: int, steps: _Steps) -> int | None:
     last = steps.last(at)
     begin = (at if last is None else last) + 1
     known = {int(conn) for part in steps.parts for conn in np.unique(part[1])}
-    last_ns = next((int(part[2, -1]) for part in reversed(steps.parts) if part.shape[1]), None)
+    last_ns = next((int(part[2][-1]) for part in reversed(steps.parts) if len(part[2])), None)
     found = raw.find(_U32.pack(_HEADER), begin)
     while found >= 0:
         if _is_consecutive(raw, found, known, last_ns):
