@@ -221,6 +221,9 @@ def run(argv: Sequence[str]) -> int:
     Returns:
         The exit status, as ``EXIT_STATUS`` lists them.
     """
+    if list(argv[:1]) == ["help"]:
+        about = list(argv[1:])
+        argv = ["--help", *about] if about in ([], ["all"]) else [*about, "--help"]
     if not argv or argv[0] in ("-h", "--help"):
         print(_overview(has_all=list(argv[1:2]) == ["all"]))
         return 0 if argv else 2
@@ -292,7 +295,8 @@ def _guarded(call: Call, args: argparse.Namespace, parser: argparse.ArgumentPars
             if error.errno == errno.ENOSPC
             else "check the path and its mode"
         )
-        return _complain(OSError(f"{where}{error.strerror or error}; {hint}"), 1, args)
+        status = 4 if error.errno == errno.ENAMETOOLONG else 1
+        return _complain(OSError(f"{where}{error.strerror or error}; {hint}"), status, args)
     except Exception as error:
         # The last resort: a bug in crosscue must still be one line, with a way to report it.
         text = (

@@ -84,7 +84,7 @@ class RunFolder(TableFolder):
         path = self.file(MANIFEST)
         try:
             found = parse_manifest(door.read(path, MAX_MANIFEST_BYTES))
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             raise UnreadableRunError(
                 f"{self.path}: no {MANIFEST}: not a run folder, or its run was cut short; "
                 "run crosscue replay again"

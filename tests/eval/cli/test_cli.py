@@ -7,6 +7,7 @@ import resource
 import subprocess
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -67,6 +68,32 @@ def test_errors_are_one_line_with_documented_exit_status(
     _register_command(monkeypatch, error)
 
     refusal(status, "fake")
+
+
+@pytest.mark.parametrize(
+    "verb", ["check", "info", "score", "report", "failures", "compare", "view"]
+)
+def test_path_of_the_wrong_kind_is_unreadable_input(verb: str, tmp_path: Path) -> None:
+    """A name that is too long, and for verbs that take runs a file."""
+    more = ["again"] if verb == "compare" else []
+    assert "File name too long" in refusal(4, verb, "a" * 300, *more)
+    if verb not in ("check", "info"):
+        file = tmp_path / "drive.mcap"
+        file.write_bytes(b"")
+        assert f"{file}: no manifest.json: not a run folder" in refusal(4, verb, file, *more)
+
+
+def test_help_is_a_command_too(capsys: pytest.CaptureFixture[str]) -> None:
+    for given, same in (
+        (["help"], ["--help"]),
+        (["help", "all"], ["--help", "all"]),
+        (["help", "fit"], ["fit", "--help"]),
+        (["help", "fit", "signs"], ["fit", "signs", "--help"]),
+    ):
+        assert cli.run(given) == 0
+        printed = capsys.readouterr().out
+        assert cli.run(same) == 0
+        assert capsys.readouterr().out == printed
 
 
 def test_control_characters_in_an_error_are_escaped(
