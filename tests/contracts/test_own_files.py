@@ -197,7 +197,6 @@ PAST_THE_DOOR: Final[dict[str, str]] = {
     "eval/report/html.py": PACKAGE,
     "eval/runs/folder.py": "copies files of ours that are no links, and reads this machine's",
     "eval/runs/tables/parquet.py": HANDLE,
-    "eval/scoring/truth.py": NAMED,
     "eval/studies/simulated_drives.py": PACKAGE,
     "eval/studies/town/work.py": PACKAGE,
     "localization/landmarks/database.py": NAMED,
