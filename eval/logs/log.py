@@ -576,13 +576,12 @@ def _table_of(blocks: Sequence[Block], reported: Mapping[str, object]) -> pa.Tab
         return pa.schema({"log_t_ns": pa.int64()}, _metadata(reported)).empty_table()
     units = blocks[0].rows.units if isinstance(blocks[0].rows, Table) else {}
     arrays = {name: numpy_column(values) for name, values in topic_columns(blocks).items()}
-    content: list[pa.Array] = []
-    if isinstance(blocks[0].rows, Images):
-        codings = [one for block in blocks for one in _images(block).coding]
+    pictures = [block.rows for block in blocks if isinstance(block.rows, Images)]
+    frames = [block.rows for block in blocks if isinstance(block.rows, CanFrames)]
+    content = [_views(one.bytes_) for one in pictures] or [_payloads(one) for one in frames]
+    if pictures:
+        codings = [coding for one in pictures for coding in one.coding]
         arrays["coding"] = arrow_column(codings, pa.string())
-        content = [_views(_images(block).bytes_) for block in blocks]
-    if isinstance(blocks[0].rows, CanFrames):
-        content = [_payloads(block.rows) for block in blocks]
     if content:
         arrays["data"] = content[0] if len(content) == 1 else pa.chunked_array(content)
     fields = [
@@ -590,11 +589,6 @@ def _table_of(blocks: Sequence[Block], reported: Mapping[str, object]) -> pa.Tab
         for name, array in arrays.items()
     ]
     return pa.table(list(arrays.values()), pa.schema(fields, metadata=_metadata(reported)))
-
-
-def _images(block: Block) -> Images:
-    assert isinstance(block.rows, Images)
-    return block.rows
 
 
 def _views(messages: Messages) -> pa.Array:
@@ -616,10 +610,9 @@ def _views(messages: Messages) -> pa.Array:
     return pa.Array.from_buffers(pa.binary_view(), len(messages), buffers)
 
 
-def _payloads(rows: object) -> pa.Array:
+def _payloads(rows: CanFrames) -> pa.Array:
     import pyarrow as pa
 
-    assert isinstance(rows, CanFrames)
     size, width = rows.data.shape
     stop, content = np.arange(0, (size + 1) * width, width, dtype=np.int32), rows.data
     if np.count_nonzero(rows.length < width):
