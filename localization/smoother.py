@@ -59,8 +59,7 @@ def smooth_poses(
     fixes: Fixes = NO_FIXES,
     at_ns: Int64s | None = None,
     lever_m: Floats | tuple[float, float] = (0.0, 0.0),
-    constants: Constants = NO_CONSTANTS,
-    by: Floats | None = None,
+    errors: tuple[Constants, Floats] | None = None,
 ) -> Smoothed:
     """Compute the poses that fit all measurements best.
 
@@ -73,16 +72,16 @@ def smooth_poses(
             the odometry are left out.
         lever_m: Point of the car whose positions the fixes are, ahead of and to the left of the
             rear axle: one point, or shape (N, 2).
-        constants: K constant errors of the odometry at the start.
-        by: Shape (N, 2, K): ``constants.effects`` of the increments; required with constants.
+        errors: K constant errors of the odometry at the start, and their ``effects`` on the
+            increments, shape (N, 2, K).
 
     Raises:
         ValueError: The odometry has a gap or is empty.
     """
     _check(start, increments)
     times = _times(start, increments, headings, fixes, at_ns)
-    effects = np.zeros((len(increments), 2, 0)) if by is None else by
-    steps = _steps(times, increments, effects)
+    constants, by = errors or (NO_CONSTANTS, np.zeros((len(increments), 2, 0)))
+    steps = _steps(times, increments, by)
     seen = _measured(times, headings, fixes, lever_m)
     rows = slice(0, 3)
     mean = np.append(start.mean[rows], constants.mean)

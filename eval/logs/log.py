@@ -573,7 +573,8 @@ def _table_of(blocks: Sequence[Block], reported: Mapping[str, object]) -> pa.Tab
     import pyarrow as pa
 
     if not blocks:
-        return pa.schema({"log_t_ns": pa.int64()}, _metadata(reported)).empty_table()
+        empty = pa.array([], pa.int64())
+        return pa.table([empty], names=["log_t_ns"], metadata=_metadata(reported))
     units = blocks[0].rows.units if isinstance(blocks[0].rows, Table) else {}
     arrays = {name: numpy_column(values) for name, values in topic_columns(blocks).items()}
     pictures = [block.rows for block in blocks if isinstance(block.rows, Images)]

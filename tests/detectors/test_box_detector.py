@@ -229,4 +229,4 @@ def test_function_without_a_source_is_refused_with_what_to_do() -> None:
     function = FunctionType(compile(text, "<stdin>", "exec").co_consts[0], {}, "red")
 
     with pytest.raises(UsageError, match="red: its source cannot be read; define it in a module"):
-        make(*chosen([function], {}))
+        make(chosen([function], {})[0])

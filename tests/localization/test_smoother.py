@@ -146,7 +146,7 @@ def test_constant_errors_of_the_odometry_are_states_with_true_variances() -> Non
         at = truth.t_ns[20::20]
         for name, constants in (("states", known), ("none", NO_CONSTANTS)):
             by = effects(made, car, constants.names)
-            found = smooth_poses(first, made, headings, fixes, at, (0.0, 0.0), constants, by)
+            found = smooth_poses(first, made, headings, fixes, at, (0.0, 0.0), (constants, by))
             error = errors(truth, found.t_ns, found.xyh)
             nees[name].append(float(error[15] @ np.linalg.solve(found.cov[15], error[15])))
 

@@ -101,7 +101,7 @@ def score_smoother(
     # Motion that is assumed between time segments has no such errors.
     by[made.is_gap] = 0.0
     found = smooth_poses(
-        measured.start, made, measured.headings, measured.fixes, wanted, lever_m, constants, by
+        measured.start, made, measured.headings, measured.fixes, wanted, lever_m, (constants, by)
     )
     rows = np.searchsorted(track.t_ns, wanted)
     x_m, y_m, _ = track.xyz_m[rows].T
