@@ -14,7 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.eval.scoring.intervals import TOO_FEW
+from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW
 from crosscue.replay import colours
 from crosscue.replay.files.whole_file import write_text
 
@@ -66,7 +66,8 @@ def page_template(
         lstrip_blocks=True,
         loader=FunctionLoader(template_text),
     )
-    environment.globals |= {"style": page_style(), **FORMATS, **(formats or {})}
+    environment.globals |= {"style": page_style(), "min_places": MIN_CLUSTERS}
+    environment.globals |= {**FORMATS, **(formats or {})}
     environment.filters["words"] = words
     compiled = environment.get_template(template)
     return lambda content: compiled.render(**content)

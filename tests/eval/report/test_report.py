@@ -29,6 +29,7 @@ from crosscue.eval.report.svg_plot import ticks
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.moments import moment_ns
 from crosscue.eval.runs.tables.log_time import ClockGap, gaps_of
+from crosscue.eval.scoring.intervals import MIN_CLUSTERS
 from crosscue.eval.scoring.runs import RunScored, judge_run, metrics_of, pooled_scores
 from support.gap_drive import Clock, replayed, write_drive
 from support.scene_run import SIZE, scene_run
@@ -94,6 +95,7 @@ def test_what_happened_is_first_and_losses_are_reported(tmp_path: Path) -> None:
     order = [page.index(part) for part in (*parts, *HEADINGS)]
     assert order == sorted(order)
     assert "<b>50 of 50</b>" in page
+    assert f"resamples places and needs {MIN_CLUSTERS} or more" in page
     assert "rows were dropped." in page
     assert "1 &lt;b&gt;not decoded&lt;/b&gt;" in page
     assert "Not scored:</b> pose (the truth has no track (pose: missing))" in page
