@@ -312,7 +312,9 @@ def read_tool_labels(path: Path, sizes: Sizes, kind: ToolFormat | None = None) -
 def _tree(path: Path) -> Any:
     try:
         return json_tree(read_whole(path, MAX_BYTES))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise AnnotationError(f"{path}: {error.strerror}; expected labels") from None
+    except ValueError as error:
         raise AnnotationError(f"{path}: not readable as JSON ({error}); expected labels") from None
 
 

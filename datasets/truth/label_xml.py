@@ -63,7 +63,9 @@ def parse_xml(path: Path, reader: XmlReader, max_bytes: int) -> None:
     try:
         content = read_whole(path, max_bytes)
         parser.Parse(content, True)
-    except (OSError, expat.ExpatError) as error:
+    except OSError as error:
+        raise AnnotationError(f"{path}: {error.strerror}; expected {reader.kind}") from None
+    except expat.ExpatError as error:
         raise AnnotationError(f"{path}: not XML ({error}); expected {reader.kind}") from None
 
 

@@ -225,7 +225,9 @@ def read_truth(path: Path) -> Truth:
         raise AnnotationError(
             f"{path}: no such truth file; for a data set write it with: crosscue truth LOG -o DIR"
         ) from None
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise AnnotationError(f"{path}: {error.strerror}; correct it") from None
+    except ValueError as error:
         raise AnnotationError(f"{path}: not readable as JSON ({error}); correct it") from None
     if truth.end_ns <= truth.start_ns:
         raise AnnotationError(

@@ -316,9 +316,8 @@ def _tree_of(path: Path) -> dict[str, Any]:
     try:
         tree = json_tree(door.read(path, MAX_BYTES))
     except (OSError, ValueError) as error:
-        raise UnreadableRunError(
-            f"{path}: unreadable ({error}); run crosscue score again"
-        ) from None
+        why = error.strerror if isinstance(error, OSError) else error
+        raise UnreadableRunError(f"{path}: unreadable ({why}); run crosscue score again") from None
     if not isinstance(tree, dict):
         raise UnreadableRunError(f"{path}: expected an object; run crosscue score again")
     return tree

@@ -6,6 +6,7 @@ import tempfile
 import time
 import tomllib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -14,6 +15,7 @@ import tomlkit
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from crosscue.datasets.labels.table import read_tool_labels
 from crosscue.datasets.truth import truth
 from crosscue.detectors.catalog.card import read_card
 from crosscue.eval.fit.ranges.fit import range_pairs
@@ -209,6 +211,10 @@ def test_product_parses_json_toml_and_yaml_only_in_tree_text() -> None:
 
 
 ENDLESS = Path("/dev/zero")
+LABELS = [
+    partial(read_tool_labels, sizes={}, kind=kind)
+    for kind in ("coco", "cvat", "fiftyone", "labelstudio")
+]
 
 
 @given(content=st.binary(max_size=40), max_count=st.integers(0, 40))
@@ -224,7 +230,7 @@ def test_file_over_limit_is_not_read(content: bytes, max_count: int) -> None:
 
 @pytest.mark.skipif(not ENDLESS.exists(), reason="no /dev/zero here")
 @pytest.mark.parametrize(
-    "read", [vehicle.load, read_card, load_gates, truth.read_truth, range_pairs]
+    "read", [vehicle.load, read_card, load_gates, truth.read_truth, range_pairs, *LABELS]
 )
 def test_endless_file_is_refused(read: Callable[[Path], object]) -> None:
     with pytest.raises(CrosscueError, match=r"/dev/zero: over \d+ MiB"):

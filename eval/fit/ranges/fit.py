@@ -339,7 +339,9 @@ def _objects(truth: Path) -> Any:
     path = _folder(truth) / name
     try:
         return json_tree(read_whole(path, MAX_BYTES))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise AnnotationError(f"{path}: {error.strerror}; repair it") from None
+    except ValueError as error:
         raise AnnotationError(f"{path}: not readable as JSON ({error}); repair it") from None
 
 
