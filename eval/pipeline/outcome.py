@@ -134,10 +134,11 @@ class Outcome(Result):
         }
 
     def lines(self) -> Iterator[str]:
-        """Yield approaches, cues, the pose and the account, at most 80 columns wide."""
+        """Yield approaches, cues, the pose and the account; only paths exceed 80 columns."""
         width = min(terminal_width(), 80)
         for line in map(visible, _lines_of(self)):
-            yield wrapped(line[9:], width, lead=line[:9]) if len(line) > width else line
+            fits = len(line) <= width or line.startswith(("run ", "log "))
+            yield line if fits else wrapped(line[9:], width, lead=line[:9])
 
 
 def _lines_of(outcome: Outcome) -> list[str]:

@@ -80,7 +80,8 @@ def test_account_of_truncated_log_balances_for_replay_and_estimate(
     damaged: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _, log, vehicle = damaged
-    run = tmp_path / "run"
+    run = tmp_path / ("long_" * 12) / "run"
+    run.parent.mkdir()
     for argv in (
         ["replay", str(log), "--vehicle", str(vehicle), "-o", str(run), "--json"],
         f"replay {log} --vehicle {vehicle} -o {run} --json --overwrite --from 1 --to 8".split(),
@@ -97,8 +98,9 @@ def test_account_of_truncated_log_balances_for_replay_and_estimate(
     assert cli.run(["estimate", str(run)]) == 3
     text = capsys.readouterr().out
     assert text.count("account  ") == 1
-    told = [line.split()[0] for line in text.splitlines() if not line.startswith(" ")]
-    assert told[:2] == ["run", "pose"]
+    # A path is in one line, however long it is, so that it can be copied.
+    assert text.splitlines()[0] == f"run      {run}"
+    assert text.splitlines()[1].split()[0] == "pose"
     assert sum(one.used for at, _, one in found.lines() if at == "reading") > 0
 
 
