@@ -17,7 +17,7 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.catalog.card import Input
 from crosscue.detectors.catalog.cards import check_card
-from crosscue.detectors.catalog.recognise import guesses, read_interface
+from crosscue.detectors.catalog.recognise import closed, guesses, read_interface
 from crosscue.detectors.networks.backends import load_network
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.networks.picture_input import prepared
@@ -26,7 +26,7 @@ from crosscue.eval import cli
 from crosscue.replay.errors import UsageError, VehicleError
 from support.data import shared
 from support.detecting import yolox_card
-from support.onnx_models import bright_box_model, constant_model
+from support.onnx_models import bright_box_model, constant_model, open_model
 
 
 def card(folder: Path, model: bytes, output: str, **more: str) -> Path:
@@ -419,3 +419,14 @@ def test_check_says_with_which_input_there_is_no_flood_of_sure_boxes(tmp_path: P
     assert doubt is not None
     assert "boxes with scores up to 1.00 above 0.3 in the picture" in doubt
     assert "with scale = 1/255, pixels from 0 to 1" in doubt
+
+
+def test_open_sizes_of_an_input_of_bytes_are_found_by_a_run(tmp_path: Path) -> None:
+    net = tmp_path / "net.onnx"
+    net.write_bytes(open_model((1, 3, "height", "width"), {}, is_bytes=True))
+
+    model = closed(net, read_interface(net), (64, 32))
+
+    assert model.inputs[0].is_bytes
+    assert model.inputs[0].shape == (1, 3, 32, 64)
+    assert model.outputs[0].shape == (1, 84, 100)

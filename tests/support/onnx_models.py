@@ -44,11 +44,14 @@ def constant_model(
     return _file(helper.make_graph(nodes, "constant", given, declared))
 
 
-def open_model(shape: tuple[int | str, ...], metadata: Mapping[str, str]) -> bytes:
+def open_model(
+    shape: tuple[int | str, ...], metadata: Mapping[str, str], *, is_bytes: bool = False
+) -> bytes:
     """A network with input ``shape`` and an output whose length is known only when it runs."""
     value = numpy_helper.from_array(np.zeros((1, 84, 100), np.float32))
     node = helper.make_node("Constant", [], ["output0"], value=value)
-    given = helper.make_tensor_value_info("images", TensorProto.FLOAT, shape)
+    kind = TensorProto.UINT8 if is_bytes else TensorProto.FLOAT
+    given = helper.make_tensor_value_info("images", kind, shape)
     found = helper.make_tensor_value_info("output0", TensorProto.FLOAT, (1, 84, "boxes"))
     return _file(helper.make_graph([node], "open", [given], [found]), metadata)
 

@@ -6,12 +6,16 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import lz4.frame
+import numpy as np
 import pytest
 import zstandard
 
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
+from crosscue.replay.readers.mcap.chunks.inflate import inflate_prefix
 from crosscue.replay.readers.mcap.reader import McapLog
+from crosscue.replay.readers.mcap.records import ChunkHead
 from support.mcap_damage import Kind, copies, judge, sound_files, sound_parts
 from support.mcap_files import (
     MAGIC,
@@ -285,3 +289,21 @@ def test_recording_after_truncated_one_is_read(tmp_path: Path) -> None:
     assert len(reading.messages["/other"]) == 9
     assert 200 < reading.count() < 400
     assert not reading.ledger.is_whole
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_cut_chunk_whose_frame_declares_more_than_the_chunk_has_no_message(
+    compression: str,
+) -> None:
+    """A sound chunk that is cut yields what precedes the cut."""
+    records = np.random.default_rng(0).bytes(1 << 16)
+    whole = zstandard.compress(records)
+    if compression == "lz4":
+        whole = lz4.frame.compress(records, store_size=True)
+    body = np.frombuffer(whole, np.uint8)[: len(whole) // 2]
+
+    def found(size: int) -> int:
+        return len(inflate_prefix(body, ChunkHead(0, 0, size, 0, compression, 0, len(whole))))
+
+    assert found(len(records)) > 0
+    assert found(len(records) - 1) == 0
