@@ -143,7 +143,12 @@ def _log_mobileye(
             lanes.send(recording, time)
     vehicles.send(recording, time)
     lanes.send(recording, time)
-    recording.log("ahead/mobileye_objects", rr.Points2D.from_fields(radii=[1.1]), static=True)
+    # Labels of vehicles side by side would cover each other; they appear under the pointer.
+    recording.log(
+        "ahead/mobileye_objects",
+        rr.Points2D.from_fields(radii=[1.1], show_labels=False),
+        static=True,
+    )
     recording.log("ahead/mobileye_lanes", rr.LineStrips2D.from_fields(radii=[0.15]), static=True)
 
 

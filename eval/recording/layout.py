@@ -126,8 +126,8 @@ def _ranges(longest_m: float) -> rrb.View:
         origin="/".join(RANGE),
         name="Range (m)",
         axis_x=rrb.TimeAxis(view_range=_whole()),
-        # A legend of eight lines would cover the curves.
-        axis_y=rrb.ScalarAxis(range=(0.0, longest_m)),
+        # From below 0, whose label would cover that of the time; a legend would cover the curves.
+        axis_y=rrb.ScalarAxis(range=(-0.05 * longest_m, longest_m)),
         plot_legend=rrb.PlotLegend(visible=False),
     )
 

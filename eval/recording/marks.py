@@ -31,6 +31,7 @@ from crosscue.replay.colours import FOUND, QUIET, ROAD, TRUTH, Colour
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .columns import DriveTime, Shapes, arrows, boxes, labelled_strips, strips
+from .labels import labelled
 
 FRAMES_HELD: Final = 256
 REGION: Final = (220, 220, 220)
@@ -39,8 +40,8 @@ PARKED: Final = (190, 130, 255)
 HATCH_ROWS: Final = 4
 # Length of an arrow as a multiple of the step from one frame to the next.
 ARROW_STEPS: Final = 4.0
-# Min width of an object with a permanent label, as a fraction of the picture's width; labels of
-# smaller ones would cover each other, and appear under the pointer.
+# Min width of an object with a permanent label, as a fraction of the picture's width. Labels of
+# smaller ones, and those without room, appear under the pointer.
 LABELLED: Final = 0.1
 SIDES: Final = ("left", "straight", "right")
 
@@ -74,11 +75,7 @@ class Overlays:
         """
         for shapes in self.all():
             shapes.begin(frame.t_ns)
-        for found in objects:
-            self._objects(found)
-        for found in frame.signs:
-            for box, text, _ in _report_text(found):
-                self.signs.add(box, FOUND, text)
+        self._boxes(objects, frame.signs, frame.size_px)
         if isinstance(frame.road, RoadMask):
             for line in road_lines(frame.road):
                 self.road.add(line, ROAD)
@@ -98,13 +95,36 @@ class Overlays:
         for shapes in self.all():
             shapes.send(recording, time)
 
-    def _objects(self, found: Detections) -> None:
-        for box, text, row in _report_text(found):
-            colour = self._colour(found, row)
-            is_far = colour == QUIET or box[2] - box[0] < LABELLED * found.size_px[0]
-            (self.far if is_far else self.objects).add(box, colour, text)
-            for line in rle.outline(found.masks[row], found.size_px, box):
-                self.outlines.add(line, colour)
+    def _boxes(
+        self, objects: Sequence[Detections], signs: Sequence[Detections], size_px: tuple[int, int]
+    ) -> None:
+        """Draw the boxes of a frame, with permanent labels where there is room for them."""
+        drawn = [
+            (self.objects, self._colour(found, row), box, text, float(found.scores[row]))
+            for found in objects
+            for box, text, row in _report_text(found)
+        ]
+        drawn += [
+            (self.signs, FOUND, box, text, float(found.scores[row]))
+            for found in signs
+            for box, text, row in _report_text(found)
+        ]
+        near = [
+            one
+            for one in drawn
+            if one[0] is self.signs
+            or (one[1] != QUIET and one[2][2] - one[2][0] >= LABELLED * size_px[0])
+        ]
+        corners = np.array([one[2] for one in near], np.float64).reshape(-1, 4)
+        fits = labelled(corners, [one[3] for one in near], [one[4] for one in near], size_px)
+        shown = {id(one) for one, has_room in zip(near, fits, strict=True) if has_room}
+        for one in drawn:
+            shapes, colour, box, text, _ = one
+            (shapes if id(one) in shown else self.far).add(box, colour, text)
+        for found in objects:
+            for box, _, row in _report_text(found):
+                for line in rle.outline(found.masks[row], found.size_px, box):
+                    self.outlines.add(line, self._colour(found, row))
 
     def _colour(self, found: Detections, row: int) -> Colour:
         """Return the colour of a detection; grey if its score is too low for a cue."""

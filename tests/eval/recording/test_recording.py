@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 import rerun as rr
@@ -24,6 +25,7 @@ from crosscue.detectors.images import Encoded
 from crosscue.eval.recording import save_rrd
 from crosscue.eval.recording.anchored import way_px
 from crosscue.eval.recording.camera import shown
+from crosscue.eval.recording.labels import label_places, labelled
 from crosscue.eval.recording.notes import inert
 from crosscue.eval.recording.plan import log_landmarks
 from crosscue.eval.runs.folder import RunFolder
@@ -205,7 +207,8 @@ def test_states_have_no_text_and_small_or_unsure_boxes_no_label(tmp_path: Path) 
     run = scene_run(tmp_path / "drive")
     save_rrd(run, tmp_path / "run.rrd")
 
-    labels = {"/cues/stop_sign": ":labels", "/camera/cars": ":show_labels"}
+    hidden = ("/camera/cars", "/ahead/mobileye_objects")
+    labels = {"/cues/stop_sign": ":labels"} | dict.fromkeys(hidden, ":show_labels")
     found: dict[str, list[object]] = {}
     for chunk in RrdReader(tmp_path / "run.rrd").stream():
         ending = labels.get(chunk.entity_path)
@@ -215,9 +218,9 @@ def test_states_have_no_text_and_small_or_unsure_boxes_no_label(tmp_path: Path) 
             found.setdefault(chunk.entity_path, []).extend(
                 batch[name].to_pylist() for name in names
             )
-    # The viewer would cut text off in short bars, and labels of arrows would cover each other.
+    # The viewer would cut text off in short bars, and labels of neighbours would cover each other.
     assert found["/cues/stop_sign"] == [[[" "]]]
-    assert found["/camera/cars"] == [[[False]]]
+    assert [found[entity] for entity in hidden] == [[[[False]]]] * 2
 
 
 @pytest.fixture(scope="module")
@@ -316,3 +319,58 @@ def test_regions_are_below_the_horizon_and_symmetric() -> None:
     mirrored = np.sort(1280.0 - right[:, 0])
     np.testing.assert_allclose(np.sort(left[:, 0]), mirrored)
     assert left[:, 0].max() < straight[:, 0].min() < straight[:, 0].max() < right[:, 0].min()
+
+
+def test_boxes_at_one_place_get_one_label_and_the_surest_keeps_it(tmp_path: Path) -> None:
+    run = scene_run(tmp_path / "drive")
+    table = run.table("detections")
+    cars = table.filter(pc.equal(table["label"], "car"))
+    twins = cars.set_column(
+        cars.schema.get_field_index("score"), cars.schema.field("score"), pa.array([0.93] * 50)
+    )
+    pq.write_table(
+        pa.concat_tables([table, twins]).sort_by("frame"), run.file("detections.parquet")
+    )
+
+    save_rrd(run, tmp_path / "run.rrd")
+
+    assert {len(row) for row in _cells(tmp_path / "run.rrd", "/camera/objects", "labels")} == {1}
+    assert all(
+        row[0].startswith("car 0.97")
+        for row in _cells(tmp_path / "run.rrd", "/camera/objects", "labels")
+    )
+    far = _cells(tmp_path / "run.rrd", "/camera/far_objects", "labels")
+    assert all(any(text.startswith("car 0.93") for text in row) for row in far)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 1800), st.integers(0, 1000), st.integers(20, 800), st.integers(20, 600)
+        ),
+        max_size=12,
+    ),
+    st.lists(st.floats(0.0, 1.0), min_size=12, max_size=12),
+)
+def test_no_label_covers_another_or_leaves_the_picture(
+    corners: list[tuple[int, int, int, int]], scores: list[float]
+) -> None:
+    boxes = np.array([(x, y, x + w, y + h) for x, y, w, h in corners], float).reshape(-1, 4)
+    texts = [f"traffic light {score:.2f}" for score in scores[: len(boxes)]]
+
+    kept = labelled(boxes, texts, scores[: len(boxes)], (1920, 1080))
+
+    places = label_places(boxes, texts, 1920)
+    inside = [bool((at[:2] >= 0).all() and (at[2:] <= (1920, 1080)).all()) for at in places]
+    clashes = [
+        [
+            bool((np.minimum(a[2:], b[2:]) > np.maximum(a[:2], b[:2])).all()) and i != j
+            for j, b in enumerate(places)
+        ]
+        for i, a in enumerate(places)
+    ]
+    for i, is_kept in enumerate(kept):
+        others = [j for j, clash in enumerate(clashes[i]) if clash and kept[j]]
+        assert not (is_kept and others)
+        # A label is left out only for the picture's edge or a surer one.
+        assert is_kept or not inside[i] or any(scores[j] >= scores[i] for j in others)
