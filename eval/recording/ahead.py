@@ -99,7 +99,7 @@ def _log_intersection(recording: rr.RecordingStream, time: DriveTime, scene: Sce
             colour = START if reference == "start" else END
             two_sd_m = 2.0 * float(np.sqrt(var_m2))
             bar = above(np.full(2, range_m), np.array([-HALF_ROAD_M, HALF_ROAD_M]))
-            bars.add(bar, colour, f"{reference} in {range_m:.1f} ± {two_sd_m:.1f} m")
+            bars.add(bar, colour, f"{reference} {range_m:.0f} ± {two_sd_m:.0f} m")
             far, near = -range_m - two_sd_m, -range_m + two_sd_m
             bands.add(np.array([-HALF_ROAD_M, far, HALF_ROAD_M, near]), colour)
     bars.send(recording, time)

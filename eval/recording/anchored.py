@@ -94,7 +94,7 @@ class Anchored:
             for side, corners in zip(SIDES, polygons, strict=True):
                 fraction = float("nan") if fractions is None else getattr(fractions, side)
                 if corners is not None:
-                    self._region(side, corners, fraction)
+                    self._region(side, corners, fraction, frame.size_px)
         if vehicle.cars.kind == "tracks":
             for car in self._cues.followed():
                 self._car(car, frame.size_px, place)
@@ -106,11 +106,13 @@ class Anchored:
         for line, text in () if roads.seen is None else opening_lines(roads.seen):
             self.marks.openings.add(line, ROAD, text)
 
-    def _region(self, side: str, corners: NDArray[np.float64], fraction: float) -> None:
+    def _region(
+        self, side: str, corners: NDArray[np.float64], fraction: float, size_px: tuple[int, int]
+    ) -> None:
         is_road = fraction > self.manifest.settings.cues.road_fraction
         text = "not seen" if np.isnan(fraction) else f"{100.0 * fraction:.0f} %"
         colour = ROAD if is_road else REGION
-        self.marks.regions.add(np.vstack([corners, corners[:1]]), colour, f"{side} {text}")
+        self.marks.region(corners, colour, f"{side} {text}", size_px)
 
     def _car(self, car: CarMotion, size_px: tuple[int, int], place: Place | None) -> None:
         cars, camera = self.manifest.settings.cars, self.manifest.settings.camera

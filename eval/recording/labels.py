@@ -38,19 +38,24 @@ def labelled(
     scores: Sequence[float],
     size_px: tuple[int, int],
 ) -> list[bool]:
-    """Return which boxes get a label: the surest first, each inside the picture and free of others.
+    """Return which boxes get a label: the surest first, each inside the picture and legible.
 
     Args:
         boxes: Corners x0, y0, x1, y1 in pixels, shape (N, 4).
         texts: Labels.
-        scores: Scores of the detections.
+        scores: Scores of the detections; negative for boxes that only get in the way.
         size_px: Width and height of the picture.
     """
     places = label_places(boxes, texts, size_px[0])
-    is_inside = (places[:, :2] >= 0.0).all(axis=1) & (places[:, 2:] <= size_px).all(axis=1)
+    is_inside = (
+        (np.asarray(scores) >= 0.0)
+        & (places[:, :2] >= 0.0).all(axis=1)
+        & (places[:, 2:] <= size_px).all(axis=1)
+    )
     kept: list[int] = []
     for row in sorted(np.flatnonzero(is_inside).tolist(), key=lambda row: (-scores[row], row)):
-        if not any(_overlap(places[row], places[other]) for other in kept):
+        is_free = not any(_overlap(places[row], places[other]) for other in kept)
+        if is_free and not any(_crosses(box, places[row]) for box in boxes):
             kept.append(row)
     return [row in kept for row in range(len(places))]
 
@@ -58,3 +63,9 @@ def labelled(
 def _overlap(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
     sizes = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
     return bool((sizes > 0.0).all())
+
+
+def _crosses(box: NDArray[np.float64], place: NDArray[np.float64]) -> bool:
+    """Return whether an edge of a box passes through a label."""
+    is_within = bool((box[:2] <= place[:2]).all() and (place[2:] <= box[2:]).all())
+    return _overlap(box, place) and not is_within

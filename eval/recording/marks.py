@@ -100,27 +100,26 @@ class Overlays:
     ) -> None:
         """Draw the boxes of a frame, with permanent labels where there is room for them."""
         drawn = [
-            (self.objects, self._colour(found, row), box, text, float(found.scores[row]))
+            _Box(self.objects, self._colour(found, row), box, text, float(found.scores[row]))
             for found in objects
             for box, text, row in _report_text(found)
         ]
         drawn += [
-            (self.signs, FOUND, box, text, float(found.scores[row]))
+            _Box(self.signs, FOUND, box, text, float(found.scores[row]))
             for found in signs
             for box, text, row in _report_text(found)
         ]
-        near = [
-            one
-            for one in drawn
-            if one[0] is self.signs
-            or (one[1] != QUIET and one[2][2] - one[2][0] >= LABELLED * size_px[0])
-        ]
-        corners = np.array([one[2] for one in near], np.float64).reshape(-1, 4)
-        fits = labelled(corners, [one[3] for one in near], [one[4] for one in near], size_px)
-        shown = {id(one) for one, has_room in zip(near, fits, strict=True) if has_room}
+        wide_px = LABELLED * size_px[0]
+        large = [one for one in drawn if one.shapes is self.signs or one.width_px >= wide_px]
+        fits = labelled(
+            np.array([one.corners for one in large], np.float64).reshape(-1, 4),
+            [one.text for one in large],
+            [-1.0 if one.colour == QUIET else one.score for one in large],
+            size_px,
+        )
+        shown = {id(one) for one, has_label in zip(large, fits, strict=True) if has_label}
         for one in drawn:
-            shapes, colour, box, text, _ = one
-            (shapes if id(one) in shown else self.far).add(box, colour, text)
+            (one.shapes if id(one) in shown else self.far).add(one.corners, one.colour, one.text)
         for found in objects:
             for box, _, row in _report_text(found):
                 for line in rle.outline(found.masks[row], found.size_px, box):
@@ -153,7 +152,15 @@ class Overlays:
             corners = np.array(getattr(self.vehicle.regions, side)) * size_px
             colour = ROAD if is_road else REGION
             fraction = 100.0 * getattr(fractions, side)
-            self.regions.add(np.vstack([corners, corners[:1]]), colour, f"{side} {fraction:.0f} %")
+            self.region(corners, colour, f"{side} {fraction:.0f} %", size_px)
+
+    def region(
+        self, corners: NDArray[np.float64], colour: Colour, text: str, size_px: tuple[int, int]
+    ) -> None:
+        """Draw the part of a region in the picture; the viewer shrinks a picture for the rest."""
+        inside = np.clip(corners, 0.0, size_px)
+        if np.ptp(inside, axis=0).all():
+            self.regions.add(np.vstack([inside, inside[:1]]), colour, text)
 
     def _cars(self, found: tuple[Detections, ...]) -> None:
         now = car_shapes(found, self.vehicle.cars)
@@ -178,6 +185,19 @@ class Overlays:
         self, tail: NDArray[np.float64], way: NDArray[np.float64], colour: Colour, label: str
     ) -> None:
         self.cars.add(np.concatenate([tail, way]), colour, label)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Box:
+    shapes: Shapes
+    colour: Colour
+    corners: NDArray[np.float64]
+    text: str
+    score: float
+
+    @property
+    def width_px(self) -> float:
+        return float(self.corners[2] - self.corners[0])
 
 
 def _report_text(found: Detections) -> Iterator[tuple[NDArray[np.float64], str, int]]:

@@ -14,6 +14,7 @@ import pytest
 import rerun as rr
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 import crosscue
@@ -26,14 +27,15 @@ from crosscue.eval.recording import save_rrd
 from crosscue.eval.recording.anchored import way_px
 from crosscue.eval.recording.camera import shown
 from crosscue.eval.recording.labels import label_places, labelled
+from crosscue.eval.recording.marks import Overlays
 from crosscue.eval.recording.notes import inert
 from crosscue.eval.recording.plan import log_landmarks
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.moments import run_between
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
-from crosscue.replay.colours import TRUTH
+from crosscue.replay.colours import QUIET, TRUTH
 from crosscue.replay.errors import LogError, UsageError
-from crosscue.replay.vehicle.vehicle import Camera, Regions
+from crosscue.replay.vehicle.vehicle import Camera, Regions, Vehicle
 from support.refusals import refusal
 from support.scene_run import FRAMES, LABEL, scene_run
 from support.scoring import at, good_truth, truth_folder
@@ -362,15 +364,28 @@ def test_no_label_covers_another_or_leaves_the_picture(
 
     places = label_places(boxes, texts, 1920)
     inside = [bool((at[:2] >= 0).all() and (at[2:] <= (1920, 1080)).all()) for at in places]
-    clashes = [
-        [
-            bool((np.minimum(a[2:], b[2:]) > np.maximum(a[:2], b[:2])).all()) and i != j
-            for j, b in enumerate(places)
-        ]
-        for i, a in enumerate(places)
-    ]
-    for i, is_kept in enumerate(kept):
-        others = [j for j, clash in enumerate(clashes[i]) if clash and kept[j]]
-        assert not (is_kept and others)
-        # A label is left out only for the picture's edge or a surer one.
-        assert is_kept or not inside[i] or any(scores[j] >= scores[i] for j in others)
+    for i, at_i in enumerate(places):
+        within = [bool((b[:2] <= at_i[:2]).all() and (at_i[2:] <= b[2:]).all()) for b in boxes]
+        crossed = [meet(box, at_i) and not within[j] for j, box in enumerate(boxes)]
+        others = [j for j in range(len(boxes)) if j != i and kept[j] and meet(places[j], at_i)]
+        assert not (kept[i] and (others or any(crossed) or not inside[i]))
+        # A label is left out only for the picture's edge, a box, or a surer label.
+        is_lesser = any(scores[j] >= scores[i] for j in others)
+        assert kept[i] or not inside[i] or any(crossed) or is_lesser
+
+
+def meet(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    return bool((np.minimum(one[2:], other[2:]) > np.maximum(one[:2], other[:2])).all())
+
+
+def test_regions_end_at_the_edge_of_the_picture() -> None:
+    marks = Overlays(Vehicle(version=1))
+    marks.regions.begin(0)
+    beside = np.array([(-900.0, 400.0), (-20.0, 400.0), (-20.0, 600.0)])
+
+    marks.region(beside, QUIET, "left not seen", SIZE)
+    marks.region(beside + np.array([300.0, 0.0]), QUIET, "left 10 %", SIZE)
+
+    assert marks.regions.labels == ["left 10 %"]
+    assert (marks.regions.geometry[0] >= 0.0).all()
+    assert (marks.regions.geometry[0] <= SIZE).all()
