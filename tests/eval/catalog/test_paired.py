@@ -104,7 +104,7 @@ def test_recommended_number_of_places_has_stated_power() -> None:
     assert {one.more_places for one in opened if one.verdict != "undecided"} <= {0}
 
 
-@pytest.mark.parametrize(("places", "metrics"), [(6, 1), (8, 1), (8, 5), (12, 1), (20, 1)])
+@pytest.mark.parametrize(("places", "metrics"), [(6, 1), (8, 5), (20, 1)])
 def test_detectable_difference_is_found_in_four_of_five_comparisons(
     places: int, metrics: int
 ) -> None:

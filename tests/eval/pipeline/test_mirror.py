@@ -164,22 +164,13 @@ CHANGES: Final[dict[str, dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("changes", CHANGES.values(), ids=CHANGES)
-def test_simulated_drive_in_a_mirror_is_mirrored(
-    simulated: RunFolder, changes: dict[str, Any]
-) -> None:
-    expected, mirrored = both(simulated, changes)
-
-    assert expected["belief"]
-    assert differences(expected, mirrored) == []
-
-
-def test_every_cue_that_names_a_side_or_not_is_seen_in_the_mirrored_drives(
-    simulated: RunFolder,
-) -> None:
+def test_simulated_drive_in_a_mirror_is_mirrored_and_shows_every_cue(simulated: RunFolder) -> None:
     seen: set[str] = set()
-    for changes in CHANGES.values():
-        seen |= positive(both(simulated, changes)[1])
+    for name, changes in CHANGES.items():
+        expected, mirrored = both(simulated, changes)
+        assert expected["belief"], name
+        assert differences(expected, mirrored) == [], name
+        seen |= positive(mirrored)
 
     # Cars beyond an intersection and in its legs need one whose range is known: see real drives.
     unseen = BUILTIN_CUES.keys() - seen
@@ -242,9 +233,9 @@ def test_real_drive_in_a_mirror_is_mirrored(
     names = ["yolox-nano", "road-segmentation-adas-0001"][: 2 if camera else 1]
     assert run(["model", "fetch", *names]) == 0
     (tmp_path / "front").mkdir()
-    for path in sorted(shared("sequences", folder).glob(pictures)):
+    for path in sorted(shared("sequences", folder).glob(pictures))[::2]:
         shutil.copy(path, tmp_path / "front")
-    (tmp_path / "front" / "timestamps.txt").write_text("rate_hz: 10\n")
+    (tmp_path / "front" / "timestamps.txt").write_text("rate_hz: 5\n")
     (tmp_path / "car.toml").write_text(f"version = 1\n{camera}")
     argv = ["replay", str(tmp_path / "front"), "--vehicle", str(tmp_path / "car.toml")]
     argv += ["--detectors", ",".join(names), "--no-cache", "-o", str(tmp_path / "run")]
