@@ -76,10 +76,6 @@ PARTS: Final = {
     "ledger": Part(
         ("replay/ledger.py",),
         ("tests/replay/test_ledger.py",),
-        (
-            "tests/replay/test_ledger.py::"
-            "test_warning_is_at_the_line_of_the_user_who_opened_the_log",
-        ),
     ),
     "account": Part(
         ("eval/runs/account.py",),

@@ -49,9 +49,12 @@ class _Rows:
     rows: int
     first_ns: int = 0
     step_ns: int = 1
+    times_ns: tuple[int, ...] = ()
 
     @property
     def log_ns(self) -> NDArray[np.int64]:
+        if self.times_ns:
+            return np.array(self.times_ns, np.int64)
         return self.first_ns + self.step_ns * np.arange(self.rows, dtype=np.int64)
 
     def __len__(self) -> int:
@@ -284,6 +287,8 @@ def test_skips_and_losses_are_stored_with_place_time_and_count() -> None:
         ([_Rows("/t", 4, 100, -1), _Rows("/t", 2, 97, -1)], False),
         ([_Rows("/t", 4, 100, -1), _Rows("/t", 2, 96, 1), _Rows("/t", 4, 90, -1)], False),
         ([_Rows("/t", 4, 100, 0)], False),
+        # Each row is earlier than the first, and the last one later than the row before.
+        ([_Rows("/t", 3, times_ns=(100, 90, 95))], False),
     ],
 )
 def test_topic_is_reported_if_all_its_times_decrease(
@@ -350,18 +355,20 @@ def test_error_names_topic_and_both_counts() -> None:
     )
 
 
-def test_each_loss_is_one_warning() -> None:
+@pytest.mark.parametrize(
+    ("topic", "shown"), [(None, [0, 1, 2]), ("/t", [1, 2]), ("/other", [0, 2]), ("/none", [2])]
+)
+def test_each_loss_of_the_topics_read_is_one_warning(topic: str | None, shown: list[int]) -> None:
     ledger = Ledger("a.log")
     ledger.skip("/t", "not a loss")
+    ledger.drop("/other", "late", 1)
     ledger.drop("/t", "cut", 1, "at byte 9")
     ledger.drop("", "torn", None)
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        warn_of(ledger)
+        warn_of(ledger, topic)
 
-    assert [str(one.message) for one in caught] == [
-        "a.log: /t: cut (at byte 9)",
-        "a.log: unknown topics: torn",
-    ]
+    every = ["a.log: /other: late", "a.log: /t: cut (at byte 9)", "a.log: unknown topics: torn"]
+    assert [str(one.message) for one in caught] == [every[number] for number in shown]
     assert {one.category for one in caught} == {LossWarning}
