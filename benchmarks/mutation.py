@@ -119,7 +119,7 @@ PARTS: Final = {
         tuple(
             f"tests/detectors/cues/test_car_tracks.py::test_stationary_car_{law}"
             for law in (
-                "never_crosses_for_any_ego_motion",
+                "never_crosses_clearly_for_any_ego_motion",
                 "is_neither_oncoming_nor_outgoing",
                 "with_jittering_box_never_crosses",
             )
