@@ -28,7 +28,7 @@ from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections
 from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.registry import chosen
-from crosscue.eval.pipeline.detect import Detecting
+from crosscue.eval.pipeline.detecting import Detecting
 from crosscue.eval.pipeline.whole_run import detect_drive
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import create

@@ -22,7 +22,7 @@ from crosscue.datasets.simulated.drive import DriveSettings, sense, true_motion,
 from crosscue.datasets.simulated.log_files import BUS, GYRO, MAGNETOMETER, sensor_blocks
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, DetectorChoice, Found, Frame, View
-from crosscue.eval.pipeline.detect import Detecting
+from crosscue.eval.pipeline.detecting import Detecting
 from crosscue.eval.pipeline.whole_run import detect_drive, estimate_run
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import create, open_run

@@ -32,7 +32,7 @@ from crosscue.datasets.simulated.drive import DriveSettings, vehicle_text
 from crosscue.detectors import rle
 from crosscue.detectors.base import DetectorChoice
 from crosscue.detectors.images import Encoded
-from crosscue.eval.pipeline.detect import Detecting
+from crosscue.eval.pipeline.detecting import Detecting
 from crosscue.eval.pipeline.whole_run import detect_drive, estimate_run
 from crosscue.eval.recording import save_rrd
 from crosscue.eval.runs.drive import Drive

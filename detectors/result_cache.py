@@ -32,12 +32,6 @@ _SCHEMA: Final = (
 )
 
 
-def default_cache() -> Path:
-    """Path of the command line's result cache, in the user's cache folder."""
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "crosscue" / "detections.sqlite"
-
-
 def picture_key(picture: Encoded) -> bytes:
     """Hash everything that determines a picture's pixels."""
     digest = hashlib.sha256(picture.content)

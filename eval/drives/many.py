@@ -5,18 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from crosscue.eval.batch.drive_list import DriveInput, DriveList, drives_of
-from crosscue.eval.batch.jobs import (
-    Job,
-    JobOutcome,
-    exit_status_of,
-    fingerprint_of,
-    planned,
-    run_many,
-)
-from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
 from crosscue.eval.logs.log import UnopenedLog
 from crosscue.eval.pipeline.outcome import MAX_LINES, Outcome
 from crosscue.eval.pipeline.run import Run
@@ -31,6 +22,9 @@ from crosscue.results import HIDDEN, Result, plain
 from crosscue.verb import Option, compared, keywords
 
 from .replay import ReplaySettings, check_inputs, replay_with
+
+if TYPE_CHECKING:
+    from crosscue.eval.batch.jobs import Job, JobOutcome
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -60,6 +54,8 @@ class ReplayedDrives(Result):
         0 if all runs are complete; 3 for losses, some failures, or tables that could not be merged;
         if every drive failed, their common status, or 1.
         """
+        from crosscue.eval.batch.jobs import exit_status_of  # one drive is no batch
+
         status = exit_status_of(self.drives)
         return status if self.not_merged is None else status or 3
 
@@ -132,6 +128,8 @@ class BatchSettings(ReplaySettings):
 
     def fingerprint(self, drive: DriveInput) -> str:
         """Return a hash of everything besides the logs that determines a drive's run."""
+        from crosscue.eval.batch.jobs import fingerprint_of
+
         flags = compared(self)
         if self.detector_names is not None and not isinstance(self.detector_names, str):
             flags["detectors"] = ",".join(map(str, self.detector_names)) or "none"
@@ -215,7 +213,9 @@ def replay_many(
     settings: BatchSettings,
 ) -> ReplayedDrives:
     """Replay many drives, as ``replay_drives``."""
-    from crosscue.eval.batch.ray_jobs import engine_of  # one drive needs no processes
+    from crosscue.eval.batch.jobs import Job, planned, run_many
+    from crosscue.eval.batch.merge import FOLDER
+    from crosscue.eval.batch.ray_jobs import engine_of
 
     nameless = [one for one in settings.detector_names or () if not isinstance(one, str)]
     if nameless:
@@ -300,6 +300,8 @@ def replay(
 
 
 def _merge(done: Sequence[JobOutcome[Outcome]], output: Path) -> None:
+    from crosscue.eval.batch.merge import FOLDER, gathered, merge_runs
+
     runs, failures = gathered([output])
     ended = {one.job.name: one.error for one in done}
     # A drive that failed now has no run, even if an earlier start left an interrupted one.

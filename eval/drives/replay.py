@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
-from crosscue.detectors.result_cache import default_cache
 from crosscue.eval.logs.log import DriveGiven, Log, UnopenedLog, opened, vehicle_of
 from crosscue.eval.pipeline.run import Run, RunGiven, run_given
 from crosscue.eval.runs.drive import Drive
@@ -31,7 +31,8 @@ def cache_file(*, cache: Path | None = None, no_cache: bool = False) -> Path | N
     """
     if no_cache:
         return None
-    return default_cache() if cache is None else cache
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "crosscue" / "detections.sqlite" if cache is None else cache
 
 
 Cache: TypeAlias = Annotated[Path | str | None, Option(made_by=cache_file)]
@@ -125,8 +126,7 @@ def replay_with(
 ) -> Run:
     """Replay a drive, as ``replay_drive``."""
     from crosscue.eval.fit.first_pose import check_start, with_start
-    from crosscue.eval.pipeline.detect import Detecting
-    from crosscue.eval.pipeline.landmarks import matcher_for, open_for
+    from crosscue.eval.pipeline.detecting import Detecting
     from crosscue.eval.pipeline.whole_run import replay_drive as replay_into
 
     overwrite, resume = settings.overwrite, settings.resume
@@ -142,6 +142,8 @@ def replay_with(
     with ExitStack() as stack:
         database = None
         if settings.landmarks is not None:
+            from crosscue.eval.pipeline.landmarks import matcher_for, open_for
+
             matcher = matcher_for(vehicle)
             database = stack.enter_context(open_for(Path(settings.landmarks), matcher))
         check_start(vehicle, first_pose)
@@ -180,7 +182,7 @@ def detect_drive(
         EmptyResultError: The result is empty; the folder is unchanged.
     """
     from crosscue.detectors.registry import known
-    from crosscue.eval.pipeline.detect import Detecting
+    from crosscue.eval.pipeline.detecting import Detecting
     from crosscue.eval.pipeline.whole_run import detect_drive as detect_into
 
     vehicle = vehicle_of(log, settings.vehicle)
@@ -286,12 +288,13 @@ def choices_for(
         UsageError: A detector does not exist.
         VehicleError: A model card or its weights cannot be read.
     """
+    names = [*vehicle.detectors] if detectors is None else detectors
+    if not len(names):
+        return ()
     from crosscue.detectors.registry import check, chosen
-    from crosscue.eval.pipeline.detect import choices_of
+    from crosscue.eval.pipeline.detecting import choices_of
 
-    sections = choices_of(vehicle)
-    names = [*sections] if detectors is None else detectors
-    choices = chosen(names, sections) if len(names) else ()
+    choices = chosen(names, choices_of(vehicle))
     for choice in choices:
         check(choice)
     return choices

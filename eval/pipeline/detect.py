@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -63,50 +62,13 @@ from crosscue.replay.signals.plan import pictures_only
 from crosscue.replay.time.segments import TimedLog, gaps_text, shift_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.versions import versions_and_commit
-from crosscue.verb import compared
 
 from .clocks import clock_rows
+from .detecting import Detecting
 from .drive_time import time_segments
 from .empty_result import empty_result
 from .visual import TABLE as VISUAL
 from .visual import VisualPass, uses_pictures
-
-
-@dataclass(frozen=True, slots=True)
-class Detecting:
-    """Options of the detect stage.
-
-    Attributes:
-        choices: Detectors, in order.
-        cache: File with results of earlier runs, or None.
-        draw: Number of pictures to write with detections drawn.
-        resume: Keep detections of an earlier start that would be the same.
-        is_required: The user named the detectors, so a drive without a camera is an error.
-    """
-
-    choices: tuple[DetectorChoice, ...]
-    cache: Path | None = field(default=None, compare=False)
-    draw: int = 0
-    resume: bool = field(default=False, compare=False)
-    is_required: bool = field(default=False, compare=False)
-
-    def as_json(self) -> dict[str, object]:
-        """Return the options that determine the result, as JSON values."""
-        options = compared(self)
-        options.pop("choices")
-        return {"detectors": [choice.as_row() for choice in self.choices], **options}
-
-
-def choices_of(vehicle: Vehicle) -> dict[str, DetectorChoice]:
-    """Return the detectors that the vehicle file defines, by name."""
-    return {
-        name: DetectorChoice(
-            name,
-            section.kind,
-            section.settings | ({} if section.card is None else {"card": section.card}),
-        )
-        for name, section in vehicle.detectors.items()
-    }
 
 
 class DetectStage:

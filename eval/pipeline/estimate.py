@@ -13,7 +13,6 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
-from crosscue.eval.pipeline.scene.looked_for import detector_notices
 from crosscue.eval.runs.account import UNATTRIBUTED, Account, account, joined_accounts, reading_of
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, write_manifest, write_timings
@@ -34,7 +33,6 @@ from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.mobileye_tables import MobileyeSink
 from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tables.skipped import write_skipped
-from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.localization.pose_track import PoseColumns
 from crosscue.replay.base import Log
 from crosscue.replay.files.whole_file import sha256_of
@@ -57,13 +55,15 @@ from crosscue.replay.versions import versions_and_commit
 from .clocks import clock_changes, clock_rows
 from .drive_time import refuse_other_segments, selections_of, time_segments
 from .empty_result import empty_result, silent_roles
-from .landmarks import landmark_stage
 from .pose import PoseStage, estimating_of, fused_positions, turn_signal_of
 from .progress import report_time
-from .visual import visual_source, with_visual_scale
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+    from crosscue.localization.landmarks.database import LandmarkDatabase
+
+    from .visual import VisualSource
 
 COVARIANCES: Final = ("xx_m2", "xy_m2", "xh_mrad", "yy_m2", "yh_mrad", "hh_rad2")
 
@@ -141,14 +141,19 @@ class EstimateStage:
             timeline=drive.segments,
         )
         if camera is not None and landmarks is not None:
+            from .landmarks import landmark_stage  # matches pictures
+
             search = landmark_stage(landmarks, vehicle, self._ledgers[camera[0]])
             self.pose.landmarks = search
             self._extractors[camera[0]].on_pictures = search.see
         if before.detected is None:
             begin_again(run, found)
         has_speed = self._planned.source_of(Signal.WHEEL_SPEEDS) is not None
-        is_visual = not has_speed and vehicle.odometry.kind != "wheels"
-        self._visual = visual_source(run) if is_visual else None
+        self._visual: VisualSource | None = None
+        if not has_speed and vehicle.odometry.kind != "wheels":
+            from .visual import visual_source
+
+            self._visual = visual_source(run)
         self._tally = PoseTally()
 
     def windows(self) -> Iterator[SampleWindow]:
@@ -190,6 +195,8 @@ class EstimateStage:
         """Return the drive with the errors that its ranges have."""
         if self._visual is None:
             return self._drive
+        from .visual import with_visual_scale
+
         return replace(self._drive, vehicle=with_visual_scale(self._drive.vehicle))
 
     def finish(self, scene: SceneSummary | None) -> Outcome:
@@ -323,6 +330,8 @@ def _of_detecting(found: DetectManifest | None, vehicle: Vehicle) -> list[str]:
     """Return the notices of the detect stage except gaps, and those on what it stored."""
     if found is None:
         return []
+    from .scene.looked_for import detector_notices
+
     notices = [one for one in found.notices if one not in found.time.notices]
     return list(dict.fromkeys([*notices, *detector_notices(found, vehicle)]))
 

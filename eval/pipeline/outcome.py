@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
-from crosscue.detectors.runner import FrameCounts
 from crosscue.eval.runs.account import Account, account_lines, details_of
 from crosscue.eval.runs.candidates import candidate_lines, not_looked_lines
 from crosscue.eval.runs.folder import RunFolder
@@ -15,6 +14,9 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.safe_text import terminal_width, visible, wrapped
 from crosscue.replay.time.segments import ONE_SEGMENT, TimeSegment
 from crosscue.results import HIDDEN, Result, json_key
+
+if TYPE_CHECKING:
+    from crosscue.detectors.runner import FrameCounts
 
 # Lines of a result that are printed without --verbose.
 MAX_LINES: Final = 25

@@ -49,10 +49,9 @@ from crosscue.replay.signals.windows import SampleWindow
 from crosscue.replay.time.segments import ONE_SEGMENT, Cause, Timeline, TimeSegment
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .visual import VisualSource
-
 if TYPE_CHECKING:
     from .landmarks import LandmarkStage
+    from .visual import VisualSource
 
 # Max plausible fraction of rejected readings; a consistent filter rejects one in a thousand.
 REJECTED_SHARE: Final = 0.1

@@ -6,16 +6,20 @@ did, and what it saw there. Both write into a run folder that the caller has loc
 
 from __future__ import annotations
 
-from crosscue.detectors.result_cache import ResultCache
+from typing import TYPE_CHECKING
+
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DetectManifest, SceneSummary
-from crosscue.localization.landmarks.database import LandmarkDatabase
 
-from .detect import Detecting, DetectStage
+from .detecting import Detecting
 from .estimate import Earlier, EstimateStage
-from .scene.stage import Scene, SceneTables, tables_of_scene
+
+if TYPE_CHECKING:
+    from crosscue.localization.landmarks.database import LandmarkDatabase
+
+    from .scene.stage import SceneTables
 
 
 def detect(drive: Drive, run: RunFolder, detecting: Detecting) -> DetectOutcome:
@@ -26,6 +30,10 @@ def detect(drive: Drive, run: RunFolder, detecting: Detecting) -> DetectOutcome:
         EmptyResultError: The drive has no camera, or the selected part contains no frame.
         OutputError: The disk is full.
     """
+    from crosscue.detectors.result_cache import ResultCache
+
+    from .detect import DetectStage
+
     with ResultCache(detecting.cache) as cache:
         stage = DetectStage(drive, run, detecting, cache)
         with stage.tables as tables:
@@ -58,6 +66,8 @@ def estimate(
         tables.add(stage.last_poses())
     scene = None
     if stage.found is not None:
+        from .scene.stage import tables_of_scene  # not without detectors
+
         seen = stage.scene_drive()
         with tables_of_scene(seen, run, stage.found) as rows:
             scene = observe(seen, run, stage.found, rows)
@@ -87,6 +97,8 @@ def observe(
         RunError: A table is missing or damaged.
         VehicleError: A cue or feature of the settings does not exist.
     """
+    from .scene.stage import Scene
+
     scene = Scene(drive, run, detected, without)
     for step in scene.steps():
         cues = scene.observe(step)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from crosscue.detectors.registry import make
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, clear, locked, staged, write_input
@@ -25,18 +24,20 @@ from crosscue.eval.runs.manifest import (
     LogRow,
     selection_record,
 )
-from crosscue.localization.landmarks.database import LandmarkDatabase
 from crosscue.replay.base import Log
 from crosscue.replay.columns import Topic
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .detect import Detecting
+from .detecting import Detecting
 from .drive_time import with_camera_segments, with_segments
 from .empty_result import nothing_left
 from .estimate import Earlier, begin_again
 from .replay import detect, estimate
+
+if TYPE_CHECKING:
+    from crosscue.localization.landmarks.database import LandmarkDatabase
 
 # Tables of the first stage that the second stage reads.
 TABLES: Final = ("frames.parquet", "detections.parquet", "road.parquet", "skipped.parquet")
@@ -121,6 +122,8 @@ def _kept(drive: Drive, run: RunFolder, detecting: Detecting) -> DetectManifest 
     camera = drive.camera
     if earlier is None or camera is None or not all(run.file(name).exists() for name in TABLES):
         return None
+    from crosscue.detectors.registry import make  # not without detectors
+
     wanted = (
         log_rows(drive.logs, run),
         selection_record(drive.selection),

@@ -12,7 +12,7 @@ from functools import lru_cache
 from textwrap import shorten
 from typing import Annotated, Any, Final, Literal, Self, TypeAlias
 
-from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError
 
 from crosscue.replay.base import Selection
@@ -366,7 +366,9 @@ class Timings(Record):
 DriveManifest: TypeAlias = DetectManifest | EstimateManifest
 Manifest: TypeAlias = DetectManifest | EstimateManifest | MergedManifest | DecodeManifest
 
-_ANY: Final[TypeAdapter[Manifest]] = TypeAdapter(Annotated[Manifest, Field(discriminator="stage")])
+_ANY: Final[TypeAdapter[Manifest]] = TypeAdapter(
+    Annotated[Manifest, Field(discriminator="stage")], config=ConfigDict(defer_build=True)
+)
 
 
 class OtherVersionError(ValueError):

@@ -24,7 +24,7 @@ from crosscue.datasets.scenes.drive import (
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.detectors.registry import EMBEDDED, chosen
 from crosscue.eval.batch.jobs import Engine, Job, JobOutcome, fingerprint_of, run_many
-from crosscue.eval.pipeline.detect import Detecting, choices_of
+from crosscue.eval.pipeline.detecting import Detecting, choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.whole_run import replay_drive
 from crosscue.eval.runs.drive import Drive

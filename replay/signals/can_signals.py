@@ -11,8 +11,6 @@ from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.columns import Block
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.mobileye.can.admit import all_ids
-from crosscue.replay.mobileye.samples import mobileye_settings
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 from .converters import SPEED_UNITS, angle_samples, column_of, wheel_samples
@@ -42,9 +40,12 @@ class CanSignals:
         for sentence in database.notices:
             ledger.notice(sentence)
         wanted = check_signals(database, vehicle, signals)
-        is_shared = not self._signals.isdisjoint(MOBILEYE_SIGNALS)
-        settings = mobileye_settings(vehicle.mobileye, is_shared_bus=is_shared)
-        elsewhere = all_ids(settings) if is_shared else ()
+        elsewhere: Collection[int] = ()
+        if not self._signals.isdisjoint(MOBILEYE_SIGNALS):
+            from crosscue.replay.mobileye.can.admit import all_ids
+            from crosscue.replay.mobileye.samples import mobileye_settings
+
+            elsewhere = all_ids(mobileye_settings(vehicle.mobileye, is_shared_bus=True))
         self._decode: Final = BusDecoder(database, bus, ledger, wanted, elsewhere=elsewhere)
 
     def __call__(self, block: Block) -> Iterator[Samples]:

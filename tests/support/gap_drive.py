@@ -17,7 +17,7 @@ from crosscue.datasets.simulated.drive import dbc_path
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
 from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.detectors.base import Detections, Found, Frame, View, nothing_found
-from crosscue.eval.pipeline.detect import Detecting, choices_of
+from crosscue.eval.pipeline.detecting import Detecting, choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.whole_run import replay_drive
 from crosscue.eval.runs.drive import Drive

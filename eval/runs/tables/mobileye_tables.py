@@ -10,13 +10,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
-from crosscue.detectors.cues.far_side import MobileyeState, end_of, past_counts, state_at
-from crosscue.fusion.evidence import PastCues
-from crosscue.fusion.intersection_range import RangeBelief, Reference
 from crosscue.replay.signals.kinds import (
     LANE_COLUMNS,
     MOBILEYE_SIGNALS,
@@ -29,6 +26,11 @@ from crosscue.replay.vehicle.mobileye_cues import Past
 
 from .labelled import LabelledSink
 from .parquet import TableFolder
+
+if TYPE_CHECKING:
+    from crosscue.detectors.cues.far_side import MobileyeState
+    from crosscue.fusion.evidence import PastCues
+    from crosscue.fusion.intersection_range import RangeBelief
 
 TABLES: Final[Mapping[Signal, tuple[str, tuple[str, ...]]]] = {
     Signal.MOBILEYE_OBSTACLES: ("mobileye_obstacles", OBSTACLE_COLUMNS),
@@ -77,6 +79,8 @@ class StoredMobileye:
 
     def at(self, t_ns: int) -> MobileyeState:
         """Return the device's state at ``t_ns``; call it with times that do not decrease."""
+        from crosscue.detectors.cues.far_side import state_at  # ``MobileyeSink`` needs no cues
+
         keep_ns = round((self._past.max_age_s + 1.0) * 1e9)
         obstacles, lanes = (
             self._readers[signal].around(t_ns, keep_ns) for signal in MOBILEYE_SIGNALS
@@ -94,6 +98,9 @@ class StoredMobileye:
 
     def cues(self, t_ns: int) -> PastCues:
         """Return the cues beyond the intersection at ``t_ns``, evaluated once a range is known."""
+        from crosscue.detectors.cues.far_side import end_of, past_counts
+        from crosscue.fusion.intersection_range import Reference
+
         past = self._past
 
         def counts(best: RangeBelief | None, reference: Reference | None) -> Mapping[str, int]:

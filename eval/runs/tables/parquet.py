@@ -119,8 +119,9 @@ class TableFolder:
         """
         import pyarrow.parquet as pq
 
+        # ``pq.read_table`` imports ``pyarrow.dataset``, and that pandas.
         with self._opened(name) as file:
-            return pq.read_table(file, columns=columns, page_checksum_verification=True)
+            return pq.ParquetFile(file, page_checksum_verification=True).read(columns)
 
     def schema(self, name: str) -> pa.Schema:
         """Read the schema of ``NAME.parquet``.

@@ -13,7 +13,7 @@ from crosscue.detectors.registry import check, chosen
 from crosscue.eval.batch.jobs import JobOutcome, exit_status_of
 from crosscue.eval.batch.ray_jobs import engine_of
 from crosscue.eval.fit.annotated_runs import annotated_approaches, graph_of_runs
-from crosscue.eval.pipeline.detect import choices_of
+from crosscue.eval.pipeline.detecting import choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.drives import DriveJudged, ScoreSettings, pool_scores, score_drive

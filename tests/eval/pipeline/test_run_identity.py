@@ -11,7 +11,7 @@ from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.detectors.base import DetectorChoice
 from crosscue.eval.cli import run
-from crosscue.eval.pipeline.detect import Detecting
+from crosscue.eval.pipeline.detecting import Detecting
 from crosscue.eval.runs.manifest import FORMAT_VERSION
 from crosscue.replay.files.log_identity import of_row
 from support.refusals import refusal

@@ -11,7 +11,7 @@ from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval import cli
-from crosscue.eval.pipeline.detect import Detecting, choices_of
+from crosscue.eval.pipeline.detecting import Detecting, choices_of
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.whole_run import replay_drive
 from crosscue.eval.runs.drive import Drive
