@@ -141,7 +141,8 @@ def _classes(
         return model.class_names
     usual = COCO_90 if guess.numbers_as_coco else COCO_80
     for known in (COCO_80, COCO_90) if not is_road else ():
-        if count == len(known) or (count is None and known is usual):
+        is_unsaid = count is None and known is usual and not guess.needs_names
+        if count == len(known) or is_unsaid:
             unsaid = "" if count else "; the file does not say how many it has (--class-names FILE)"
             assumed.append(f"the {len(known)} classes are COCO's, in its order{unsaid}")
             return known

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import io
 import math
+import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -57,6 +58,10 @@ _ONNX_BYTE: Final = 2
 # Minimum spread of candidates, as a fraction of the input's sides. If the layout is correct, the
 # candidates of all cells are spread over the whole picture.
 SPREAD_FRACTION: Final = 0.5
+# Version of an OpenVINO file, at its beginning, and the oldest one that is still read.
+_OPENVINO_VERSION: Final = re.compile(rb'<net [^>]*\bversion="(\d{1,3})"')
+_OPENVINO_OLDEST: Final = 10
+_MAX_HEAD: Final = 1000
 # Path of the class names in an OpenVINO file, with underscores for spaces.
 _LABELS: Final = ["model_info", "labels"]
 # Task of a segmentation in LibreYOLO's metadata.
@@ -161,6 +166,12 @@ def _tensor(value: Any) -> Tensor:
 def _of_openvino(content: bytes, path: Path) -> Interface:
     if find_spec("openvino") is None:
         raise UsageError(f"{path}: needs the package openvino: pip install openvino")
+    old = _OPENVINO_VERSION.search(content[:_MAX_HEAD])
+    if old and int(old[1]) < _OPENVINO_OLDEST:
+        raise UsageError(
+            f"{path}: version {int(old[1])} of OpenVINO's format, which its releases no longer "
+            "read; convert the network again"
+        )
     ov = import_openvino()
     second = path.with_suffix(".bin")
     weights = read_whole(second, MAX_BYTES) if second.exists() else b""
@@ -170,9 +181,12 @@ def _of_openvino(content: bytes, path: Path) -> Interface:
         names = sorted(port.get_names())
         sides = (side.get_length() if side.is_static else None for side in port.partial_shape)
         is_integer = port.element_type.get_type_name() in ("i32", "i64")
-        return Tensor(names[0] if names else "output0", tuple(sides), is_integer)
+        is_bytes = port.element_type.get_type_name() == "u8"
+        return Tensor(names[0] if names else "output0", tuple(sides), is_integer, is_bytes)
 
-    metadata = _yaml_metadata(path.with_name("metadata.yaml"))
+    # YOLOv5 calls the file as the model.
+    beside = (path.with_name("metadata.yaml"), path.with_suffix(".yaml"))
+    metadata = next(filter(None, map(_yaml_metadata, beside)), {})
     names = class_names(metadata)
     if not names and model.has_rt_info(_LABELS):
         names = tuple(model.get_rt_info(_LABELS).astype(str).split()[:_MANY_CLASSES])
@@ -181,19 +195,20 @@ def _of_openvino(content: bytes, path: Path) -> Interface:
         tuple(tensor(port) for port in model.outputs),
         metadata,
         names,
-        _detected_classes(model),
+        *_detected_classes(model),
     )
 
 
-def _detected_classes(model: Any) -> int | None:
-    """Number of classes that DetectionOutput is given, without the background."""
+def _detected_classes(model: Any) -> tuple[int | None, int | None]:
+    """Number of classes that a suppression is given, and number of the first, if it says so."""
     for operation in model.get_ops():
         if operation.get_type_name() == "DetectionOutput":
             shapes = [operation.input(index).get_partial_shape() for index in (0, 1)]
+            background = operation.get_attributes()["background_label_id"]
             if all(shape.is_static for shape in shapes):
                 boxes, scores = (shape[1].get_length() for shape in shapes)
-                return int(4 * scores // boxes) - 1
-    return None
+                return int(4 * scores // boxes) - 1, 0 if background else 1
+    return None, None
 
 
 def _of_tflite(content: bytes, path: Path) -> Interface:

@@ -8,8 +8,10 @@ from typing import Final, TypeAlias
 from crosscue.detectors.decoders.base import IMAGENET, Guess, Interface, Tensor, static
 
 _MAX_CLASSES: Final = 256
-# Maximum size of an output's pixel, in pixels of the input.
+# Maximum size of an output's pixel, in pixels of the input, and the fewest of them along a side.
+# FOMO finds centers of objects in such a grid: 12 to 40 cells.
 _COARSEST: Final = 8
+_FEWEST: Final = 48
 # What networks expect by the name of their input: in words, and the keys of the card's ``[input]``.
 _Picture: TypeAlias = tuple[str, dict[str, object]]
 _USUAL: Final[_Picture] = ("RGB, scaled to 0..1", {"colour": "rgb", "scale": (1 / 255,) * 3})
@@ -55,6 +57,8 @@ def _classes_of(output: Tensor, model: Interface) -> int | None:
         return None
     height, width, columns, rows = (side or 1 for side in (*sides, *model.declared_px))
     if rows % height or rows * width != columns * height or rows // height > _COARSEST:
+        return None
+    if rows // height == _COARSEST and min(height, width) < _FEWEST:
         return None
     count = static(output.shape, channels)
     if len(output.shape) == 4 and count is not None and 2 <= count <= _MAX_CLASSES:

@@ -83,6 +83,7 @@ class Interface:
         metadata: Text by key, as stored by the exporter.
         class_names: Class names from the metadata; empty if missing.
         class_count: Number of classes that a suppression in the file is given; None without it.
+        first_class: Number of the first class, if the suppression says which is the background.
     """
 
     inputs: tuple[Tensor, ...]
@@ -90,6 +91,7 @@ class Interface:
     metadata: Mapping[str, str]
     class_names: tuple[str, ...] = ()
     class_count: int | None = None
+    first_class: int | None = None
 
     @property
     def layout(self) -> str | None:
@@ -120,6 +122,7 @@ class Guess:
         network: Keys of the card's ``[network]``, for files that contain only tensors.
         usual_size_px: Width and height to run at, where the file does not declare them.
         numbers_as_coco: True if networks of this layout use COCO's class numbers, with gaps.
+        needs_names: True if networks of this layout are seldom trained on COCO.
         is_decided: False if other layouts may have such shapes, so that the reasons only suggest
             this one.
     """
@@ -132,6 +135,7 @@ class Guess:
     network: Mapping[str, object] | None = None
     usual_size_px: tuple[int, int] = (640, 640)
     numbers_as_coco: bool = False
+    needs_names: bool = False
     is_decided: bool = True
 
 

@@ -63,7 +63,10 @@ class YoloV7NmsOutput(BoxOutput):
 
 
 class MmdeployOutput(BoxOutput):
-    """Boxes (1, N, 5): x0, y0, x1, y1 in input pixels, score; class numbers (1, N)."""
+    """Boxes (1, N, 5): x0, y0, x1, y1 in input pixels, score; class numbers (1, N).
+
+    Open Model Zoo's exports have no axis of pictures.
+    """
 
     kind: Literal["mmdeploy"]
     boxes: str = "dets"
@@ -71,8 +74,10 @@ class MmdeployOutput(BoxOutput):
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
-        rows = output_rows(named(outputs, self.boxes, "boxes"), 5, "boxes and scores")
-        labels = named(outputs, self.labels, "labels")
+        boxes, labels = named(outputs, self.boxes, "boxes"), named(outputs, self.labels, "labels")
+        if boxes.ndim == 2:
+            boxes, labels = boxes[None], labels[None]
+        rows = output_rows(boxes, 5, "boxes and scores")
         if labels.shape != (1, len(rows)):
             raise ValueError(f"labels: expected (1, {len(rows)}), got {labels.shape}")
         # Rows after the detections are zeros, and their class may be -1.
@@ -84,6 +89,15 @@ class MmdeployOutput(BoxOutput):
     @classmethod
     def recognise(cls, model: Interface, /) -> Guess | None:
         by_name = {out.name: out for out in model.outputs}
+        if is_called(model, "boxes", "labels") and static(by_name["boxes"].shape, 1) == 5:
+            return Guess(
+                {"kind": "mmdeploy", "boxes": "boxes", "overlap": 1.0},
+                len(model.class_names) or model.class_count,
+                ("outputs boxes, of 5 columns, and labels, as in Open Model Zoo",),
+                ("pixels are BGR, from 0 to 255",),
+                {"colour": "bgr", "fit": "stretch"},
+                needs_names=True,
+            )
         if not is_called(model, "dets", "labels") or static(by_name["dets"].shape, 2) != 5:
             return None
         return Guess(

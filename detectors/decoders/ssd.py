@@ -1,4 +1,4 @@
-"""Decoders of SSD exports of TensorFlow's and OpenVINO's model zoos, with built-in suppression."""
+"""Decoders of SSD: with suppression, of TensorFlow's and OpenVINO's model zoos, and without."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ from .base import (
     Interface,
     Outputs,
     Size,
+    best_class,
     class_numbers,
+    grid_cells,
     is_called,
     named,
+    output_rows,
     static,
 )
 
@@ -135,11 +138,53 @@ class DetectionOutput(BoxOutput):
             return None
         if static(model.outputs[0].shape, 3) != 7 or static(model.outputs[0].shape, 1) != 1:
             return None
+        first = model.first_class
+        start = f"the classes start at {1 if first is None else first}"
         return Guess(
-            {"kind": "ssd", "name": model.outputs[0].name, "overlap": 1.0},
+            {"kind": "ssd", "name": model.outputs[0].name, "overlap": 1.0}
+            | ({} if first is None else {"first_class": first}),
             len(model.class_names) or model.class_count,
-            ("rows of 7, as the operation DetectionOutput returns",),
-            ("class 0 is the background, the classes start at 1 (--first-class)",),
+            (
+                "rows of 7, as the operation DetectionOutput returns",
+                *(() if first is None else (f"{start}, the background is its other number",)),
+            ),
+            (f"class 0 is the background, {start} (--first-class)",) if first is None else (),
             {"colour": "bgr", "fit": "stretch"},
             numbers_as_coco=True,
+        )
+
+
+class SsdScoresOutput(BoxOutput):
+    """Scores (1, N, 1 + C), the first of the background; boxes (1, N, 4): corners in fractions."""
+
+    kind: Literal["ssd-scores"]
+    scores: str = "scores"
+    boxes: str = "boxes"
+
+    @override
+    def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
+        boxes = output_rows(named(outputs, self.boxes, "boxes"), 4, "boxes")
+        scores = output_rows(
+            named(outputs, self.scores, "scores"), 1 + len(self.classes), "scores and a background"
+        )
+        if len(boxes) != len(scores):
+            raise ValueError(f"expected as many boxes as scores, got {len(boxes)}, {len(scores)}")
+        best, classes = best_class(scores[:, 1:])
+        return BoxCandidates(boxes * np.tile(size_px, 2), best, classes)
+
+    @override
+    @classmethod
+    def recognise(cls, model: Interface, /) -> Guess | None:
+        shapes = {out.name: out.shape for out in model.outputs}
+        if shapes.keys() != {"scores", "boxes"} or static(shapes["boxes"], 2) != 4:
+            return None
+        rows, columns = static(shapes["scores"], 1), static(shapes["scores"], 2) or 0
+        if rows != static(shapes["boxes"], 1) or columns < 2 or rows == grid_cells(model):
+            return None
+        return Guess(
+            {"kind": "ssd-scores"},
+            columns - 1,
+            ("its outputs are called scores and boxes, as those of pytorch-ssd and UltraFace",),
+            ("the first score is of the background; pixels are (x - 127) / 128",),
+            {"colour": "rgb", "fit": "stretch", "mean": (127.0,) * 3, "scale": (1 / 128,) * 3},
         )

@@ -13,7 +13,7 @@ from .nanodet import NanodetOutput
 from .nms_tables import EfficientNmsOutput, MmdeployOutput, YoloV7NmsOutput
 from .paddle import PaddleNmsOutput, PpYoloeOutput
 from .picodet import PicodetOutput
-from .ssd import DetectionOutput, TensorflowSsdOutput
+from .ssd import DetectionOutput, SsdScoresOutput, TensorflowSsdOutput
 from .torchvision_export import TorchvisionOutput
 from .yolo import YoloV5Output, YoloV8Output, YoloV8SegOutput
 from .yolo_fastestv2 import YoloFastestV2Output
@@ -41,6 +41,7 @@ AnyBoxOutput: TypeAlias = (
     | DarknetOutput
     | TensorflowSsdOutput
     | DetectionOutput
+    | SsdScoresOutput
 )
 
 # Decoders, in the order in which ``crosscue model init`` lists candidates.

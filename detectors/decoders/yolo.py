@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from .base import (
     GRID_STRIDES,
+    IMAGENET,
     MAX_QUERIES,
     Array,
     BoxCandidates,
@@ -77,7 +78,7 @@ class YoloV5Output(_CentersOutput):
             output is None
             or columns is None
             or columns < 6
-            or (not heads and any(len(out.shape) == 4 for out in model.outputs))
+            or (not heads and prototype_output(model) is not None)
         ):
             return None
         rows, cells = None if heads else static(output.shape, 1), grid_cells(model)
@@ -105,7 +106,10 @@ class YoloV5Output(_CentersOutput):
             columns - 5,
             (why, *((f"its metadata names {names} classes",) if names else ())),
             () if names else ("boxes are in input pixels, with an objectness",),
-            PICTURE,
+            # YOLOP has maps of road and lanes besides.
+            {**PICTURE, **IMAGENET}
+            if any(len(out.shape) == 4 for out in model.outputs)
+            else PICTURE,
             is_decided=bool(names),
         )
 
@@ -128,9 +132,11 @@ class YoloV8Output(_CentersOutput):
     def recognise(cls, model: Interface, /) -> Guess | None:
         names = len(model.class_names)
         found = _transposed(model) or _rows_of_boxes(model)
-        if found is None or len(model.outputs) != 1:
+        # YOLOv9's own export has an auxiliary head before the one that counts.
+        heads, last = len(model.outputs), model.outputs[-1]
+        if found is None or heads > 2 or model.outputs[0].shape != last.shape:
             return None
-        name, rows = found
+        name, rows = last.name, found[1]
         if rows < 5 or (names and names != rows - 4):
             return None
         why = f"{rows} rows: 4 and {rows - 4} classes"
@@ -140,7 +146,10 @@ class YoloV8Output(_CentersOutput):
             {"kind": "yolov8", "name": name, **({"are_corners": True} if are_corners else {})},
             rows - 4,
             (why, *((f"its metadata names {names} classes",) if names else ())),
-            () if names else ("class scores without an objectness",),
+            (
+                *(() if names else ("class scores without an objectness",)),
+                *((f"{name} is the head that counts, as in YOLOv9's export",) * (heads - 1)),
+            ),
             PICTURE,
             is_decided=bool(names),
         )

@@ -33,6 +33,7 @@ Array = NDArray[np.generic]
 # Errors of ONNX Runtime and of LiteRT where an operation is unknown.
 _LACKING: Final = re.compile(
     r"([\w.:]+)\(-?\d+\) is not a registered|custom op: ([\w.-]+\w)|(Select TensorFlow op)"
+    r"|No Op registered for (\w+)"
 )
 # Encoded protobuf key of a tensor that is stored in another file.
 _EXTERNAL: Final = b"\x0a\x08location"
@@ -111,7 +112,7 @@ def load_network(
 def missing_operation(error: Exception) -> str | None:
     """Name the operation that a back end does not know; None if its error is another."""
     found = _LACKING.search(str(error))
-    name = found and (found[1] or found[2] or "Flex, of TensorFlow itself,")
+    name = found and (found[1] or found[2] or found[4] or "Flex, of TensorFlow itself,")
     return found and f"the operation {name} is unknown; export it without that"
 
 

@@ -10,13 +10,14 @@ import numpy as np
 
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.catalog.card import Input
-from crosscue.detectors.decoders.base import IMAGENET, BoxCandidates, BoxOutput, Size
+from crosscue.detectors.decoders.base import IMAGENET, BoxCandidates, BoxOutput, Size, named
 from crosscue.detectors.decoders.plausible import oddity
 from crosscue.detectors.signs.templates import draw_sign_template
 from crosscue.replay.columns import Bytes, Floats
 
 from .backends import Network
 from .box_model import BoxModel
+from .model_detector import RoadModel
 from .picture_input import prepared
 
 # Mean and scale of red, green and blue with which networks are trained.
@@ -30,6 +31,8 @@ _SCALES: Final = {
 _MANY: Final = 100
 _MANY_SURE: Final = 20
 _SURE: Final = 0.98
+# Minimum fraction of pixels without a sure class in maps of points.
+_LOW_FRACTION: Final = 0.9
 # The way to fit a picture that a network may be trained with instead of the card's.
 _OTHER_FIT: Final = {
     "stretch": "letterbox",
@@ -39,23 +42,39 @@ _OTHER_FIT: Final = {
 
 
 def fault_seen(detector: Detector, picture: Bytes | None = None) -> str | None:
-    """Run a detector of boxes on noise, on grey and on a picture; return what cannot be right.
+    """Run a detector on noise, on grey and on a picture; return what cannot be right.
 
     Args:
-        detector: The detector; only the boxes of a model card's are examined.
+        detector: The detector; only those of model cards are examined.
         picture: Pixels (H, W, 3), blue green red; by default the drawing of a sign.
     """
-    if not isinstance(detector, BoxModel):
+    if not isinstance(detector, BoxModel | RoadModel):
         return None
-    for where, pixels in _pictures(detector, picture):
-        why = _oddity_on(detector, pixels)
+    for where, pixels in _pictures(detector.card.input, picture):
+        if isinstance(detector, RoadModel):
+            why = _maps_on(detector, pixels)
+        else:
+            why = _oddity_on(detector, pixels)
         if why is not None:
             return f"on {where}, {why}"
     return None
 
 
-def _pictures(detector: BoxModel, picture: Bytes | None) -> Iterator[tuple[str, Bytes]]:
-    given = detector.card.input
+def _maps_on(detector: RoadModel, pixels: Bytes) -> str | None:
+    """Say that a network's maps are those of points, as of a pose: nearly zero nearly all over."""
+    batch, _ = prepared(pixels, detector.card.input)
+    raw = np.asarray(named(detector.network(batch), detector.output.name), np.float64)
+    if raw.ndim != 4:
+        return None
+    axis = 1 if raw.shape[1] == len(detector.output.classes) else 3
+    best, total = raw.max(axis=axis), raw.sum(axis=axis)
+    is_low = (best < 0.5).mean() > _LOW_FRACTION and raw.min() > -0.1 and 0.0 < raw.max() <= 1.1
+    if not is_low or np.allclose(total, 1.0, atol=0.02):
+        return None
+    return f"{(best < 0.5).mean():.0%} of the pixels have no score of 0.5: these are maps of points"
+
+
+def _pictures(given: Input, picture: Bytes | None) -> Iterator[tuple[str, Bytes]]:
     shape = (given.height_px, given.width_px, 3)
     yield "noise", np.random.default_rng(0).integers(0, 256, shape, np.uint8)
     yield "grey", np.full(shape, 114, np.uint8)

@@ -13,12 +13,12 @@ import pytest
 import crosscue
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.catalog.recognise import (
-    _detected_classes,
     guesses,
+    input_settings,
     plausible,
     read_interface,
 )
-from crosscue.detectors.decoders.base import Size, cell_grid, decoder_name
+from crosscue.detectors.decoders.base import Guess, Size, cell_grid, decoder_name
 from crosscue.detectors.decoders.table import DECODERS
 from crosscue.detectors.networks.model_detector import build
 from crosscue.replay.errors import VehicleError
@@ -270,14 +270,21 @@ def test_yolov6_gets_its_own_pixels(tmp_path: Path) -> None:
     assert (guess.input["colour"], guess.input["fit"]) == ("rgb", "letterbox-center")
 
 
+@pytest.mark.parametrize("background", [0, 2])
 @pytest.mark.parametrize("count", [2, 90])
-def test_number_of_classes_is_read_from_detection_output(count: int) -> None:
-    """Open Model Zoo's pedestrians and vehicles are not COCO's first classes."""
+def test_classes_are_read_from_detection_output(
+    tmp_path: Path, count: int, background: int
+) -> None:
+    """Open Model Zoo's pedestrians and vehicles are not COCO's first classes.
+
+    Its newer networks have the background last.
+    """
     ov = pytest.importorskip("openvino")
     shapes = {"boxes": [1, 400], "scores": [1, 100 * (count + 1)], "priors": [1, 2, 400]}
     given = [ov.opset8.parameter(shape, np.float32, name) for name, shape in shapes.items()]
+    picture = ov.opset8.parameter([1, 3, 32, 64], np.float32, "data")
     settings = {
-        "background_label_id": 0,
+        "background_label_id": background and count,
         "top_k": 400,
         "keep_top_k": [200],
         "nms_threshold": 0.45,
@@ -287,5 +294,53 @@ def test_number_of_classes_is_read_from_detection_output(count: int) -> None:
         "share_location": True,
     }
     found = ov.opset8.detection_output(*given, settings)
+    ov.save_model(ov.Model([found], [picture, *given]), tmp_path / "net.xml")
 
-    assert _detected_classes(ov.Model([found], given)) == count
+    model = read_interface(tmp_path / "net.xml")
+    (guess,) = guesses(model)
+
+    assert guess.class_count == count
+    assert guess.settings.get("first_class", 1) == (0 if background else 1)
+
+
+def test_classes_of_open_model_zoo_are_not_taken_for_coco_s(tmp_path: Path) -> None:
+    net = tmp_path / "net.onnx"
+    net.write_bytes(export(EVERY["mmdeploy, names of Open Model Zoo"](SIZE)))
+
+    with pytest.raises(crosscue.UsageError, match="its classes without names"):
+        crosscue.draft_card(net)
+
+
+def test_openvino_network_of_bytes_scales_its_pixels_itself(tmp_path: Path) -> None:
+    """OpenVINO's PrePostProcessor puts mean and scale into the file."""
+    ov = pytest.importorskip("openvino")
+    given = ov.opset8.parameter([1, 32, 64, 3], np.uint8, "image")
+    rows = ov.opset8.constant(np.zeros((1, 43, 6), np.float32))
+    ov.save_model(ov.Model([rows], [given]), tmp_path / "net.xml")
+
+    model = read_interface(tmp_path / "net.xml")
+    guess = Guess({"kind": "nanodet"}, 1, (), input={"colour": "bgr", "scale": (1 / 255,) * 3})
+
+    assert model.inputs[0].is_bytes
+    assert "scale" not in input_settings(model, guess)
+
+
+def test_names_beside_a_yolov5_openvino_file_are_read(tmp_path: Path) -> None:
+    """Its exporter calls them as the model, other exporters metadata.yaml."""
+    ov = pytest.importorskip("openvino")
+    given = ov.opset8.parameter([1, 3, 32, 64], np.float32, "images")
+    ov.save_model(ov.Model([given], [given]), tmp_path / "best.xml")
+    (tmp_path / "best.yaml").write_text("stride: 32\nnames: {0: cube, 1: cone}\n")
+
+    assert read_interface(tmp_path / "best.xml").class_names == ("cube", "cone")
+
+
+def test_old_openvino_file_is_not_called_incomplete(tmp_path: Path) -> None:
+    pytest.importorskip("openvino")
+    old = tmp_path / "old.xml"
+    old.write_text('<?xml version="1.0"?>\n<net name="vd" version="3" batch="1"><layers/></net>')
+
+    with pytest.raises(crosscue.UsageError, match=r"version 3 of OpenVINO's format.*convert") as e:
+        read_interface(old)
+
+    assert "not a complete" not in str(e.value)

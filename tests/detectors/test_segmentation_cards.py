@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import crosscue
 from crosscue.detectors.base import Frame
 from crosscue.detectors.networks.model_detector import RoadModel, build
-from crosscue.replay.errors import UsageError
+from crosscue.replay.errors import UsageError, VehicleError
 from support.data import shared
 from support.onnx_models import constant_model
 
@@ -66,6 +66,26 @@ def test_other_maps_are_not_taken_for_classes(
 ) -> None:
     with pytest.raises(UsageError, match="not supported"):
         crosscue.draft_card(network(tmp_path, **outputs), classes="road")
+
+
+def test_maps_of_points_are_not_taken_for_classes(tmp_path: Path) -> None:
+    """A pose network's maps are zero but for a spot; a pixel's class has a high score."""
+    maps = np.zeros((1, 17, 8, 16), np.float32)
+    maps[0, :, 5, 7] = 0.9
+
+    with pytest.raises(VehicleError, match=r"not written: .*maps of points"):
+        crosscue.draft_card(
+            network(tmp_path, maps=maps), classes=",".join(["road", *map(str, range(16))])
+        )
+
+
+def test_grid_of_centers_is_not_taken_for_classes(tmp_path: Path) -> None:
+    """Edge Impulse's FOMO has a grid of 12 x 12 for a picture of 96 x 96."""
+    path = tmp_path / "fomo.onnx"
+    path.write_bytes(constant_model((1, 3, 96, 96), {"grid": scores((12, 12), 2)}))
+
+    with pytest.raises(UsageError, match="grid 1x2x12x12: not supported"):
+        crosscue.draft_card(path, classes="road,face")
 
 
 @pytest.mark.parametrize("weights", ROAD_NETWORKS)

@@ -354,6 +354,38 @@ def _ssd(size: Size) -> Sample:
     return Sample({"kind": "ssd", "name": "detection_out"}, {"detection_out": rows})
 
 
+def _ssd_scores(size: Size) -> Sample:
+    """UltraFace and pytorch-ssd: the first score is of the background."""
+    boxes, scores = _pair(size)
+    fractions = np.tile(boxes / np.tile(size, 2), (1, 2, 1))[:, :1500]
+    some = np.tile(np.insert(scores, 0, 0.9, axis=2), (1, 2, 1))[:, :1500]
+    some[:, scores.shape[1] :] = 0.0
+    return Sample({"kind": "ssd-scores"}, {"scores": some, "boxes": fractions})
+
+
+def _boxes_and_labels(size: Size) -> Sample:
+    """Open Model Zoo's ATSS: as mmdeploy, with other names and without the axis of pictures."""
+    dets, labels = _mmdeploy(size).outputs.values()
+    return Sample({"kind": "mmdeploy", "boxes": "boxes"}, {"boxes": dets[0], "labels": labels[0]})
+
+
+def _yolov9_heads(size: Size) -> Sample:
+    """YOLOv9's own export: an auxiliary head, then the one that counts."""
+    columns = _yolov8(size).outputs["output0"]
+    settings = {"kind": "yolov8", "name": "3377"}
+    return Sample(settings, {"output0": np.zeros_like(columns), "3377": columns})
+
+
+def _yolop(size: Size) -> Sample:
+    """YOLOP: boxes, and two maps of the whole input."""
+    rows = _yolov5(size).outputs["output0"]
+    road, lanes = np.zeros((2, 1, 2, size[1], size[0]))
+    return Sample(
+        {"kind": "yolov5", "name": "det_out"},
+        {"det_out": rows, "drive_area_seg": road, "lane_line_seg": lanes},
+    )
+
+
 _FAMILIES: Final[dict[str, Callable[[Size], Sample]]] = {
     "yolox": _yolox,
     "yolov5": _yolov5,
@@ -375,6 +407,7 @@ _FAMILIES: Final[dict[str, Callable[[Size], Sample]]] = {
     "darknet": _darknet,
     "ssd-tensorflow": _ssd_tensorflow,
     "ssd": _ssd,
+    "ssd-scores": _ssd_scores,
 }
 # Other exports of these families.
 VARIANTS: Final[dict[str, Callable[[Size], Sample]]] = {
@@ -387,6 +420,9 @@ VARIANTS: Final[dict[str, Callable[[Size], Sample]]] = {
     "pp-yoloe, one output": _pp_yoloe_joined,
     "yolov8, corners": _yolov8_corners,
     "efficient-nms, names of the plugin": _efficient_nms_plugin,
+    "mmdeploy, names of Open Model Zoo": _boxes_and_labels,
+    "yolov9, two heads": _yolov9_heads,
+    "yolop": _yolop,
 }
 SAMPLES: Final[dict[str, Callable[[], Sample]]] = {
     kind: partial(make, SIZE) for kind, make in _FAMILIES.items()
