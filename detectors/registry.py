@@ -13,14 +13,12 @@ import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from inspect import Parameter, getattr_static, isfunction, signature
-from operator import attrgetter
 from pathlib import Path
 from typing import Final, cast
 
 from crosscue.replay.errors import UsageError, VehicleError
-from crosscue.replay.plugins import offered
+from crosscue.replay.plugins import imported, offered
 
 from .base import Detector, DetectorChoice
 from .box_detector import FunctionDetector
@@ -206,7 +204,7 @@ def _factory_of(
 ) -> tuple[str, Callable[..., object]]:
     """Return the ``module:factory`` of a detector, and the imported factory."""
     place = table.get(choice.kind) or _offered(choice.kind) or choice.kind
-    module, colon, factory = place.partition(":")
+    colon = ":" in place
     if not colon and choice.kind.endswith(_WEIGHTS):
         raise UsageError(
             f"detector {choice.kind!r}: expected a model card (.toml); write one with crosscue "
@@ -218,11 +216,7 @@ def _factory_of(
         close = difflib.get_close_matches(choice.kind, names, n=1)
         hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names)}."
         raise UsageError(f"detector {choice.kind!r}: no such name; {hint} Or use module:factory")
-    try:
-        found = attrgetter(factory)(import_module(module))
-    except (ImportError, AttributeError) as error:
-        raise UsageError(f"detector {place}: {error}; check the module and the name") from None
-    return place, cast("Callable[..., object]", found)
+    return place, cast("Callable[..., object]", imported(place, "detector"))
 
 
 def _offered(name: str) -> str | None:

@@ -15,9 +15,12 @@ import warnings
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib import import_module
+from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, TypeVar
 
-from crosscue.replay.errors import PluginWarning
+from crosscue.replay.errors import PluginWarning, UsageError
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -122,3 +125,25 @@ def described(point: EntryPoint, kind: Kind, problem: str) -> Plugin:
     package = "unknown" if point.dist is None else str(point.dist.metadata["Name"])
     version = "unknown" if point.dist is None else str(point.dist.version)
     return Plugin(point.name, kind, package, version, point.value, problem)
+
+
+def imported(place: str, user: str) -> object:
+    """Return the object that ``module:name`` names, as written in a command or settings file.
+
+    Args:
+        place: Module and name.
+        user: What it is to be, for the error.
+
+    Raises:
+        UsageError: There is no such module or name.
+    """
+    module, _, name = place.partition(":")
+    try:
+        return attrgetter(name)(import_module(module))
+    except (ImportError, AttributeError) as error:
+        # A command does not search the current folder, unlike python -m and python -c.
+        is_here = isinstance(error, ModuleNotFoundError) and Path(f"{module}.py").exists()
+        hint = "check the module and the name"
+        if is_here:
+            hint = f"{module}.py is in this folder, which is not searched: set PYTHONPATH=."
+        raise UsageError(f"{user} {place}: {error}; {hint}") from None

@@ -120,7 +120,7 @@ def draft_vehicle(log: WholeDriveGiven, settings: DraftSettings) -> VehicleDraft
 
     Raises:
         UsageError: A number of the mounting is out of range.
-        EmptyResultError: No topic has a role in a vehicle file.
+        EmptyResultError: No topic has a role, or none is a CAN bus for the databases.
         SchemaError: A database is not valid.
         OutputError: The file exists, or cannot be written.
     """

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Final, NamedTuple, Protocol, cast
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import UsageError
+from crosscue.replay.plugins import imported
 
 MATCHERS: Final[Mapping[str, str]] = {
     "orb": "crosscue.localization.landmarks.matcher:orb",
@@ -113,10 +113,7 @@ def make_matcher(name: str, camera: CameraGeometry = CameraGeometry()) -> Matche
     if not (colon and module and factory):
         known = ", ".join(sorted(MATCHERS))
         raise UsageError(f"matcher {name!r}: there are: {known}, or module:factory of your own")
-    try:
-        build = cast("Callable[[CameraGeometry], Matcher]", getattr(import_module(module), factory))
-    except (ImportError, AttributeError) as error:
-        raise UsageError(f"matcher {name!r}: {error}; check module and factory") from None
+    build = cast("Callable[[CameraGeometry], Matcher]", imported(target, "matcher"))
     try:
         made = build(camera)
     except TypeError as error:

@@ -62,15 +62,21 @@ def examine(logs: Sequence[Log], dbc: Sequence[Path]) -> Examined:
         dbc: Files that describe its buses.
 
     Raises:
-        EmptyResultError: No topic of the logs has a role.
+        EmptyResultError: No topic of the logs has a role, or none is a CAN bus for the files.
         SchemaError: A DBC file cannot be read.
     """
     topics = [topic for log in logs for topic in log.topics]
-    if all(role_of(topic) is None for topic in topics):
-        names = ", ".join(f"{topic.name} ({topic.type_name})" for topic in topics) or "none"
+    names = ", ".join(f"{topic.name} ({topic.type_name})" for topic in topics) or "none"
+    roles = {role_of(topic) for topic in topics}
+    if not roles - {None}:
         raise EmptyResultError(
             f"{', '.join(map(name_of, logs))}: no topic has a role in a vehicle file; there are: "
             f"{names}; expected a log with a CAN bus, camera, compass or inertial unit"
+        )
+    if dbc and Role.CAN not in roles:
+        raise EmptyResultError(
+            f"{', '.join(map(name_of, logs))}: no CAN bus for {', '.join(one.name for one in dbc)};"
+            f" there are: {names}; expected messages of can_msgs/msg/Frame, or a CAN log beside it"
         )
     if not dbc:
         seen = observe(logs, None)

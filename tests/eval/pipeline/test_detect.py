@@ -183,6 +183,21 @@ def test_later_picture_not_matching_intrinsics_is_dropped(tmp_path: Path) -> Non
     assert (account.used, account.dropped) == (4, {OTHER_SIZE: 1})
 
 
+def test_detector_in_a_file_of_this_folder_is_found_or_the_way_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = _folder(tmp_path)
+    (tmp_path / "my_lamps.py").write_text("from support.detecting import build as bright\n")
+    args = [str(log), "-o", str(tmp_path / "run"), "--detectors", "my_lamps:bright", "--no-cache"]
+    monkeypatch.chdir(tmp_path)
+
+    told = refusal(2, "detect", *args)
+
+    assert "my_lamps.py is in this folder, which is not searched: set PYTHONPATH=." in told
+    monkeypatch.syspath_prepend(tmp_path)
+    assert run(["detect", *args, "-q"]) == 0
+
+
 @pytest.mark.parametrize(
     ("detector", "message"),
     [

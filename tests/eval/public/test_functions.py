@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 import crosscue
+from crosscue.datasets.simulated.drive import dbc_path
+from crosscue.replay.errors import EmptyResultError
 from crosscue.replay.progress import Progress, watching
 from crosscue.replay.vehicle.vehicle import parse
 from support.gap_drive import Clock, write_drive
@@ -53,6 +55,20 @@ def test_vehicle_draft_has_published_intrinsics_and_commented_sections(tmp_path:
 
 
 @pytest.mark.slow
+def test_databases_for_a_log_without_a_bus_are_refused_with_the_types_that_are_there(
+    tmp_path: Path,
+) -> None:
+    drive = pandaset_drive(tmp_path / "002", 4)
+
+    with pytest.raises(EmptyResultError) as caught:
+        crosscue.draft_vehicle(drive, [dbc_path()])
+
+    text = str(caught.value)
+    assert text.startswith(f"{drive}: no CAN bus for simulated_car.dbc; there are: ")
+    assert "front_camera (crosscue/Images)" in text
+    assert "can_msgs/msg/Frame" in text
+
+
 def test_vehicle_draft_uses_intrinsics_of_calibration_message(tmp_path: Path) -> None:
     files = crosscue.simulate_approach(tmp_path, "L0", width_px=64)
     known = crosscue.load_vehicle(files.vehicle).camera
