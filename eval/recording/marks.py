@@ -43,6 +43,8 @@ ARROW_STEPS: Final = 4.0
 # Min width of an object with a permanent label, as a fraction of the picture's width. Labels of
 # smaller ones, and those without room, appear under the pointer.
 LABELLED: Final = 0.1
+# Width of the label of a region, as a fraction of the picture's.
+REGION_LABEL: Final = 0.15
 SIDES: Final = ("left", "straight", "right")
 
 
@@ -157,9 +159,13 @@ class Overlays:
     def region(
         self, corners: NDArray[np.float64], colour: Colour, text: str, size_px: tuple[int, int]
     ) -> None:
-        """Draw the part of a region in the picture; the viewer shrinks a picture for the rest."""
+        """Draw the part of a region in the picture; the viewer shrinks a picture for the rest.
+
+        The label is in the middle of the part, where too narrow a part would cut it off.
+        """
         inside = np.clip(corners, 0.0, size_px)
-        if np.ptp(inside, axis=0).all():
+        width_px, height_px = np.ptp(inside, axis=0)
+        if height_px > 0.0 and width_px > REGION_LABEL * size_px[0]:
             self.regions.add(np.vstack([inside, inside[:1]]), colour, text)
 
     def _cars(self, found: tuple[Detections, ...]) -> None:

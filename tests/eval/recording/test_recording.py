@@ -384,6 +384,7 @@ def test_regions_end_at_the_edge_of_the_picture() -> None:
     beside = np.array([(-900.0, 400.0), (-20.0, 400.0), (-20.0, 600.0)])
 
     marks.region(beside, QUIET, "left not seen", SIZE)
+    marks.region(beside + np.array([100.0, 0.0]), QUIET, "left 5 %", SIZE)
     marks.region(beside + np.array([300.0, 0.0]), QUIET, "left 10 %", SIZE)
 
     assert marks.regions.labels == ["left 10 %"]
