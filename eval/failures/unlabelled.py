@@ -45,6 +45,8 @@ QUEUE_M: Final = 15.0
 LANE_M: Final = 2.0
 # Objects do not appear for two frames only.
 BRIEF: Final = 2
+# Severity of a brief moving or parked car, as a fraction of that of a brief sign or light.
+MOTION: Final = 0.25
 # Min overlap (IoU) of boxes of one object.
 SAME_BOX: Final = 0.3
 
@@ -135,6 +137,11 @@ def _suspect(
 
 def _contradicted(run: str, claims: Sequence[_Claim], belief: BeliefRows) -> Iterator[Failure]:
     """Yield cues against which the belief of their approach ended."""
+    closed = {
+        (other.approach, CUES[other.cue].claim[0])
+        for other in claims
+        if other.cue in CUES and not CUES[other.cue].claim[1]
+    }
     for one in claims:
         if one.cue not in CUES or CUES[one.cue].claim[0] not in belief.features:
             continue
@@ -142,6 +149,8 @@ def _contradicted(run: str, claims: Sequence[_Claim], belief: BeliefRows) -> Ite
         rows = np.flatnonzero(belief.approach == one.approach)
         values = belief.features[feature][rows[np.argsort(belief.t_ns[rows], kind="stable")]]
         if one.approach == NONE or not len(values) or not math.isfinite(values[-1]):
+            continue
+        if _is_road(one) and (one.approach, feature) in closed:
             continue
         agreeing = float(values[-1] if is_there else 1.0 - values[-1])
         if agreeing < EVEN:
@@ -156,10 +165,17 @@ def _opposed(run: str, claims: Sequence[_Claim]) -> Iterator[Failure]:
         if pair[0].approach != pair[1].approach or not _exclude(pair[0].cue, pair[1].cue):
             continue
         rare, often = sorted(pair, key=lambda one: len(one.t_ns))
+        if _is_road(rare):
+            continue
         text = f"in {len(rare.t_ns)} frames, {_words(often.cue)} in {len(often.t_ns)}"
         severity = math.log2(1 + len(often.t_ns) / len(rare.t_ns))
         why = f"{_words(often.cue)} excludes it", text
         yield _suspect(run, rare.cue, why, rare.t_ns, severity, rare.approach)
+
+
+def _is_road(claim: _Claim) -> bool:
+    """Return whether a road was seen, which may well be there and closed by a sign."""
+    return claim.cue in CUES and CUES[claim.cue].observed_by == "road"
 
 
 def _exclude(cue: str, other: str) -> bool:
@@ -182,7 +198,10 @@ def _brief(run: str, claims: Sequence[_Claim], frames_ns: Int64s) -> Iterator[Fa
             around = np.searchsorted(frames_ns, times[[0, -1]])
             if len(times) <= BRIEF and around[0] > 0 and around[1] < len(frames_ns) - 1:
                 why = "for a frame or two only", f"found in {len(times)} frames"
-                yield _suspect(run, one.cue, why, times, 1.0 / len(times), one.approach)
+                # A car's motion is judged over frames, so that of one in doubt comes and goes.
+                is_motion = CUES[one.cue].observed_by == "car pairs"
+                severity = (MOTION if is_motion else 1.0) / len(times)
+                yield _suspect(run, one.cue, why, times, severity, one.approach)
 
 
 def _unheeded(

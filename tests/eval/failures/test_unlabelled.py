@@ -105,6 +105,32 @@ def test_object_of_one_frame_is_suspect(tmp_path: Path) -> None:
     assert _kinds(found) == [("cross_traffic_left", "for a frame or two only")]
 
 
+def test_road_that_a_sign_closes_contradicts_nothing(tmp_path: Path) -> None:
+    """The road to the left is seen, and the belief ends at 0 because of the sign."""
+    cues = {"road_left": _found(10, 20), "one_way_right": _found(10, 40)}
+    belief = {"intersection": {10: 0.95}, "left": {10: 0.5, 40: 0.0}}
+
+    assert ("road_left", "the belief ends against it") not in _kinds(
+        _run(tmp_path / "closed", cues, belief=belief)
+    )
+    assert "road_left" not in {one.what for one in _run(tmp_path / "again", cues)}
+    del cues["one_way_right"]
+    assert ("road_left", "the belief ends against it") in _kinds(
+        _run(tmp_path / "open", cues, belief=belief)
+    )
+
+
+def test_sign_of_one_frame_ranks_above_a_car_of_one_frame(tmp_path: Path) -> None:
+    found = _run(
+        tmp_path / "drive", {"cross_traffic_left": _found(20, 21), "one_way_left": _found(30, 31)}
+    )
+
+    assert [one.what for one in found if one.cause == "for a frame or two only"] == [
+        "one_way_left",
+        "cross_traffic_left",
+    ]
+
+
 def test_box_that_one_of_two_detectors_has_is_suspect(tmp_path: Path) -> None:
     one = detections().to_pylist()
     cars = [row for row in one if row["label"] == "car"]

@@ -91,7 +91,7 @@ def test_hostile_names_do_not_become_active_content(tmp_path: Path) -> None:
 def test_what_happened_is_first_and_losses_are_reported(tmp_path: Path) -> None:
     page = _report_text(tmp_path, _scored(tmp_path / "drive"))
 
-    parts = ('class="told"', "rows known to be dropped", 'class="strip"')
+    parts = ('class="told"', "rows known to be dropped", 'class="strip"', "Truth: ")
     order = [page.index(part) for part in (*parts, *HEADINGS)]
     assert order == sorted(order)
     assert "<b>50 of 50</b>" in page
