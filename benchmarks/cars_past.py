@@ -19,6 +19,7 @@ import numpy as np
 from crosscue.datasets.adapters.pandaset import read_pandaset_poses
 from crosscue.datasets.real.annotate_pandaset import BEHIND_M, FAR_KERB_M, VehicleBoxes
 from crosscue.detectors.base import Detections
+from crosscue.detectors.boxes import iou
 from crosscue.detectors.cues.observed import Place
 from crosscue.detectors.cues.tracked.judge import (
     COMES_OR_GOES,
@@ -29,7 +30,6 @@ from crosscue.detectors.cues.tracked.judge import (
 )
 from crosscue.detectors.cues.tracked.motion import CarMotion
 from crosscue.detectors.cues.tracked.tracks import CarTracks
-from crosscue.detectors.ranging.object_tracks import iou
 from crosscue.eval.pipeline.scene.stage import EgoMotion
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.runs.tables.stored_frames import stored_frames

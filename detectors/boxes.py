@@ -11,13 +11,24 @@ from numpy.typing import NDArray
 _BLOCK: Final = 128
 
 
-def box_ious(box: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Intersection over union of one box with each of N others, shape (N,)."""
-    low = np.maximum(box[:2], others[:, :2])
-    high = np.minimum(box[2:], others[:, 2:])
-    both = np.prod(np.maximum(high - low, 0.0), axis=1)
-    areas = np.prod(others[:, 2:] - others[:, :2], axis=1) + np.prod(box[2:] - box[:2])
-    return np.asarray(both / np.maximum(areas - both, 1e-12), np.float64)
+def box_ious(boxes: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Intersection over union of boxes, shape (..., 4), with others of a shape that fits."""
+    low = np.maximum(boxes[..., :2], others[..., :2])
+    sides = np.maximum(np.minimum(boxes[..., 2:], others[..., 2:]) - low, 0.0)
+    both = sides[..., 0] * sides[..., 1]
+    own, other = (np.prod(some[..., 2:] - some[..., :2], axis=-1) for some in (boxes, others))
+    return np.asarray(both / np.maximum(own + other - both, 1e-12), np.float64)
+
+
+def iou(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Intersection over union of two boxes."""
+    # Plain numbers: small arrays would be slow for one pair after the other.
+    left, top, right, bottom = one.tolist()
+    x0, y0, x1, y1 = other.tolist()
+    wide, high = min(right, x1) - max(left, x0), min(bottom, y1) - max(top, y0)
+    inside = max(wide, 0.0) * max(high, 0.0)
+    both = (right - left) * (bottom - top) + (x1 - x0) * (y1 - y0)
+    return float(inside / (both - inside)) if both > inside else 0.0
 
 
 def non_maximum_suppression(
@@ -80,11 +91,5 @@ def _rivals(
     max_overlap: float,
 ) -> NDArray[np.bool_]:
     """Mark pairs of one group that overlap by more than ``max_overlap``, shape (some, others)."""
-    mine, theirs = boxes[some, None], boxes[others]
-    sides = np.minimum(mine[..., 2:], theirs[:, 2:]) - np.maximum(mine[..., :2], theirs[:, :2])
-    sides = np.maximum(sides, 0.0)
-    both = sides[..., 0] * sides[..., 1]
-    own, other = (np.prod(b[:, 2:] - b[:, :2], axis=1) for b in (boxes[some], theirs))
-    union = own[:, None] + other - both
-    is_over = both / np.maximum(union, 1e-12) > max_overlap
+    is_over = box_ious(boxes[some, None], boxes[others]) > max_overlap
     return np.asarray(is_over & (groups[some, None] == groups[others]))

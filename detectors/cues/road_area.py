@@ -200,15 +200,18 @@ def _shown(is_road: NDArray[np.bool_], boxes_px: Floats, away_m: Floats) -> NDAr
     framed = np.zeros((width + 2, height + 2), np.uint8)
     shown = framed[1:-1, 1:-1]
     np.add(columns, np.uint8(SHOWS_GROUND), out=shown)
-    # The run without road that goes up to each pixel begins above this row.
-    rows = np.arange(height, dtype=np.uint16)
-    road_below = np.where(columns, rows, np.uint16(height))[:, ::-1]
-    road_below = np.minimum.accumulate(road_below, axis=1)[:, ::-1]
+    # Row after each pixel's run of pixels without road; 0 for road.
+    pixels = columns.ravel()
+    is_last = np.append(pixels[1:] != pixels[:-1], True)
+    is_last[height - 1 :: height] = True
+    stops = np.flatnonzero(is_last) + 1
+    lengths = np.diff(stops, prepend=0)
+    after = np.where(pixels[stops - 1], 0, (stops - 1) % height + 1).astype(np.uint16)
+    road_below = np.repeat(after, lengths).reshape(columns.shape)
     # First row that is too much nearer than a row above it; so are all rows further down.
-    is_nearer = np.triu(away_m[:, None] - away_m > BESIDE_M)
+    is_nearer = np.triu(away_m < (away_m - BESIDE_M)[:, None])
     nearer = np.where(is_nearer.any(axis=1), is_nearer.argmax(axis=1), height).astype(np.uint16)
-    is_behind = ~columns & (road_below > nearer)
-    shown += is_behind.view(np.uint8) * np.uint8(SHOWS_BEHIND - SHOWS_GROUND)
+    shown += (road_below > nearer).view(np.uint8) * np.uint8(SHOWS_BEHIND - SHOWS_GROUND)
     margin = MARGIN * (boxes_px[:, 2:] - boxes_px[:, :2])
     widened = boxes_px + np.column_stack([-margin[:, 0], 0.0 * margin[:, 0], margin])
     for x0, y0, x1, y1 in np.maximum(np.rint(widened), 0).astype(int).tolist():

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.ranging.object_tracks import iou
+from crosscue.detectors.boxes import iou
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 MIN_IOU: Final = 0.5

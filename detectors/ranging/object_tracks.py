@@ -24,6 +24,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.detectors.boxes import box_ious
+
 from .range_from_motion import MotionRange, range_from_motion, range_from_size
 from .standard_sizes import BOX_SPREAD, SizePrior, size_prior
 
@@ -406,16 +408,17 @@ class ObjectTracks:
             slack: Factor on the permitted distances and logarithms of growth.
         """
         spans_px = np.where(heights_px > 0.0, heights_px, boxes_px[:, 3] - boxes_px[:, 1])
-        pairs = [
-            (away, i, j)
-            for j, track in enumerate(self.tracks)
-            for i, (box_px, span_px) in enumerate(
-                zip(boxes_px.tolist(), spans_px.tolist(), strict=True)
-            )
-            if (away := _cost_of(track, box_px, span_px, slack)) < NEAR_HEIGHTS * slack
-        ]
+        own_px = np.array([one.height_px for one in self.tracks]).reshape(-1, 1)
+        predicted_px = np.array([one.box_px for one in self.tracks]).reshape(-1, 1, 4)
+        off_px = boxes_px - predicted_px
+        # Distance of a box from the predicted box, in heights.
+        away = 0.5 * np.hypot(off_px[..., 0] + off_px[..., 2], off_px[..., 1] + off_px[..., 3])
+        away /= np.maximum(spans_px, own_px)
+        is_near = np.abs(np.log(spans_px / own_px)) <= slack * math.log(GROWTH)
+        is_near &= away < NEAR_HEIGHTS * slack
         found: list[ObjectTrack | None] = [None] * len(boxes_px)
-        for _, i, j in sorted(pairs):
+        pairs = np.argwhere(is_near).tolist()
+        for _, i, j in sorted((float(away[j, i]), i, j) for j, i in pairs):
             track = self.tracks[j]
             if found[i] is None and not track.is_seen:
                 track.observe(boxes_px[i], float(heights_px[i]), self._cue)
@@ -424,29 +427,27 @@ class ObjectTracks:
 
     def _is_found(self, boxes_px: NDArray[np.float64], i: int) -> bool:
         """Return whether a box without a track is of an object with another box."""
-        is_again = any(
-            one is not None and iou(boxes_px[i], boxes_px[j]) > SAME_IOU
-            for j, one in enumerate(self.of_boxes)
-        )
+        found = [j for j, one in enumerate(self.of_boxes) if one is not None]
+        is_again = bool((box_ious(boxes_px[i], boxes_px[found]) > SAME_IOU).any())
         self.counts["boxes of an object already found"] += is_again
         return is_again
 
     def _share_sizes(self) -> None:
         """Combine each object's size with the sizes by motion of similar objects."""
         tracks = [one for one in self.tracks if one.is_accepted]
+        sizes = [one.size_by_motion() for one in tracks]
         said = [
-            (one, by_motion)
-            for one in tracks
-            if one.seen >= MIN_SEEN and (by_motion := one.size_by_motion()) is not None
+            (one, size)
+            for one, size in zip(tracks, sizes, strict=True)
+            if one.seen >= MIN_SEEN and size is not None
         ]
-        for one in tracks:
-            own = one.size_by_motion()
+        for one, own in zip(tracks, sizes, strict=True):
             others = [
-                by_motion
-                for other, by_motion in said
+                size
+                for other, size in said
                 if other is not one
                 and is_alike(one.aspect, other.aspect)
-                and (own is None or may_be_one_make(own, by_motion))
+                and (own is None or may_be_one_make(own, size))
             ]
             if others and one.is_seen:
                 one.weigh(shared_size(one.size, others))
@@ -501,26 +502,6 @@ def shared_size(size: SizePrior, others: Sequence[tuple[float, float]]) -> SizeP
     mean = sum(off / (own + var) for off, var in others) / precision
     var = own + 1.0 / precision
     return SizePrior(math.exp(size.log_mean + mean + 0.5 * var), math.sqrt(math.expm1(var)))
-
-
-def iou(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Intersection over union of two boxes."""
-    # Plain numbers: this is called for all pairs of boxes, and small arrays would be slow.
-    left, top, right, bottom = one.tolist()
-    x0, y0, x1, y1 = other.tolist()
-    wide, high = min(right, x1) - max(left, x0), min(bottom, y1) - max(top, y0)
-    inside = max(wide, 0.0) * max(high, 0.0)
-    both = (right - left) * (bottom - top) + (x1 - x0) * (y1 - y0)
-    return float(inside / (both - inside)) if both > inside else 0.0
-
-
-def _cost_of(track: ObjectTrack, box_px: Sequence[float], height_px: float, slack: float) -> float:
-    """Distance of a box from the predicted box, in heights; infinite if the heights differ."""
-    if abs(math.log(height_px / track.height_px)) > slack * math.log(GROWTH):
-        return math.inf
-    (x0, y0, x1, y1), (left, top, right, bottom) = box_px, track.box_px.tolist()
-    apart_px = math.hypot(0.5 * (x0 + x1 - left - right), 0.5 * (y0 + y1 - top - bottom))
-    return apart_px / max(height_px, track.height_px)
 
 
 def _is_over(track: ObjectTrack) -> bool:

@@ -21,10 +21,10 @@ The scale of the errors is estimated with the range, from residuals and a weak p
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from statistics import median
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,7 @@ class MotionRange:
 NEAREST_M: Final = 0.5
 FURTHEST_M: Final = 500.0
 GRID: Final = 101
+STEPS: Final = np.linspace(0.0, 1.0, GRID)
 # Number of standard deviations beyond which an observation's weight decreases with the square of
 # its distance.
 OUTLIER: Final = 2.5
@@ -106,23 +107,30 @@ def range_from_motion(
         ValueError: There are no observations, shapes differ, or a height or the focal length is not
             positive.
     """
-    seen = _checked(travelled_m, height_px, focal_px, errors)
+    seen = _checked(travelled_m, height_px, focal_px, size, errors)
     nearest_m = max(NEAREST_M, 1.01 * -float(seen.ahead_m.min()))
     furthest_m = max(FURTHEST_M, 2.0 * nearest_m)
-    wide = _Grid.of(seen, *_ranges(nearest_m, furthest_m), size)
+    wide = _Grid.of(seen, *_ranges(nearest_m, furthest_m))
     weights = seen.worth * _first_weights(wide.off, seen.var)
     post = _refined(seen, wide, weights, size)
     for _ in range(ROUNDS):
-        residual = seen.excess(np.array([post.mean_m]))[0] - np.log(post.height_m)
-        new = seen.worth * _weights(seen, residual, errors)
+        new = seen.worth * _weights(seen, seen.off(post.mean_m) - post.at_mean, errors)
         if (np.abs(new - weights) <= 1e-3 * weights).all():
             break
         weights = new
         post = _refined(seen, wide, weights, size)
-    angle = median(seen.log_angle[-5:].tolist())
+    angle = median((seen.log_excess[-5:] + size.log_mean).tolist())
     before_m2 = _var_of_one_m2(angle, float(seen.var[-1]), size, (nearest_m, furthest_m))
     by_motion = min(max(1.0 - post.var_m2 / before_m2, 0.0), 1.0)
-    return replace(post, by_motion=by_motion)
+    log_height, log_height_var = post.log_height()
+    return MotionRange(
+        post.mean_m,
+        post.var_m2,
+        math.exp(size.log_mean + post.at_mean),
+        by_motion,
+        size.log_mean + log_height,
+        log_height_var,
+    )
 
 
 def range_from_size(height_px: float, focal_px: float, size: SizePrior) -> MotionRange:
@@ -138,30 +146,31 @@ def range_from_size(height_px: float, focal_px: float, size: SizePrior) -> Motio
     return MotionRange(mean_m, var_m2, size.mean_m, 0.0, size.log_mean, size.log_var)
 
 
-@dataclass(frozen=True, slots=True)
-class _Observations:
+class _Observations(NamedTuple):
     """All observations, as arrays of shape (N,).
 
     Attributes:
         ahead_m: Range at the observation minus range at the last observation.
-        log_angle: Logarithm of height over focal length.
-        var: Prior variance of ``log_angle``.
+        log_excess: Logarithm of height over focal length, less the mean logarithm of the size.
+        var: Prior variance of ``log_excess``.
         worth: Weight of each observation, in independent observations.
     """
 
     ahead_m: Floats
-    log_angle: Floats
+    log_excess: Floats
     var: Floats
     worth: Floats
 
-    def excess(self, range_m: Floats) -> Floats:
-        """Log height by each observation if the last range is ``range_m``, shape (G, N)."""
-        depth = np.maximum(range_m[:, None] + self.ahead_m[None, :], 1e-3)
-        return np.asarray(self.log_angle[None, :] + np.log(depth), np.float64)
+    def off(self, range_m: Floats | float) -> Floats:
+        """Log height above its mean if the last range is ``range_m``, shape (G, 1) or a number."""
+        found: Floats = range_m + self.ahead_m
+        np.log(found, out=found)
+        found += self.log_excess
+        return found
 
 
 def _checked(
-    travelled_m: Floats, height_px: Floats, focal_px: float, errors: HeightErrors
+    travelled_m: Floats, height_px: Floats, focal_px: float, size: SizePrior, errors: HeightErrors
 ) -> _Observations:
     if travelled_m.ndim != 1 or travelled_m.shape != height_px.shape or not len(travelled_m):
         raise ValueError(
@@ -176,7 +185,8 @@ def _checked(
     # tanh(step / length / 2).
     worth = np.concatenate(([1.0], np.tanh(0.5 * step_m / errors.resemble_m)))
     var = errors.fraction**2 + (errors.edges_px / height_px) ** 2
-    return _Observations(travelled_m[-1] - travelled_m, np.log(height_px / focal_px), var, worth)
+    log_excess = np.log(height_px / focal_px) - size.log_mean
+    return _Observations(travelled_m[-1] - travelled_m, log_excess, var, worth)
 
 
 class _Grid(NamedTuple):
@@ -188,10 +198,10 @@ class _Grid(NamedTuple):
     squares: Floats
 
     @classmethod
-    def of(cls, seen: _Observations, range_m: Floats, prior: Floats, size: SizePrior) -> _Grid:
+    def of(cls, seen: _Observations, range_m: Floats, prior: Floats) -> Self:
         """Compute the heights."""
-        off = seen.excess(range_m) - size.log_mean
-        return cls(range_m, prior, off, off**2)
+        off = seen.off(range_m[:, None])
+        return cls(range_m, prior, off, off * off)
 
 
 @lru_cache(maxsize=8)
@@ -237,12 +247,14 @@ def _medians(rows: Floats) -> Floats:
 def _weights(seen: _Observations, residual: Floats, errors: HeightErrors) -> Floats:
     """Inverse variances, with the errors' scale from the residuals and its prior."""
     squares = residual**2 / seen.var
-    scale = 1.0
+    scale, before = 1.0, math.nan
     for _ in range(ROUNDS):
+        if scale == before:
+            break
         trust = seen.worth * _trust(squares / scale)
         # Range and size use up two degrees of freedom.
         left = max(float(trust.sum()) - 2.0, 0.0)
-        scale = (errors.worth + float(trust @ squares)) / (errors.worth + left)
+        before, scale = scale, (errors.worth + float(trust @ squares)) / (errors.worth + left)
     return np.asarray(_trust(squares / scale) / (scale * seen.var), np.float64)
 
 
@@ -251,33 +263,59 @@ def _trust(squares: Floats) -> Floats:
     return OUTLIER**2 / np.maximum(squares, OUTLIER**2)
 
 
-def _refined(seen: _Observations, grid: _Grid, weights: Floats, size: SizePrior) -> MotionRange:
+class _Posterior(NamedTuple):
+    """Posterior of the range, with the size integrated out.
+
+    Attributes:
+        mean_m: Its mean.
+        var_m2: Its variance.
+        density: Shape (G,), of sum 1.
+        pull: Shape (G,): weighted sum of the log heights at each range.
+        at_mean: Log height at the mean range, above its prior mean.
+        precision: Inverse variance of the log height at a given range.
+    """
+
+    mean_m: float
+    var_m2: float
+    density: Floats
+    pull: Floats
+    at_mean: float
+    precision: float
+
+    def log_height(self) -> tuple[float, float]:
+        """Mean above its prior mean, and variance, of the logarithm of the height."""
+        mean, var = _moments(self.density, self.pull / self.precision)
+        return mean, var + 1.0 / self.precision
+
+
+def _refined(seen: _Observations, grid: _Grid, weights: Floats, size: SizePrior) -> _Posterior:
     """Compute the posterior on successively finer grids; it can be narrower than a grid's steps."""
-    post = _posterior(seen, grid, weights, size)
+    precision = float(weights.sum()) + 1.0 / size.log_var
+    mean_m, var_m2, density, pull = _on_grid(grid, weights, precision)
     for _ in range(2):
         range_m = grid.range_m
-        near = max(int(np.searchsorted(range_m, post.mean_m)), 1)
-        step_m = float(range_m[min(near, len(range_m) - 1)] - range_m[near - 1])
-        reach_m = max(8.0 * math.sqrt(post.var_m2), 2.0 * step_m)
-        near_m, far_m = max(post.mean_m - reach_m, range_m[0]), post.mean_m + reach_m
-        range_m = np.linspace(near_m, min(far_m, range_m[-1]), GRID)
-        grid = _Grid.of(seen, range_m, 1.0 / range_m, size)
-        post = _posterior(seen, grid, weights, size)
-    return post
+        near = max(int(range_m.searchsorted(mean_m)), 1)
+        step_m = float(range_m[min(near, GRID - 1)] - range_m[near - 1])
+        reach_m = max(8.0 * math.sqrt(var_m2), 2.0 * step_m)
+        near_m = max(mean_m - reach_m, float(range_m[0]))
+        range_m = near_m + (min(mean_m + reach_m, float(range_m[-1])) - near_m) * STEPS
+        grid = _Grid.of(seen, range_m, 1.0 / range_m)
+        mean_m, var_m2, density, pull = _on_grid(grid, weights, precision)
+    at_mean = float(seen.off(mean_m) @ weights) / precision
+    return _Posterior(mean_m, max(var_m2, 1e-12), density, pull, at_mean, precision)
 
 
-def _posterior(seen: _Observations, grid: _Grid, weights: Floats, size: SizePrior) -> MotionRange:
-    """Posterior of the range, with the size integrated out."""
-    precision = float(weights.sum()) + 1.0 / size.log_var
+def _on_grid(grid: _Grid, weights: Floats, precision: float) -> tuple[float, float, Floats, Floats]:
+    """Mean, variance and density of the range, and weighted sums of the log heights."""
     pull = grid.off @ weights
-    log_density = -0.5 * (grid.squares @ weights - pull**2 / precision)
-    density = np.exp(log_density - log_density.max()) * grid.prior
+    log_density = pull * pull / precision - grid.squares @ weights
+    density = np.exp(0.5 * (log_density - log_density.max())) * grid.prior
     density /= density.sum()
-    mean_m = float(density @ grid.range_m)
-    var_m2 = float(density @ (grid.range_m - mean_m) ** 2)
-    at_mean = seen.excess(np.array([mean_m]))[0] - size.log_mean
-    height_m = math.exp(size.log_mean + float(at_mean @ weights) / precision)
-    log_heights = size.log_mean + pull / precision
-    log_height = float(density @ log_heights)
-    log_height_var = float(density @ (log_heights - log_height) ** 2) + 1.0 / precision
-    return MotionRange(mean_m, max(var_m2, 1e-12), height_m, 0.0, log_height, log_height_var)
+    return *_moments(density, grid.range_m), density, pull
+
+
+def _moments(density: Floats, values: Floats) -> tuple[float, float]:
+    """Mean and variance of values, shape (G,), by their density."""
+    mean = float(density @ values)
+    off = values - mean
+    return mean, float(density @ (off * off))

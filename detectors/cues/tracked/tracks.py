@@ -9,7 +9,7 @@ it would be if it stood.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections
+from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.cues.observed import nose_of
 from crosscue.detectors.cues.tracked.motion import (
     ALONG_ASIDE_MPS,
@@ -28,7 +29,7 @@ from crosscue.detectors.cues.tracked.motion import (
     place_of_end,
 )
 from crosscue.detectors.ranging.ground_plane import GroundPlane
-from crosscue.detectors.ranging.object_tracks import CarStep, iou
+from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.detectors.ranging.usable import are_cut
 from crosscue.replay.vehicle.vehicle import Camera, Cars
 
@@ -221,19 +222,15 @@ class CarTracks:
         A box of low score only continues a track, at its predicted box, because the score of a
         distant or half hidden car falls below the threshold in every other frame.
         """
+        moving = self._predicted(cars)
         used: set[int] = set()
         again: list[_Track] = []
-        for cost, sure in ((_cost_moving, True), (_cost_standing, True), (_cost_moving, False)):
-            pairs = sorted(
-                (away, i, j)
-                for j, track in enumerate(self._tracks)
-                for i, (box, one) in enumerate(cars)
-                if i not in used
-                and one.is_sure == sure
-                and track.seen[-1].t_s < self._t_s
-                and (away := cost(track, box, one)) < math.inf
-            )
-            for _, i, j in pairs:
+        for pairs, sure in (
+            (moving, True),
+            (self._standing(cars, used), True),
+            (moving, False),
+        ):
+            for _, i, j in sorted(pair for pair in pairs if cars[pair[1]][1].is_sure == sure):
                 track = self._tracks[j]
                 if i not in used and track.seen[-1].t_s < self._t_s:
                     used.add(i)
@@ -244,6 +241,36 @@ class CarTracks:
                 self._begun += 1
                 self._tracks.append(_Track(self._begun, box, np.zeros(4), [one]))
         return again
+
+    def _predicted(
+        self, cars: Sequence[tuple[NDArray[np.float64], Observation]]
+    ) -> list[tuple[float, int, int]]:
+        """Boxes that overlap a predicted box: cost, index of the box and of the track."""
+        if not cars or not self._tracks:
+            return []
+        late_s = [self._t_s - track.seen[-1].t_s for track in self._tracks]
+        boxes_px = np.array(
+            [
+                track.box_px + late * track.edges_pxps
+                for track, late in zip(self._tracks, late_s, strict=True)
+            ]
+        )
+        overlap = box_ious(boxes_px[:, None], np.array([box for box, _ in cars]))
+        last_m = np.array([track.seen[-1].distance_m for track in self._tracks])
+        grown = np.array([one.distance_m for _, one in cars]) / last_m[:, None]
+        is_same = (overlap > MIN_OVERLAP) & (grown > 1.0 / GROWTH) & (grown < GROWTH)
+        return [(1.0 - float(overlap[j, i]), i, j) for j, i in np.argwhere(is_same).tolist()]
+
+    def _standing(
+        self, cars: Sequence[tuple[NDArray[np.float64], Observation]], used: set[int]
+    ) -> Iterator[tuple[float, int, int]]:
+        """Boxes that are left where a standing car would be, as ``_predicted``."""
+        for j, track in enumerate(self._tracks):
+            for i, (box, one) in enumerate(cars):
+                if i not in used and one.is_sure and track.seen[-1].t_s < self._t_s:
+                    away = _cost_standing(track, box, one)
+                    if away < math.inf:
+                        yield away, i, j
 
 
 def past_within_m(camera: Camera, settings: Cars) -> float:
@@ -288,18 +315,6 @@ def _moved(axle: tuple[float, float, float], motion: CarStep) -> tuple[float, fl
         y + way_m * math.sin(middle),
         heading + motion.turned_rad,
     )
-
-
-def _cost_moving(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float:
-    """Cost of a box by its overlap with the predicted box; infinite if it does not match.
-
-    A car that was seen only once has no prediction.
-    """
-    last = track.seen[-1]
-    if not 1.0 / GROWTH < one.distance_m / last.distance_m < GROWTH:
-        return math.inf
-    overlap = iou(track.box_px + (one.t_s - last.t_s) * track.edges_pxps, box_px)
-    return 1.0 - overlap if overlap > MIN_OVERLAP else math.inf
 
 
 def _cost_standing(track: _Track, box_px: NDArray[np.float64], one: Observation) -> float:

@@ -5,11 +5,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.detectors.base import Detections
+from crosscue.detectors.boxes import iou
 from crosscue.detectors.cues.candidates import SAME_OBJECT
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections
 from crosscue.detectors.cues.same_object import KEPT, MIN_IOU, label_meanings, same_objects
-from crosscue.detectors.ranging.object_tracks import iou
 from crosscue.replay.vehicle.vehicle import Cars, Cues, Vehicle
 
 VEHICLE = Vehicle(version=1, cues=Cues(kind="frames"), cars=Cars(labels=("car", "truck")))
