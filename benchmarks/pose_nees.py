@@ -60,8 +60,12 @@ HORIZONS_S: Final = (5, 10, 20, 30, 60)
 # Length of a part of a long drive; a shorter drive is cut in halves.
 PART_S: Final = 85.0
 SIMULATED_S: Final = 150.0
-KINDS: Final = ("straight", "turns", "stop and go")
+SHORT: Final = "short, by wheels"
+KINDS: Final = ("straight", "turns", "stop and go", SHORT)
 FIX_SD_M: Final = 0.3
+# A short drive has no gyro and better positions.
+SHORT_S: Final = 60.0
+SHORT_FIX_SD_M: Final = 0.1
 # Start of a prediction before its first position, and the heading below which a car has moved.
 START_SD_M: Final = 30.0
 START_SD_RAD: Final = 0.3
@@ -197,17 +201,19 @@ def recorded(log: Path, vehicle: Vehicle, truth: Path | None) -> dict[str, Known
 
 
 def simulated(kind: str, seed: int) -> KnownDrive:
-    """Simulate a drive with positions of ``FIX_SD_M`` once a second."""
+    """Simulate a drive with positions once a second."""
     settings = DriveSettings(seed=seed, blocks=14)
     motion = true_motion(settings) if kind == "turns" else _motion(kind, seed)
     read = sense(motion, settings)
     rows = slice(None, None, 100)
+    fix_sd_m = SHORT_FIX_SD_M if kind == SHORT else FIX_SD_M
     xy = np.column_stack([motion.x_m[rows], motion.y_m[rows]])
-    xy += np.random.default_rng([seed, 21]).normal(0.0, FIX_SD_M, xy.shape)
-    cov = np.tile(np.eye(2) * FIX_SD_M**2, (len(xy), 1, 1))
+    xy += np.random.default_rng([seed, 21]).normal(0.0, fix_sd_m, xy.shape)
+    cov = np.tile(np.eye(2) * fix_sd_m**2, (len(xy), 1, 1))
+    gyro = TurnSignal(read.gyro_t_ns, read.gyro_radps[:, 2], "yaw rate")
     return KnownDrive(
         WheelSamples(read.wheel_t_ns, read.wheels_mps),
-        TurnSignal(read.gyro_t_ns, read.gyro_radps[:, 2], "yaw rate"),
+        None if kind == SHORT else gyro,
         Fixes(motion.t_ns[rows], xy, cov),
         (0.0, 0.0),
     )
@@ -216,7 +222,7 @@ def simulated(kind: str, seed: int) -> KnownDrive:
 def _motion(kind: str, seed: int) -> TrueMotion:
     """Return a straight drive at changing speed, or one with stops and gentle bends."""
     rng = np.random.default_rng([seed, 20])
-    t_s = np.arange(round(SIMULATED_S * 100)) * 0.01
+    t_s = np.arange(round((SHORT_S if kind == SHORT else SIMULATED_S) * 100)) * 0.01
     phase = rng.uniform(0.0, 2.0 * np.pi, 2)
     speed = 15.0 + 3.0 * np.sin(2.0 * np.pi * t_s / 40.0 + phase[0])
     yaw = np.zeros(len(t_s))

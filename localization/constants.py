@@ -6,12 +6,16 @@ from the settings, and the pose filter is augmented by them (Bar-Shalom, Li, Kir
 *Estimation with Applications to Tracking and Navigation*, section 11.9). The motion's Jacobian
 propagates them; measurements of the pose update them by their correlation with it. A parameter may
 drift as a random walk. Without constants, the filter is the published one.
+
+With them, the covariance is of second order in the heading: a car whose heading is uncertain comes
+less far than the arc says. These errors of all steps since a measurement have one sign, so that
+their sum is kept, and not the sum of their squares.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -51,6 +55,7 @@ class Constants:
         cov: Shape (K, K).
         cross: Shape (4, K): covariance of the pose's states and the parameters.
         drift_var_per_s: Shape (K,): growth of each parameter's variance per second.
+        lost_m: Shape (2,): expected way lost by the heading's uncertainty since a measurement.
     """
 
     names: tuple[str, ...]
@@ -58,6 +63,7 @@ class Constants:
     cov: Floats
     cross: Floats
     drift_var_per_s: Floats
+    lost_m: Floats = field(default_factory=lambda: np.zeros(2))
 
 
 NO_CONSTANTS: Final = Constants((), np.empty(0), np.empty((0, 0)), np.empty((4, 0)), np.empty(0))
@@ -208,8 +214,14 @@ def predict_constants(
     shared = moved @ by_input.T
     added = shared + shared.T + caused @ by_input.T
     after = predict_pose(state, distance_m + off_m, turn_rad + off_rad, *noise)
+    hh = after.hh + float(added[HEADING, HEADING])
+    before_m = constants.lost_m
+    lost_m = before_m + 0.5 * hh * np.subtract(after[:2], state[:2])
+    # The mean square of a squared Gaussian is three times the square of its mean.
+    added[:2, :2] += 3.0 * (np.outer(lost_m, lost_m) - np.outer(before_m, before_m))
     cov = np.array(after[4:]) + added[_UPPER]
-    return State(*after[:4], *cov.tolist()), _drifted(constants, moved + caused, dt_s)
+    moved_on = replace(_drifted(constants, moved + caused, dt_s), lost_m=lost_m)
+    return State(*after[:4], *cov.tolist()), moved_on
 
 
 def coast_constants(belief: PoseBelief, constants: Constants, dt_s: float) -> Constants:
@@ -245,4 +257,5 @@ def update_constants(constants: Constants, before: PoseBelief, after: PoseBelief
         mean=constants.mean + gain @ moved,
         cov=constants.cov + gain @ (after.cov - before.cov) @ gain.T,
         cross=after.cov @ gain.T,
+        lost_m=np.zeros(2),
     )

@@ -235,6 +235,7 @@ def _follow(
     ahead_m, left_m = lever_m
     n, count = len(state), 0
     moved, by, seen = np.zeros((3, n - 2)), np.zeros((3, 2)), np.zeros((2, n))
+    lost = np.zeros(2)
     for row in range(len(steps.at_fix)):
         effect = steps.by[row]
         distance_m, turn_rad = steps.distance_m[row], steps.turn_rad[row]
@@ -270,6 +271,13 @@ def _follow(
         for i in range(2):
             # The filter's position includes the error of the positions that wanders.
             p[i, i] += steps.wander_var_m2[row]
+        # Of second order, as in ``predict_constants``; ``moved`` has the step as (-y, x).
+        less = 0.5 * p[2, 2] * moved[1, 0], -0.5 * p[2, 2] * moved[0, 0]
+        for i in range(2):
+            for j in range(2):
+                p[i, j] += 3.0 * (less[i] * (lost[j] + less[j]) + lost[i] * less[j])
+        lost[0] += less[0]
+        lost[1] += less[1]
         for k in range(n - 3):
             p[3 + k, 3 + k] += steps.drift_var[row, k]
         k = steps.at_fix[row]
@@ -297,6 +305,7 @@ def _follow(
             if more == 1.0:
                 more = max((x * wx + y * wy) / GATE_NIS, 1.0)
         state += seen[0] * wx + seen[1] * wy
+        lost[:] = 0.0
         for i in range(n):
             a = (seen[0, i] * syy - seen[1, i] * sxy) * per
             b = (seen[1, i] * sxx - seen[0, i] * sxy) * per
