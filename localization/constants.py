@@ -216,7 +216,7 @@ def predict_constants(
     after = predict_pose(state, distance_m + off_m, turn_rad + off_rad, *noise)
     hh = after.hh + float(added[HEADING, HEADING])
     before_m = constants.lost_m
-    lost_m = before_m + 0.5 * hh * np.subtract(after[:2], state[:2])
+    lost_m = before_m - np.expm1(-0.5 * hh) * np.subtract(after[:2], state[:2])
     # The mean square of a squared Gaussian is three times the square of its mean.
     added[:2, :2] += 3.0 * (np.outer(lost_m, lost_m) - np.outer(before_m, before_m))
     cov = np.array(after[4:]) + added[_UPPER]

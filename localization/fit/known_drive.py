@@ -272,7 +272,8 @@ def _follow(
             # The filter's position includes the error of the positions that wanders.
             p[i, i] += steps.wander_var_m2[row]
         # Of second order, as in ``predict_constants``; ``moved`` has the step as (-y, x).
-        less = 0.5 * p[2, 2] * moved[1, 0], -0.5 * p[2, 2] * moved[0, 0]
+        part = 1.0 - math.exp(-0.5 * p[2, 2])
+        less = part * moved[1, 0], -part * moved[0, 0]
         for i in range(2):
             for j in range(2):
                 p[i, j] += 3.0 * (less[i] * (lost[j] + less[j]) + lost[i] * less[j])

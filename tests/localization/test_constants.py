@@ -137,8 +137,8 @@ def test_prediction_propagates_the_joint_covariance_by_finite_differences() -> N
         pack_belief(belief), constants, (4.0, 0.3, 0.0, 0.0, 0.0), by, 0.5
     )
 
-    # Half the heading's variance of the way, and three times its square.
-    lost = 0.5 * expected[2, 2] * (moved(at) - at)[:2]
+    # The mean of 1 - cos of the heading, times the way, and three times its square.
+    lost = (1.0 - np.exp(-0.5 * expected[2, 2])) * (moved(at) - at)[:2]
     expected[:2, :2] += 3.0 * np.outer(lost, lost)
 
     np.testing.assert_allclose(state[:4], moved(at)[:4], rtol=1e-12)
