@@ -79,14 +79,14 @@ class VisualPass:
         }
 
 
-def moving_boxes(found: Sequence[Found], labels: set[str]) -> Floats:
-    """Boxes of everything that may move, shape (N, 4)."""
+def moving_boxes(found: Sequence[Found], labels: set[str], score: float = 0.0) -> Floats:
+    """Boxes of everything that may move, with a score above ``score``, shape (N, 4)."""
     boxes = [
         one.boxes_px[i]
         for one in found
         if isinstance(one, Detections)
         for i, label in enumerate(one.labels)
-        if label in labels
+        if label in labels and one.scores[i] > score
     ]
     return np.array(boxes, np.float64).reshape(-1, 4)
 

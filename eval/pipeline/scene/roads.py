@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -10,6 +11,7 @@ from typing import Final
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.observed import NOT_SEEN, FrameDetections, RoadFractions
 from crosscue.detectors.cues.road_area import NEAREST_M, RoadArea, RoadPlan, reach_of
+from crosscue.detectors.cues.road_layout import RoadLayout
 from crosscue.detectors.cues.road_openings import RoadOpenings, Seen
 from crosscue.eval.pipeline.visual import MOVING, TABLE, moving_boxes
 from crosscue.eval.runs.tables.parquet import TableFolder
@@ -19,6 +21,9 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 # Distance between an opening and a range from lights or signs that can belong together.
 TOGETHER_M: Final = 15.0
+# Least score of a box that hides the road from the rule without a calibrated camera.
+HIDES: Final = 0.3
+BY_SHAPE: Final = "roads to the sides by the shape of the road mask"
 
 
 @dataclass(slots=True)
@@ -30,12 +35,15 @@ class Roads:
         pitches_rad: Pitch of the camera by the time of a frame, where the pictures tell it.
         area: The accumulated road; None before the first mask.
         seen: Openings in the newest frame.
+        by_shape: Number of frames without a focal length, in which the mask's shape shows roads.
     """
 
     vehicle: Vehicle
     pitches_rad: Mapping[int, float]
     area: RoadArea | None = None
     seen: Seen | None = None
+    by_shape: int = 0
+    _layout: RoadLayout = field(default_factory=RoadLayout)
     _openings: RoadOpenings = field(init=False)
     _pitch_rad: float = field(init=False)
 
@@ -50,8 +58,13 @@ class Roads:
         if not isinstance(frame.road, RoadMask):
             return frame.road
         camera = self.vehicle.camera
+        labels = {*self.vehicle.cars.labels, *MOVING}
         reach_m = reach_of(camera, frame.road)
-        if evidence.travelled_m is None or reach_m <= 0.0:
+        if reach_m <= 0.0:
+            self.by_shape += 1
+            legs = self._layout(frame.t_ns, frame.road, moving_boxes(frame.objects, labels, HIDES))
+            return RoadFractions(*legs)
+        if evidence.travelled_m is None:
             self.restart()
             return NOT_SEEN
         if self.area is None:
@@ -59,7 +72,6 @@ class Roads:
         turned_rad = evidence.turned_rad or 0.0
         self.area.move(evidence.travelled_m, turned_rad)
         self._pitch_rad = self.pitches_rad.get(frame.t_ns, self._pitch_rad)
-        labels = {*self.vehicle.cars.labels, *MOVING}
         self.area.see(frame.road, moving_boxes(frame.objects, labels), self._pitch_rad)
         self.seen = self._openings(self.area.plan(), evidence.travelled_m, turned_rad)
         return RoadFractions(*self.seen.legs)
@@ -90,10 +102,15 @@ class Roads:
         """Return the plan view after the newest frame."""
         return None if self.area is None else self.area.plan()
 
+    def notes(self) -> Counter[str]:
+        """Number of frames in which another rule than openings was used, by its name."""
+        return Counter({BY_SHAPE: self.by_shape} if self.by_shape else {})
+
     def restart(self) -> None:
         """Forget the road."""
         self.area, self.seen = None, None
         self._openings.restart()
+        self._layout.restart()
 
 
 def pitches_of(run: TableFolder) -> dict[int, float]:

@@ -250,6 +250,8 @@ class Scene:
         """Return what the frames have shown."""
         cues, candidates = self._cues, self._cues.candidates
         counts = self._approaches.counts + self._motion.counts + cues.controls.counts
+        if self._roads is not None:
+            counts += self._roads.notes()
         return SceneSummary(
             frames=self._frames,
             positive=dict(sorted(self._positive.items())),

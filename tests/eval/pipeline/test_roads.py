@@ -9,11 +9,12 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.observed import NOT_SEEN, FrameDetections, RoadFractions
 from crosscue.detectors.cues.road_openings import Legs, Seen
-from crosscue.eval.pipeline.scene.roads import Roads
+from crosscue.eval.pipeline.scene.roads import BY_SHAPE, Roads
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.camera import Camera
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle, parse
+from support.road_masks import RIGHT, ROAD, seen_from
 
 CAMERA = Camera(focal_px=700.0, z_m=1.6)
 SIZE_PX = (640, 360)
@@ -61,12 +62,25 @@ def test_openings_fit_lights_and_signs_at_their_place_alone(range_m: float, fits
     assert roads(Seen((), Legs(0.0, math.nan, 0.0))).fits([other])
 
 
-def test_without_odometry_or_a_focal_length_no_road_is_seen() -> None:
+def test_without_odometry_no_road_is_seen() -> None:
     assert roads()(frame(), evidence(None)) is NOT_SEEN
-    assert roads(camera=Camera())(frame(), evidence(1.0)) is NOT_SEEN
     known = roads()(frame(), evidence(1.0))
     assert isinstance(known, RoadFractions)
     assert roads()(FrameDetections(0), evidence(1.0)) is None
+
+
+def test_without_a_focal_length_the_mask_alone_shows_roads_and_gives_no_range() -> None:
+    road = seen_from([ROAD, RIGHT], 0.8, 1.4, 0.45)
+    uncalibrated = roads(camera=Camera())
+    for t_ns in range(0, 10**9, 10**8):
+        # Neither a distance nor the car's own motion is needed.
+        found = uncalibrated(FrameDetections(t_ns, road=road), evidence(None))
+    assert found is not None
+    assert found.right == 1.0
+    assert math.isnan(found.left)
+    assert not uncalibrated.ranges()
+    assert uncalibrated.plan() is None
+    assert uncalibrated.notes() == {BY_SHAPE: 10}
 
 
 def test_an_opening_supports_the_intersection_unless_the_method_or_the_file_says_otherwise() -> (

@@ -1,0 +1,129 @@
+"""Roads at the intersection ahead by the shape of the road mask, for uncalibrated cameras.
+
+Without a focal length the mask cannot be projected to the ground. A small convolutional network,
+trained on masks of simulated layouts seen by random cameras (``benchmarks/road_layout``), tells
+from the mask and the boxes of vehicles whether a road to the left or to the right begins within
+about 30 m, and whether the road goes on behind it. It gives no distance. Its log odds are averaged
+over time; a road that they do not show is not seen, because traffic or a house may hide it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.detectors.base import RoadMask
+from crosscue.detectors.networks.backends import Network, load_network
+from crosscue.detectors.networks.weights import Weights
+from crosscue.replay.columns import Floats
+from crosscue.replay.errors import VehicleError
+
+from .road_openings import Legs
+
+WEIGHTS: Final = Path(__file__).parents[1] / "checkpoints" / "road_layout.onnx"
+SHA256: Final = "758d3c17fabecf6ad74a7b138139e0bd76119fe75aafab4ad6b5112f3daac57d"
+# Rows and columns of the network's input.
+SHAPE: Final = (128, 160)
+# Order of the network's outputs with left and right exchanged.
+MIRRORED: Final = (1, 0, 2, 3)
+# Time over which log odds are averaged.
+MEAN_S: Final = 0.6
+# Least mean log odds of a road to a side, of one straight on, and of an intersection before that.
+SIDE: Final = 2.0
+STRAIGHT: Final = 3.0
+INTERSECTION: Final = 2.0
+
+
+class LogOdds(NamedTuple):
+    """Log odds of one frame, or their mean: roads that begin within about 30 m.
+
+    Attributes:
+        left: A road to the left.
+        right: A road to the right.
+        straight: The road goes on behind the intersection, if there is one.
+        intersection: A road to either side.
+    """
+
+    left: float
+    right: float
+    straight: float
+    intersection: float
+
+
+@dataclass(slots=True)
+class RoadLayout:
+    """Roads over the frames of a drive."""
+
+    _mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(4))
+    _first_ns: int | None = None
+    _last_ns: int = 0
+
+    def __call__(self, t_ns: int, road: RoadMask, boxes_px: Floats) -> Legs:
+        """Process the next frame; return 1 for roads that are seen, NaN for the others.
+
+        Args:
+            t_ns: Time of the frame.
+            road: Its mask.
+            boxes_px: Shape (N, 4): boxes of everything that hides the road.
+
+        Raises:
+            ValueError: The mask is damaged.
+            VehicleError: The network's file is damaged.
+        """
+        found = np.array(log_odds(road, boxes_px))
+        if self._first_ns is None:
+            self._first_ns, gain = t_ns, 1.0
+        else:
+            gain = -math.expm1(-max(t_ns - self._last_ns, 0) * 1e-9 / MEAN_S)
+        self._last_ns = t_ns
+        self._mean = self._mean + gain * (found - self._mean)
+        if t_ns - self._first_ns < MEAN_S * 1e9:
+            return Legs(math.nan, math.nan, math.nan)
+        mean = LogOdds(*self._mean)
+        goes_on = mean.straight > STRAIGHT and mean.intersection > INTERSECTION
+        is_seen = (mean.left > SIDE, goes_on, mean.right > SIDE)
+        return Legs(*(1.0 if one else math.nan for one in is_seen))
+
+    def restart(self) -> None:
+        """Forget all frames."""
+        self._first_ns = None
+
+
+def log_odds(road: RoadMask, boxes_px: Floats) -> LogOdds:
+    """Return the log odds of one frame, the mean of those of the picture and of its mirror image.
+
+    Raises:
+        ValueError: The mask is damaged.
+        VehicleError: The network's file is damaged.
+    """
+    import cv2
+
+    width, height = road.size_px
+    rows, columns = SHAPE
+    hidden = np.zeros((2 * rows, 2 * columns), np.float32)
+    scale = np.array([columns, rows, columns, rows]) * 2.0 / (width, height, width, height)
+    for left, top, right, bottom in np.maximum(np.round(boxes_px * scale), 0.0).astype(int):
+        hidden[top:bottom, left:right] = 1.0
+    planes = [
+        cv2.resize(one, (columns, rows), interpolation=cv2.INTER_AREA)
+        for one in (road.pixels().astype(np.float32), hidden)
+    ]
+    picture = np.stack([*planes, np.full(SHAPE, height / width, np.float32)]).astype(np.float32)
+    both = np.stack([picture, picture[..., ::-1]])
+    given, mirrored = next(iter(_network()(both).values())).astype(np.float64)
+    return LogOdds(*((given + mirrored[list(MIRRORED)]) / 2.0))
+
+
+@cache
+def _network() -> Network:
+    content = WEIGHTS.read_bytes()
+    if hashlib.sha256(content).hexdigest() != SHA256:
+        raise VehicleError(f"{WEIGHTS}: damaged; install crosscue again")
+    return load_network(Weights(name=WEIGHTS.name, content=content))

@@ -1,0 +1,65 @@
+"""Roads by the shape of the road mask alone, for cameras that nobody calibrated."""
+
+import math
+
+import numpy as np
+import pytest
+
+from crosscue.detectors.cues.road_layout import RoadLayout
+from support.road_masks import LEFT, RIGHT, ROAD, SIZE_PX, Area, mask_of, seen_from
+
+NO_BOXES = np.zeros((0, 4))
+
+
+def after(
+    areas: list[Area], frames: int = 10, camera: tuple[float, float, float] = (0.8, 1.4, 0.45)
+) -> tuple[bool, bool]:
+    """Whether a road to the left and one to the right are seen after frames at 10 Hz."""
+    layout = RoadLayout()
+    found = [layout(n * 100_000_000, seen_from(areas, *camera), NO_BOXES) for n in range(frames)]
+    assert all(math.isnan(one) or one == 1.0 for legs in found for one in legs)
+    return found[-1].left == 1.0, found[-1].right == 1.0
+
+
+@pytest.mark.parametrize("camera", [(0.8, 1.4, 0.45), (0.6, 1.3, 0.5), (0.7, 1.2, 0.55)])
+def test_a_side_street_is_seen_on_its_side_whatever_the_camera(
+    camera: tuple[float, float, float],
+) -> None:
+    assert after([ROAD], camera=camera) == (False, False)
+    assert after([ROAD, RIGHT], camera=camera) == (False, True)
+    assert after([ROAD, LEFT], camera=camera) == (True, False)
+    assert after([ROAD, LEFT, RIGHT], camera=camera) == (True, True)
+
+
+def test_the_road_ahead_is_seen_only_behind_an_intersection() -> None:
+    crossing, straight = RoadLayout(), RoadLayout()
+    for t_ns in range(0, 10**9, 10**8):
+        ahead = crossing(t_ns, seen_from([ROAD, LEFT, RIGHT], 0.8, 1.4, 0.45), NO_BOXES).straight
+        alone = straight(t_ns, seen_from([ROAD], 0.8, 1.4, 0.45), NO_BOXES).straight
+    assert ahead == 1.0
+    assert math.isnan(alone)
+
+
+def test_a_side_street_of_one_frame_is_none() -> None:
+    layout = RoadLayout()
+    for n in range(10):
+        areas = [ROAD, RIGHT] if n == 7 else [ROAD]
+        legs = layout(n * 100_000_000, seen_from(areas, 0.8, 1.4, 0.45), NO_BOXES)
+        assert math.isnan(legs.right), n
+    assert after([ROAD, RIGHT], frames=3) == (False, False)
+
+
+def test_nothing_is_remembered_after_a_restart() -> None:
+    layout = RoadLayout()
+    for n in range(10):
+        layout(n * 100_000_000, seen_from([ROAD, RIGHT], 0.8, 1.4, 0.45), NO_BOXES)
+    layout.restart()
+    legs = layout(1_100_000_000, seen_from([ROAD, RIGHT], 0.8, 1.4, 0.45), NO_BOXES)
+    assert all(map(math.isnan, legs))
+
+
+def test_a_picture_without_road_shows_nothing() -> None:
+    layout = RoadLayout()
+    for n in range(10):
+        legs = layout(n * 100_000_000, mask_of(np.zeros(SIZE_PX[::-1], np.bool_)), NO_BOXES)
+        assert all(map(math.isnan, legs))
