@@ -1,7 +1,7 @@
 """Roads at the intersection ahead by the shape of the road mask, for uncalibrated cameras.
 
 Without a focal length the mask cannot be projected to the ground. A small convolutional network,
-trained on masks of simulated layouts seen by random cameras (``benchmarks/road_layout``), tells
+trained on masks of simulated layouts seen by random cameras (``benchmarks/road_layout.py``), tells
 from the mask and the boxes of vehicles whether a road to the left or to the right begins within
 about 30 m, and whether the road goes on behind it. It gives no distance. Its log odds are averaged
 over time; a road that they do not show is not seen, because traffic or a house may hide it.
@@ -14,18 +14,19 @@ import math
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import RoadMask
-from crosscue.detectors.networks.backends import Network, load_network
-from crosscue.detectors.networks.weights import Weights
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import VehicleError
 
 from .road_openings import Legs
+
+if TYPE_CHECKING:
+    from crosscue.detectors.networks.backends import Network
 
 WEIGHTS: Final = Path(__file__).parents[1] / "checkpoints" / "road_layout.onnx"
 SHA256: Final = "758d3c17fabecf6ad74a7b138139e0bd76119fe75aafab4ad6b5112f3daac57d"
@@ -117,12 +118,20 @@ def log_odds(road: RoadMask, boxes_px: Floats) -> LogOdds:
     ]
     picture = np.stack([*planes, np.full(SHAPE, height / width, np.float32)]).astype(np.float32)
     both = np.stack([picture, picture[..., ::-1]])
-    given, mirrored = next(iter(_network()(both).values())).astype(np.float64)
+    given, mirrored = next(iter(network()(both).values())).astype(np.float64)
     return LogOdds(*((given + mirrored[list(MIRRORED)]) / 2.0))
 
 
 @cache
-def _network() -> Network:
+def network() -> Network:
+    """Load the network that comes with the package.
+
+    Raises:
+        VehicleError: Its file is damaged.
+    """
+    from crosscue.detectors.networks.backends import load_network
+    from crosscue.detectors.networks.weights import Weights
+
     content = WEIGHTS.read_bytes()
     if hashlib.sha256(content).hexdigest() != SHA256:
         raise VehicleError(f"{WEIGHTS}: damaged; install crosscue again")

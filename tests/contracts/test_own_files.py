@@ -180,6 +180,7 @@ PAST_THE_DOOR: Final[dict[str, str]] = {
     "datasets/simulated/log_files.py": PACKAGE,
     "datasets/truth/": NAMED,
     "detectors/catalog/": NAMED,
+    "detectors/cues/road_layout.py": PACKAGE,
     "detectors/networks/mask_rcnn/coco.py": NAMED,
     "detectors/result_cache.py": "SQLite opens the cache itself, after the door",
     "detectors/signs/templates.py": PACKAGE,

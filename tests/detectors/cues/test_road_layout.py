@@ -1,11 +1,14 @@
 """Roads by the shape of the road mask alone, for cameras that nobody calibrated."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from crosscue.detectors.cues import road_layout
 from crosscue.detectors.cues.road_layout import RoadLayout
+from crosscue.replay.errors import VehicleError
 from support.road_masks import LEFT, RIGHT, ROAD, SIZE_PX, Area, mask_of, seen_from
 
 NO_BOXES = np.zeros((0, 4))
@@ -63,3 +66,15 @@ def test_a_picture_without_road_shows_nothing() -> None:
     for n in range(10):
         legs = layout(n * 100_000_000, mask_of(np.zeros(SIZE_PX[::-1], np.bool_)), NO_BOXES)
         assert all(map(math.isnan, legs))
+
+
+def test_a_damaged_network_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = bytearray(road_layout.WEIGHTS.read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "road_layout.onnx").write_bytes(content)
+    monkeypatch.setattr(road_layout, "WEIGHTS", tmp_path / "road_layout.onnx")
+    road_layout.network.cache_clear()
+    with pytest.raises(VehicleError, match=r"road_layout\.onnx: damaged; install crosscue again$"):
+        after([ROAD], frames=1)
