@@ -26,7 +26,7 @@ from crosscue.eval.runs.manifest import DriveManifest
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.fusion.approaches import RangeRow
 from crosscue.fusion.intersection_range import Reference
-from crosscue.replay.colours import FEATURES, ROAD, Colour
+from crosscue.replay.colours import FEATURES, ROAD
 from crosscue.replay.vehicle.vehicle import Camera
 
 from .marks import CROSSING, PARKED, REGION, SIDES, Overlays
@@ -118,40 +118,25 @@ class Anchored:
         cars, camera = self.manifest.settings.cars, self.manifest.settings.camera
         if parked([car], cars):
             nose = np.array([NOSE * size_px[0] * np.sign(car.nose), 0.0])
-            self._arrow(car, nose, PARKED, "parked")
+            self.marks.arrow(car.center_px, nose, PARKED, "parked", size_px)
         elif crossing([car], cars):
-            self._arrow(car, way_px(car, camera, size_px), CROSSING, "crossing")
+            way_px = motion_px(car, camera, size_px)
+            self.marks.arrow(car.center_px, way_px, CROSSING, "crossing", size_px)
         elif along([car], cars):
             way = "outgoing" if car.ahead_mps > 0.0 else "oncoming"
             is_beyond = place is not None and is_past(car, camera, place)
             colour = FEATURES["straight"] if is_beyond else ALONG
-            self._arrow(
-                car, way_px(car, camera, size_px), colour, f"{way} {abs(car.ahead_mps):.0f} m/s"
-            )
-
-    def _arrow(
-        self, car: CarMotion, way_px: NDArray[np.float64], colour: Colour, label: str
-    ) -> None:
-        self.marks.cars.add(np.concatenate([car.center_px, way_px]), colour, label)
+            way_px, label = motion_px(car, camera, size_px), f"{way} {abs(car.ahead_mps):.0f} m/s"
+            self.marks.arrow(car.center_px, way_px, colour, label, size_px)
 
 
-def way_px(car: CarMotion, camera: Camera, size_px: tuple[int, int]) -> NDArray[np.float64]:
+def motion_px(car: CarMotion, camera: Camera, size_px: tuple[int, int]) -> NDArray[np.float64]:
     """Return a car's displacement in the image within a second, with the camera at rest."""
     center = np.array(camera.center_px or (0.5 * size_px[0], 0.5 * size_px[1]))
     now_px = np.array(car.center_px) - center
     then_m = max(car.distance_m + ARROW_S * car.ahead_mps, NEAREST_M)
     sideways_px = np.array([(camera.focal_px or 0.0) * ARROW_S * car.right_mps / then_m, 0.0])
-    way = np.asarray(now_px * (car.distance_m / then_m - 1.0) + sideways_px, np.float64)
-    return way * _part_inside(np.asarray(car.center_px), way, size_px)
-
-
-def _part_inside(
-    tail_px: NDArray[np.float64], way_px: NDArray[np.float64], size_px: tuple[int, int]
-) -> float:
-    """Return the fraction of an arrow that is inside the image, to which the viewer adapts."""
-    room_px = np.where(way_px > 0.0, np.subtract(size_px, tail_px), tail_px)
-    moves = np.abs(way_px) > 0.0
-    return max(float(np.min(room_px[moves] / np.abs(way_px[moves]), initial=1.0)), 0.0)
+    return np.asarray(now_px * (car.distance_m / then_m - 1.0) + sideways_px, np.float64)
 
 
 def _ranges_of(run: RunFolder) -> dict[int, list[RangeRow]]:

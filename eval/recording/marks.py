@@ -85,7 +85,7 @@ class Overlays:
         if self.vehicle.regions.kind == "picture":
             self._regions(frame.road, frame.size_px)
         if frame.objects and self.vehicle.cars.kind != "tracks":
-            self._cars(frame.objects)
+            self._cars(frame.objects, frame.size_px)
 
     def all(self) -> Iterator[Shapes]:
         """Yield all shapes."""
@@ -168,7 +168,7 @@ class Overlays:
         if height_px > 0.0 and width_px > REGION_LABEL * size_px[0]:
             self.regions.add(np.vstack([inside, inside[:1]]), colour, text)
 
-    def _cars(self, found: tuple[Detections, ...]) -> None:
+    def _cars(self, found: tuple[Detections, ...], size_px: tuple[int, int]) -> None:
         now = car_shapes(found, self.vehicle.cars)
         before, self._before = self._before, now
         if before is None:
@@ -182,15 +182,33 @@ class Overlays:
                 pairs.width_px,
             )
             if any(cross_traffic(one, self.vehicle.cars)):
-                self._arrow(one.center_px[0], ARROW_STEPS * one.step_px[0], CROSSING, "crossing")
+                way_px = ARROW_STEPS * one.step_px[0]
+                self.arrow(one.center_px[0], way_px, CROSSING, "crossing", size_px)
             elif any(parked_cars(one, self.vehicle.cars)):
                 ahead = np.array([0.04 * pairs.width_px * float(one.nose[0]), 0.0])
-                self._arrow(one.center_px[0], ahead, PARKED, "parked")
+                self.arrow(one.center_px[0], ahead, PARKED, "parked", size_px)
 
-    def _arrow(
-        self, tail: NDArray[np.float64], way: NDArray[np.float64], colour: Colour, label: str
+    def arrow(
+        self,
+        tail_px: Sequence[float] | NDArray[np.float64],
+        way_px: NDArray[np.float64],
+        colour: Colour,
+        label: str,
+        size_px: tuple[int, int],
     ) -> None:
+        """Draw the part of an arrow in the picture."""
+        tail = np.clip(tail_px, 0.0, size_px)
+        way = way_px * _part_inside(tail, way_px, size_px)
         self.cars.add(np.concatenate([tail, way]), colour, label)
+
+
+def _part_inside(
+    tail_px: NDArray[np.float64], way_px: NDArray[np.float64], size_px: tuple[int, int]
+) -> float:
+    """Return the fraction of an arrow that is inside the image, to which the viewer adapts."""
+    room_px = np.where(way_px > 0.0, np.subtract(size_px, tail_px), tail_px)
+    leaves = np.abs(way_px) > room_px
+    return float(np.min(room_px[leaves] / np.abs(way_px[leaves]), initial=1.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

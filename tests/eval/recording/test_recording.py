@@ -24,7 +24,7 @@ from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.cues.tracked.motion import CarMotion
 from crosscue.detectors.images import Encoded
 from crosscue.eval.recording import save_rrd
-from crosscue.eval.recording.anchored import way_px
+from crosscue.eval.recording.anchored import motion_px
 from crosscue.eval.recording.camera import shown
 from crosscue.eval.recording.labels import label_places, labelled
 from crosscue.eval.recording.marks import Overlays
@@ -302,12 +302,12 @@ def car(right_mps: float, ahead_mps: float) -> CarMotion:
 
 
 def test_oncoming_car_moves_from_the_optical_axis_and_outgoing_towards_it() -> None:
-    assert (way_px(car(0.0, -10.0), CAMERA, SIZE) > 0.0).all()
-    assert (way_px(car(0.0, 10.0), CAMERA, SIZE) < 0.0).all()
+    assert (motion_px(car(0.0, -10.0), CAMERA, SIZE) > 0.0).all()
+    assert (motion_px(car(0.0, 10.0), CAMERA, SIZE) < 0.0).all()
 
 
 def test_arrow_of_crossing_car_equals_pinhole_projection() -> None:
-    np.testing.assert_allclose(way_px(car(8.0, 0.0), CAMERA, SIZE), [700.0 * 8.0 / 40.0, 0.0])
+    np.testing.assert_allclose(motion_px(car(8.0, 0.0), CAMERA, SIZE), [700.0 * 8.0 / 40.0, 0.0])
 
 
 def test_regions_are_below_the_horizon_and_symmetric() -> None:
@@ -390,3 +390,20 @@ def test_regions_end_at_the_edge_of_the_picture() -> None:
     assert marks.regions.labels == ["left 10 %"]
     assert (marks.regions.geometry[0] >= 0.0).all()
     assert (marks.regions.geometry[0] <= SIZE).all()
+
+
+@given(st.floats(0.0, 1280.0), st.floats(0.0, 720.0), st.floats(-3e3, 3e3), st.floats(-3e3, 3e3))
+def test_arrow_keeps_its_direction_and_ends_in_the_picture(
+    x: float, y: float, right: float, down: float
+) -> None:
+    marks = Overlays(Vehicle(version=1))
+    marks.cars.begin(0)
+
+    marks.arrow((x, y), np.array([right, down]), QUIET, "crossing", SIZE)
+
+    tail, way = np.split(marks.cars.geometry[0], 2)
+    assert (tail == (x, y)).all()
+    assert ((tail + way >= -1e-6) & (tail + way <= np.array(SIZE) + 1e-6)).all()
+    assert way[0] * down == pytest.approx(way[1] * right, abs=1e-3)
+    is_inside = 0.0 <= x + right <= SIZE[0] and 0.0 <= y + down <= SIZE[1]
+    assert not is_inside or (way == (right, down)).all()
