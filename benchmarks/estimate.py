@@ -22,14 +22,19 @@ from crosscue.datasets.simulated.drive import DriveSettings, sense, true_motion,
 from crosscue.datasets.simulated.log_files import BUS, GYRO, MAGNETOMETER, sensor_blocks
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, DetectorChoice, Found, Frame, View
+from crosscue.detectors.catalog.known_models import OBJECTS, ROAD
+from crosscue.detectors.networks.box_model import BoxModel
+from crosscue.detectors.registry import make
+from crosscue.eval.drives.demo import fetch_drive
+from crosscue.eval.drives.replay import choices_for
 from crosscue.eval.pipeline.detecting import Detecting
-from crosscue.eval.pipeline.whole_run import detect_drive, estimate_run
+from crosscue.eval.pipeline.whole_run import detect_drive, estimate_run, replay_drive
 from crosscue.eval.runs.drive import Drive
-from crosscue.eval.runs.folder import create, open_run
+from crosscue.eval.runs.folder import RunFolder, create, open_run
 from crosscue.replay.columns import Block, Images, Messages, Topic
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
-from crosscue.replay.vehicle.vehicle import parse
+from crosscue.replay.vehicle.vehicle import load, parse
 from crosscue.replay.write.convert import LogWriter
 
 ROUNDS = 5
@@ -120,8 +125,57 @@ def write_log(path: Path, settings: DriveSettings) -> float:
     return (last - first) * 1e-9
 
 
+def estimated(run: RunFolder, seconds: float) -> None:
+    """Print how long it takes to estimate a run again, after a first time that imports."""
+    taken, cpu = [], []
+    for _ in range(1 + ROUNDS):
+        began, began_cpu = time.perf_counter(), time.process_time()
+        estimate_run(open_run(run.path))
+        taken.append(time.perf_counter() - began)
+        cpu.append(time.process_time() - began_cpu)
+    print(
+        f"estimate: {median(taken[1:]):.2f} s wall, {median(cpu[1:]):.2f} s CPU; "
+        f"{seconds / median(cpu[1:]):.1f} times real time (CPU)"
+    )
+
+
+def real(source: str | None) -> None:
+    """Time PandaSet 002, and its replay with yolox-nano against the bare network."""
+    known = fetch_drive(source, with_road=True)
+    vehicle = load(known.vehicle)
+    with tempfile.TemporaryDirectory() as name, open_log(known.log) as log:
+        drive = Drive([log], vehicle)
+        everything = Detecting(choices_for(vehicle, f"{OBJECTS},{ROAD}"))
+        run = create(Path(name) / "run", overwrite=False)
+        outcome = replay_drive(drive, run, everything)
+        print(f"PandaSet 002, {outcome.drive_seconds:.1f} s, with road, lights and cars")
+        estimated(run, outcome.drive_seconds)
+        (choice,) = choices_for(vehicle, OBJECTS)
+        detector = make(choice)
+        assert isinstance(detector, BoxModel)
+        given = detector.card.input
+        batch = np.zeros((1, 3, given.height_px, given.width_px), np.float32)
+        ratios = []
+        for number in range(3):
+            assert outcome.scene is not None
+            began = time.process_time()
+            for _ in range(outcome.scene.frames):
+                detector.network(batch)
+            bare = time.process_time() - began
+            began = time.process_time()
+            replay_drive(
+                drive, create(Path(name) / f"{number}", overwrite=False), Detecting((choice,))
+            )
+            ratios.append((time.process_time() - began) / bare)
+            print(f"bare network {bare:.2f} s CPU, replay {ratios[-1]:.2f} times as much")
+        print(f"replay with {OBJECTS}: {median(ratios):.2f} times the bare network")
+
+
 def main() -> None:
     """Write the drive once and estimate it several times."""
+    if sys.argv[1:2] == ["--real"]:
+        real(sys.argv[2] if len(sys.argv) > 2 else None)
+        return
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 10.0
     settings = DriveSettings(blocks=max(4, round(minutes * 60.0 / SECONDS_PER_BLOCK)))
     with tempfile.TemporaryDirectory() as name:
@@ -134,19 +188,8 @@ def main() -> None:
         with open_log(folder / "drive.mcap") as log:
             detect_drive(Drive([log], vehicle), run, Detecting((choice,)))
         size = (folder / "drive.mcap").stat().st_size
-        taken, cpu = [], []
-        for _ in range(ROUNDS):
-            began, began_cpu = time.perf_counter(), time.process_time()
-            outcome = estimate_run(open_run(run.path))
-            taken.append(time.perf_counter() - began)
-            cpu.append(time.process_time() - began_cpu)
-        scene = outcome.scene
-        assert scene is not None
-        print(f"simulated drive of {seconds:.0f} s, {size / 1e6:.0f} MB, {scene.frames:,} frames")
-        print(
-            f"estimate: {median(taken):.2f} s wall, {median(cpu):.2f} s CPU; "
-            f"{seconds / median(taken):.0f} times real time"
-        )
+        print(f"simulated drive of {seconds:.0f} s, {size / 1e6:.0f} MB")
+        estimated(run, seconds)
 
 
 if __name__ == "__main__":
