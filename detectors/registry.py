@@ -204,14 +204,13 @@ def _factory_of(
 ) -> tuple[str, Callable[..., object]]:
     """Return the ``module:factory`` of a detector, and the imported factory."""
     place = table.get(choice.kind) or _offered(choice.kind) or choice.kind
-    colon = ":" in place
-    if not colon and choice.kind.endswith(_WEIGHTS):
+    if ":" not in place and choice.kind.endswith(_WEIGHTS):
         raise UsageError(
             f"detector {choice.kind!r}: expected a model card (.toml); write one with crosscue "
             "model init, or name a checkpoint of crosscue train under [detectors.NAME] of a "
             "vehicle file"
         )
-    if not colon:
+    if ":" not in place:
         names = known({})
         close = difflib.get_close_matches(choice.kind, names, n=1)
         hint = f"did you mean {close[0]}?" if close else f"there are: {', '.join(names)}."

@@ -142,8 +142,7 @@ def imported(place: str, user: str) -> object:
         return attrgetter(name)(import_module(module))
     except (ImportError, AttributeError) as error:
         # A command does not search the current folder, unlike python -m and python -c.
-        is_here = isinstance(error, ModuleNotFoundError) and Path(f"{module}.py").exists()
         hint = "check the module and the name"
-        if is_here:
+        if isinstance(error, ModuleNotFoundError) and Path(f"{module}.py").exists():
             hint = f"{module}.py is in this folder, which is not searched: set PYTHONPATH=."
         raise UsageError(f"{user} {place}: {error}; {hint}") from None

@@ -144,11 +144,8 @@ def _log_mobileye(
     vehicles.send(recording, time)
     lanes.send(recording, time)
     # Labels of vehicles side by side would cover each other; they appear under the pointer.
-    recording.log(
-        "ahead/mobileye_objects",
-        rr.Points2D.from_fields(radii=[1.1], show_labels=False),
-        static=True,
-    )
+    style = rr.Points2D.from_fields(radii=[1.1], show_labels=False)
+    recording.log("ahead/mobileye_objects", style, static=True)
     recording.log("ahead/mobileye_lanes", rr.LineStrips2D.from_fields(radii=[0.15]), static=True)
 
 

@@ -54,8 +54,9 @@ def labelled(
     )
     kept: list[int] = []
     for row in sorted(np.flatnonzero(is_inside).tolist(), key=lambda row: (-scores[row], row)):
-        is_free = not any(_overlap(places[row], places[other]) for other in kept)
-        if is_free and not any(_crosses(box, places[row]) for box in boxes):
+        place = places[row]
+        holds = (boxes[:, :2] <= place[:2]).all(axis=1) & (place[2:] <= boxes[:, 2:]).all(axis=1)
+        if not any(_overlap(one, place) for one in (*places[kept], *boxes[~holds])):
             kept.append(row)
     return [row in kept for row in range(len(places))]
 
@@ -63,9 +64,3 @@ def labelled(
 def _overlap(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
     sizes = np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2])
     return bool((sizes > 0.0).all())
-
-
-def _crosses(box: NDArray[np.float64], place: NDArray[np.float64]) -> bool:
-    """Return whether an edge of a box passes through a label."""
-    is_within = bool((box[:2] <= place[:2]).all() and (place[2:] <= box[2:]).all())
-    return _overlap(box, place) and not is_within

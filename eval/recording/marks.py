@@ -102,17 +102,13 @@ class Overlays:
     ) -> None:
         """Draw the boxes of a frame, with permanent labels where there is room for them."""
         drawn = [
-            _Box(self.objects, self._colour(found, row), box, text, float(found.scores[row]))
-            for found in objects
+            _Box(shapes, colour or self._colour(found, row), box, text, float(found.scores[row]))
+            for shapes, group, colour in ((self.objects, objects, None), (self.signs, signs, FOUND))
+            for found in group
             for box, text, row in _report_text(found)
         ]
-        drawn += [
-            _Box(self.signs, FOUND, box, text, float(found.scores[row]))
-            for found in signs
-            for box, text, row in _report_text(found)
-        ]
-        wide_px = LABELLED * size_px[0]
-        large = [one for one in drawn if one.shapes is self.signs or one.width_px >= wide_px]
+        wide_px = {id(self.objects): LABELLED * size_px[0], id(self.signs): 0.0}
+        large = [one for one in drawn if np.ptp(one.corners[[0, 2]]) >= wide_px[id(one.shapes)]]
         fits = labelled(
             np.array([one.corners for one in large], np.float64).reshape(-1, 4),
             [one.text for one in large],
@@ -159,10 +155,7 @@ class Overlays:
     def region(
         self, corners: NDArray[np.float64], colour: Colour, text: str, size_px: tuple[int, int]
     ) -> None:
-        """Draw the part of a region in the picture; the viewer shrinks a picture for the rest.
-
-        The label is in the middle of the part, where too narrow a part would cut it off.
-        """
+        """Draw the part of a region in the picture, unless its label would be cut off."""
         inside = np.clip(corners, 0.0, size_px)
         width_px, height_px = np.ptp(inside, axis=0)
         if height_px > 0.0 and width_px > REGION_LABEL * size_px[0]:
@@ -218,10 +211,6 @@ class _Box:
     corners: NDArray[np.float64]
     text: str
     score: float
-
-    @property
-    def width_px(self) -> float:
-        return float(self.corners[2] - self.corners[0])
 
 
 def _report_text(found: Detections) -> Iterator[tuple[NDArray[np.float64], str, int]]:
