@@ -30,7 +30,12 @@ from crosscue.detectors.decoders.base import (
 )
 from crosscue.detectors.decoders.plausible import oddity
 from crosscue.detectors.decoders.table import DECODERS
-from crosscue.detectors.networks.backends import Network, load_network, missing_operation
+from crosscue.detectors.networks.backends import (
+    Network,
+    load_network,
+    missing_operation,
+    output_name,
+)
 from crosscue.detectors.networks.openvino import import_openvino
 from crosscue.detectors.networks.trial import candidates_in
 from crosscue.detectors.networks.weights import Weights
@@ -177,12 +182,11 @@ def _of_openvino(content: bytes, path: Path) -> Interface:
     weights = read_whole(second, MAX_BYTES) if second.exists() else b""
     model = ov.Core().read_model(content, weights)
 
-    def tensor(port: Any) -> Tensor:
-        names = sorted(port.get_names())
+    def tensor(port: Any, index: int) -> Tensor:
         sides = (side.get_length() if side.is_static else None for side in port.partial_shape)
         is_integer = port.element_type.get_type_name() in ("i32", "i64")
         is_bytes = port.element_type.get_type_name() == "u8"
-        return Tensor(names[0] if names else "output0", tuple(sides), is_integer, is_bytes)
+        return Tensor(output_name(port, index), tuple(sides), is_integer, is_bytes)
 
     # YOLOv5 calls the file as the model.
     beside = (path.with_name("metadata.yaml"), path.with_suffix(".yaml"))
@@ -191,8 +195,8 @@ def _of_openvino(content: bytes, path: Path) -> Interface:
     if not names and model.has_rt_info(_LABELS):
         names = tuple(model.get_rt_info(_LABELS).astype(str).split()[:_MANY_CLASSES])
     return Interface(
-        tuple(tensor(port) for port in model.inputs),
-        tuple(tensor(port) for port in model.outputs),
+        tuple(tensor(port, i) for i, port in enumerate(model.inputs)),
+        tuple(tensor(port, i) for i, port in enumerate(model.outputs)),
         metadata,
         names,
         *_detected_classes(model),

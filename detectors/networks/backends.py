@@ -191,7 +191,7 @@ def _in_openvino(weights: Weights, threads: int, size_px: Size | None) -> Networ
             replace_size([side.get_length() for side in model.input(0).partial_shape], size_px)
         )
     compiled = core.compile_model(model, "CPU")
-    names = [_output_name(out, i) for i, out in enumerate(compiled.outputs)]
+    names = [output_name(out, i) for i, out in enumerate(compiled.outputs)]
 
     def call(batch: Array) -> Mapping[str, Array]:
         found = compiled([batch])
@@ -261,7 +261,8 @@ def _real(values: Array, out: Any) -> Array:
     return np.asarray((np.asarray(values, np.float64) - zero) * scale)
 
 
-def _output_name(output: Any, index: int) -> str:
+def output_name(output: Any, index: int) -> str:
+    """Name of an output of OpenVINO, or its number, where it has none."""
     names = sorted(output.get_names())
     return str(names[0]) if names else f"output{index}"
 

@@ -68,7 +68,7 @@ def _maps_on(detector: RoadModel, pixels: Bytes) -> str | None:
         return None
     axis = 1 if raw.shape[1] == len(detector.output.classes) else 3
     best, total = raw.max(axis=axis), raw.sum(axis=axis)
-    is_low = (best < 0.5).mean() > _LOW_FRACTION and raw.min() > -0.1 and 0.0 < raw.max() <= 1.1
+    is_low = (best < 0.5).mean() > _LOW_FRACTION and raw.min() >= 0.0 < raw.max() <= 1.0
     if not is_low or np.allclose(total, 1.0, atol=0.02):
         return None
     return f"{(best < 0.5).mean():.0%} of the pixels have no score of 0.5: these are maps of points"

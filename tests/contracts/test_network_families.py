@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Final
 
@@ -323,6 +324,20 @@ def test_openvino_network_of_bytes_scales_its_pixels_itself(tmp_path: Path) -> N
 
     assert model.inputs[0].is_bytes
     assert "scale" not in input_settings(model, guess)
+
+
+def test_outputs_without_names_are_told_apart(tmp_path: Path) -> None:
+    """Ultralytics' segmentation in OpenVINO has two of them."""
+    ov = pytest.importorskip("openvino")
+    given = ov.opset8.parameter([1, 3, 320, 640], np.float32, "x")
+    values = [value.astype(np.float32) for value in EVERY["yolov8-seg"](SIZE).outputs.values()]
+    net = tmp_path / "net.xml"
+    ov.save_model(ov.Model(list(map(ov.opset8.constant, values)), [given]), net)
+    net.write_text(re.sub(r' (?:output_)?names="Result[^"]*"', "", net.read_text()))
+
+    card = crosscue.draft_card(net, class_names=CLASSES)
+
+    assert card.draft.kind == "yolov8-seg"
 
 
 def test_names_beside_a_yolov5_openvino_file_are_read(tmp_path: Path) -> None:

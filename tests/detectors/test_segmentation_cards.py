@@ -79,6 +79,14 @@ def test_maps_of_points_are_not_taken_for_classes(tmp_path: Path) -> None:
         )
 
 
+def test_weak_scores_of_both_signs_are_classes(tmp_path: Path) -> None:
+    """Logits of a network with random weights."""
+    weak = np.random.default_rng(0).normal(0.0, 0.02, (1, 11, 8, 16)).astype(np.float32)
+
+    names = ",".join(["road", *map(str, range(10))])
+    assert crosscue.draft_card(network(tmp_path, logits=weak), classes=names).path.exists()
+
+
 def test_grid_of_centers_is_not_taken_for_classes(tmp_path: Path) -> None:
     """Edge Impulse's FOMO has a grid of 12 x 12 for a picture of 96 x 96."""
     path = tmp_path / "fomo.onnx"
