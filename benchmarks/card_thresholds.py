@@ -13,13 +13,19 @@ decide whether the card gets it: if they show the same (one-sided, not corrected
 nine tenths of the pictures found at 0.5 are still found. Otherwise the card keeps the default.
 
     python benchmarks/card_thresholds.py DATA yolox-nano picodet-s
+
+Other pictures are counted at 0.5 and at the card's threshold of a class, without a choice. LABELS
+is a table as ``crosscue fit detector`` reads: picture, and yes or no for each class:
+
+    python benchmarks/card_thresholds.py --count FOLDER LABELS yolox-nano picodet-s
 """
 
 from __future__ import annotations
 
+import csv
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -29,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import beta
 
-from crosscue.detectors.base import Detections, Frame
+from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.catalog.places import card_named
 from crosscue.detectors.networks.model_detector import build
 
@@ -67,6 +73,8 @@ class Half:
 
 
 def _interval(right: int, count: int) -> str:
+    if not count:
+        return "none labelled"
     low = 100.0 * beta.ppf(RISK / 2, right, count - right + 1) if right else 0.0
     high = 100.0 * beta.ppf(1 - RISK / 2, right + 1, count - right) if right < count else 100.0
     return f"{low:.1f} to {high:.1f} %"
@@ -79,20 +87,43 @@ def _labelled(data: Path) -> Iterator[tuple[int, Path, set[str]]]:
         yield number, data / "images" / f"{file.stem}.png", names
 
 
+def _best(detector: Detector, pictures: Sequence[Path]) -> dict[str, list[float]]:
+    """Best score of each class in each picture."""
+    best: dict[str, list[float]] = {label: [] for label in NAMES}
+    for picture in pictures:
+        pixels = np.asarray(cv2.imread(str(picture)), np.uint8)
+        frame = Frame(0, "", pixels, (pixels.shape[1], pixels.shape[0]))
+        (found,) = detector([frame])
+        assert isinstance(found, Detections)
+        for label, scores in best.items():
+            is_it = np.array([one == label for one in found.labels], np.bool_)
+            scores.append(float(found.scores[is_it].max(initial=0.0)))
+    return best
+
+
+def _count(folder: Path, labels: Path, names: Sequence[str]) -> int:
+    """Print what cards find in pictures that are labelled as wholes."""
+    with labels.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for name in names:
+        detector = build(card=str(card_named(name)))
+        best = _best(detector, [folder / row["picture"] for row in rows])
+        thresholds = getattr(detector, "min_scores", {})
+        for label in NAMES.keys() & rows[0].keys():
+            has = np.array([row[label] == "yes" for row in rows])
+            score = np.array(best[label])
+            for at in sorted({0.5, thresholds.get(label, 0.5)}):
+                print(f"{name} {label} above {at:.2f}: {Half(score[has], score[~has]).text(at)}")
+    return 0
+
+
 def main() -> int:
     """Print the choice for each card and class, and what the other half shows."""
+    if sys.argv[1] == "--count":
+        return _count(Path(sys.argv[2]), Path(sys.argv[3]), sys.argv[4:])
     labelled = list(_labelled(Path(sys.argv[1])))
     for name in sys.argv[2:]:
-        detector = build(card=str(card_named(name)))
-        best: dict[str, list[float]] = {label: [] for label in NAMES}
-        for _, picture, _ in labelled:
-            pixels = np.asarray(cv2.imread(str(picture)), np.uint8)
-            frame = Frame(0, "", pixels, (pixels.shape[1], pixels.shape[0]))
-            (found,) = detector([frame])
-            assert isinstance(found, Detections)
-            for label, scores in best.items():
-                is_it = np.array([one == label for one in found.labels], np.bool_)
-                scores.append(float(found.scores[is_it].max(initial=0.0)))
+        best = _best(build(card=str(card_named(name))), [picture for _, picture, _ in labelled])
         is_odd = np.array([number % 2 == 1 for number, _, _ in labelled])
         for label, known in NAMES.items():
             has, score = np.array([known in names for *_, names in labelled]), np.array(best[label])
