@@ -11,7 +11,8 @@ the pictures that ``cut`` takes (first, last, step); null is uncertain and not s
 
 A leg counts by the highest belief within the annotated frames: above 0.9 it is believed, and wrong
 where there is none. At its prior it is not seen; below, a missing leg is right. Anything else is
-undecided. Times, frames and distances are those of the
+undecided. Below, each cue and leg has a line with the numbers of drives and places it stands on,
+apart for drives of development (``*``). Times, frames and distances are those of the
 annotations; ranges are scored only where a track gives the true distance.
 """
 
@@ -358,6 +359,43 @@ def _ranges(
     return inside, total
 
 
+def evidence(scores: Mapping[str, Score], drives: Mapping[str, Drive] = DRIVES) -> Iterator[str]:
+    """Yield a line for each cue and leg: what it says, on how many drives and at how many places.
+
+    Several stretches of one recording are one drive and several places; the same stretch with other
+    settings counts once. A cue is right, missed or false in frames, a leg at annotated approaches.
+    """
+    stretches = {(drives[name].folder, drives[name].cut): name for name in reversed([*scores])}
+    rows: dict[tuple[str, bool], list[tuple[str, Counter[str]]]] = {}
+    for (folder, _), name in reversed(stretches.items()):
+        counts = dict(scores[name].cues)
+        for leg, said in scores[name].legs.items():
+            counts.setdefault(leg.split()[-1], Counter())[_LEG_WORDS[said.split()[0]]] += 1
+        for what, count in counts.items():
+            if count.total():
+                key = (what, drives[name].is_development)
+                rows.setdefault(key, []).append((folder, count))
+    yield f"{'evidence':24} {'drives':>6} {'places':>6}"
+    for what in (*CUES, *FEATURES):
+        for is_development in (True, False):
+            found = rows.get((what, is_development), [])
+            total = sum((count for _, count in found), Counter[str]())
+            numbers = ", ".join(f"{number} {word}" for word, number in sorted(total.items()))
+            name = f"{what}{'*' if is_development else ''}"
+            yield (
+                f"{name:24} {len({folder for folder, _ in found}):6} {len(found):6} "
+                f"{numbers or '-'}"
+            )
+
+
+_LEG_WORDS: Final = {
+    "right": "right",
+    "WRONG": "wrong",
+    "not": "not seen",
+    "undecided": "undecided",
+}
+
+
 def main(arguments: Sequence[str]) -> None:
     """Replay and score the named drives, or all."""
     out = Path(arguments[0])
@@ -368,12 +406,13 @@ def main(arguments: Sequence[str]) -> None:
         f"{'drive':24} {'lights':>9} {'stop signs':>10} (right/missed/false) {'legs':52} "
         f"{'first':>9} {'pieces':>6} {'false':>6} {'in 95 %':>8}"
     )
+    scores = {}
     for name in arguments[1:] or DRIVES:
         drive = DRIVES[name]
         if not any((DATA / "sequences" / drive.folder).glob(drive.pictures)):
             print(f"{name:24} no {drive.folder}/{drive.pictures} in sequences")
             continue
-        score = scored(replayed(name, drive, out), drive)
+        score = scores[name] = scored(replayed(name, drive, out), drive)
         lights, stops = (
             "/".join(str(score.cues[cue][kind]) for kind in ("right", "missed", "false"))
             for cue in CUES
@@ -386,6 +425,7 @@ def main(arguments: Sequence[str]) -> None:
             f"{f'{inside}/{total}' if total else '-':>8}",
             flush=True,
         )
+    print(*evidence(scores), sep="\n")
 
 
 if __name__ == "__main__":
