@@ -411,10 +411,10 @@ def score_layout_study(drives: Sequence[LayoutDrive], *, ablation: bool = True) 
             for one in _counted(f"without {rule or 'nothing'}", "drives", drives)
         ]
 
-    def without(cues: Iterable[str]) -> list[DriveBelief]:
-        return [_everywhere(one, learned[one.fold].temporal, frozenset(cues)) for one in drives]
+    def without(cues: frozenset[str]) -> list[DriveBelief]:
+        return [_everywhere(one, learned[one.fold].temporal, cues) for one in drives]
 
-    kinds = {kind: of_kind(kind) for kind in KINDS} | {EVERYWHERE: without(())}
+    kinds = {kind: of_kind(kind) for kind in KINDS} | {EVERYWHERE: without(frozenset())}
     every = kinds[EVERYWHERE]
     left_out = _counted("leaving out cues", "cues", list(groups().items()) if ablation else ())
     rules = {rule: with_rules(rule) for rule in (("", *RULES) if ablation else ())}
@@ -427,7 +427,7 @@ def score_layout_study(drives: Sequence[LayoutDrive], *, ablation: bool = True) 
             if kind != name
         },
         {
-            group: score_difference(every, without(cue.name for cue in some))
+            group: score_difference(every, without(frozenset(cue.name for cue in some)))
             for group, some in left_out
         },
         {rule: score_layouts(some) for rule, some in rules.items()},

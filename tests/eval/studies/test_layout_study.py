@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval.scoring.intervals import Mean
 from crosscue.eval.scoring.truth import FEATURES
 from crosscue.eval.studies import simulated_drives
+from crosscue.eval.studies.layouts import run as layout_run
 from crosscue.eval.studies.layouts.run import study_tables, verdict, write_layout_study
 from crosscue.eval.studies.layouts.score import (
     DriveBelief,
@@ -204,3 +206,24 @@ def test_files_state_that_study_is_simulated_and_command_to_repeat_it(tmp_path: 
 
     write_layout_study(tmp_path, LayoutStudy("faults"), scores(), {})
     assert "No network saw a picture" in (tmp_path / "study.html").read_text(encoding="utf-8")
+
+
+def test_a_cue_is_left_out_of_every_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    lacking: dict[frozenset[str], list[str]] = {}
+
+    def everywhere(drive: Any, learned: object, without: frozenset[str]) -> str:
+        lacking.setdefault(without, []).append(drive.layout)
+        return ""
+
+    drives: list[Any] = [MagicMock(layout=f"M{i}", fold=i % 2) for i in range(4)]
+    monkeypatch.setattr(layout_run, "fit_beliefs", MagicMock())
+    monkeypatch.setattr(layout_run, "_in_approaches", MagicMock())
+    monkeypatch.setattr(layout_run, "score_layouts", MagicMock())
+    monkeypatch.setattr(layout_run, "score_difference", MagicMock())
+    monkeypatch.setattr(layout_run, "_everywhere", everywhere)
+
+    layout_run.score_layout_study(drives)
+
+    whole = [one.layout for one in drives]
+    assert len(lacking) > 5
+    assert all(of_drives == whole for of_drives in lacking.values())
