@@ -19,7 +19,7 @@ import numpy as np
 from crosscue.datasets.adapters.pandaset import read_pandaset_poses
 from crosscue.datasets.real.annotate_pandaset import BEHIND_M, FAR_KERB_M, VehicleBoxes
 from crosscue.detectors.base import Detections
-from crosscue.detectors.boxes import iou
+from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.cues.observed import Place
 from crosscue.detectors.cues.tracked.judge import (
     COMES_OR_GOES,
@@ -90,7 +90,7 @@ def places(run: RunFolder) -> dict[int, Place]:
 
 def owner(box_px: Sequence[float], boxes: VehicleBoxes, rows: np.ndarray) -> int | None:
     """Return the row of the 3-D box that a box in the picture overlaps most."""
-    overlaps = [iou(boxes.outline_px[row], np.asarray(box_px)) for row in rows]
+    overlaps = [float(box_ious(boxes.outline_px[row], np.asarray(box_px))) for row in rows]
     best = int(np.argmax(overlaps)) if overlaps else 0
     return int(rows[best]) if overlaps and overlaps[best] > MIN_IOU else None
 

@@ -20,17 +20,6 @@ def box_ious(boxes: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray
     return np.asarray(both / np.maximum(own + other - both, 1e-12), np.float64)
 
 
-def iou(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Intersection over union of two boxes."""
-    # Plain numbers: small arrays would be slow for one pair after the other.
-    left, top, right, bottom = one.tolist()
-    x0, y0, x1, y1 = other.tolist()
-    wide, high = min(right, x1) - max(left, x0), min(bottom, y1) - max(top, y0)
-    inside = max(wide, 0.0) * max(high, 0.0)
-    both = (right - left) * (bottom - top) + (x1 - x0) * (y1 - y0)
-    return float(inside / (both - inside)) if both > inside else 0.0
-
-
 def non_maximum_suppression(
     boxes: NDArray[np.float64],
     scores: NDArray[np.float64],

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.boxes import iou
+from crosscue.detectors.boxes import box_ious
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 MIN_IOU: Final = 0.5
@@ -75,12 +75,15 @@ def _best_kept(
     """Find the kept detection that overlaps a detection most and can replace it."""
     label = found[k].labels[i]
     wanted = meaning.get(label, label)
-    best, largest = None, MIN_IOU
-    for (other, j), taken in stands_for.items():
-        name = found[other].labels[j]
-        if k in taken or meaning.get(name, name) != wanted:
-            continue
-        overlap = iou(found[k].boxes_px[i], found[other].boxes_px[j])
-        if overlap > largest:
-            best, largest = (other, j), overlap
-    return best
+    kept = [
+        (other, j)
+        for (other, j), taken in stands_for.items()
+        for name in (found[other].labels[j],)
+        if k not in taken and meaning.get(name, name) == wanted
+    ]
+    if not kept:
+        return None
+    boxes_px = np.array([found[other].boxes_px[j] for other, j in kept])
+    overlaps = box_ious(found[k].boxes_px[i], boxes_px)
+    best = int(overlaps.argmax())
+    return kept[best] if overlaps[best] > MIN_IOU else None

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.detectors.base import Detections
-from crosscue.detectors.boxes import iou
+from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.cues.candidates import SAME_OBJECT
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections
@@ -86,7 +86,7 @@ def test_dropped_detection_overlaps_a_kept_one_of_the_other_detector(
                 j
                 for j in range(len(boxes[other]))
                 if same[other][j] == KEPT
-                and iou(one.boxes_px[i], boxes[other].boxes_px[j]) > MIN_IOU
+                and box_ious(one.boxes_px[i], boxes[other].boxes_px[j]) > MIN_IOU
                 and boxes[other].scores[j] >= one.scores[i]
             ]
             assert kept
