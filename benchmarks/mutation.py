@@ -97,6 +97,7 @@ PARTS: Final = {
                 "pairs_by_hand",
                 "past",
                 "road",
+                "road_area",
                 "road_by_hand",
                 "road_ground",
                 "same_object",
@@ -164,7 +165,13 @@ PARTS: Final = {
             )
         ),
     ),
-    "ekf": Part(("localization/ekf.py",), ("tests/localization/test_ekf.py",)),
+    "ekf": Part(
+        ("localization/ekf.py",),
+        (
+            "tests/localization/test_ekf.py",
+            "tests/localization/landmarks/test_landmark_update.py",
+        ),
+    ),
 }
 
 

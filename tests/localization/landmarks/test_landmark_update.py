@@ -55,6 +55,7 @@ def test_update_of_the_axle_is_the_joseph_form(seed: int, x: float, y: float) ->
     belief, measured = some_belief(seed), np.array([x, y])
 
     ours = update_point(belief, measured, COV)
+    assert (ours.belief.t_ns, ours.is_accepted) == (belief.t_ns, True)
     wanted = joseph(belief, measured, COV, (0.0, 0.0))
     np.testing.assert_allclose(ours.belief.mean, wanted.mean, atol=1e-9)
     np.testing.assert_allclose(ours.belief.cov, wanted.cov, atol=1e-9)
@@ -85,7 +86,7 @@ def test_gate_rejects_outlier_and_keeps_the_belief() -> None:
     belief = some_belief(2)
     far = update_point(belief, np.array([500.0, 0.0]), COV, gate_nis=13.8)
 
-    assert not far.is_accepted
+    assert far.is_accepted is False
     assert far.belief is belief
     assert far.nis > 13.8
 
