@@ -100,6 +100,7 @@ PARTS: Final = {
                 "road_area",
                 "road_by_hand",
                 "road_ground",
+                "road_openings_by_hand",
                 "same_object",
                 "trackers",
             )
