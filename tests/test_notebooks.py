@@ -12,8 +12,8 @@ FOLDER = Path(__file__).parents[1] / "notebooks"
 SELF_CONTAINED = {"variable_recruitment"}
 # What notebooks use of verbs beside the public names: settings and helpers, at their homes.
 HOMES = {
-    "crosscue.detectors.result_cache",
     "crosscue.detectors.signs.templates",
+    "crosscue.eval.drives.replay",
     "crosscue.eval.studies.town.settings",
 }
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
