@@ -4,7 +4,9 @@ While the car turns, the rotation from picture to picture is the integral of the
 their times. Around a standstill, the static scene grows in the picture in proportion to the speed.
 Both are fitted by least squares, with the delay, its drift, and the scale of the signal free. The
 standard deviation of a delay that the drive does not determine is large. Errors of successive
-pictures are correlated, so the covariance is that of Newey and West (Econometrica 55, 1987).
+pictures are correlated: their noise is white plus an Ornstein-Uhlenbeck process, whose share and
+time scale are averaged over, weighted by the restricted likelihood of the residuals (Harville,
+JASA 72, 1977).
 """
 
 from __future__ import annotations
@@ -33,8 +35,9 @@ BOUNDED_SD_S: Final = 0.05
 # are faster than the pictures come.
 TURN_RAD: Final = np.radians(3.0)
 MIN_PAIRS: Final = 20
-# Time over which errors of successive pictures are correlated.
-CORRELATED_S: Final = 0.5
+# Shares of correlated noise in the noise, and its time scales.
+SHARES: Final = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 0.9)
+SCALES_S: Final = (0.25, 0.5, 1.0, 2.0, 4.0)
 # Pictures this long before and after a standstill show how the motion begins and ends.
 AROUND_S: Final = 2.5
 # Shortest drive with a drift, and the s.d. of a drift before the drive.
@@ -42,11 +45,10 @@ DRIFT_FROM_S: Final = 30.0
 DRIFT_SD: Final = 100e-6
 # Longest time between two readings of a signal that is bridged.
 MAX_GAP_S: Final = 0.5
-# S.d. of the error of the turn rate by pictures that is common to a turn, of the delay from the
-# motion around a standstill because the scene changes, and of the delay from unmodelled filters.
-TURN_SD_RADPS: Final = 2.5e-4
+# Time over which a signal is averaged for its slopes, so that its noise does not count as motion.
+SMOOTH_S: Final = 0.3
+# S.d. of the delay from the motion around a standstill because the scene changes.
 STOP_SD_S: Final = 0.03
-FILTERS_SD_S: Final = 0.002
 # S.d. of the growth at a standstill, and of the growth of a moving scene as a fraction.
 GROWTH_SD: Final = 5e-4
 SCENE_SD: Final = 0.05
@@ -195,7 +197,15 @@ class _Integral(NamedTuple):
         return cls(t_ns, values, np.concatenate([[0.0], np.cumsum(steps)])[: len(t_ns)])
 
     def at(self, t_s: Floats, origin_ns: int) -> tuple[Floats, Floats]:
-        """Return integral and signal at times from an origin; NaN outside and in gaps."""
+        """Return integral and smoothed signal at times from an origin; NaN outside and in gaps."""
+        area = self._area(t_s, origin_ns)
+        ends_s = (self.t_ns[[0, -1]] - origin_ns) * 1e-9
+        before_s, after_s = (np.clip(t_s + 0.5 * side * SMOOTH_S, *ends_s) for side in (-1.0, 1.0))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            turned = self._area(after_s, origin_ns) - self._area(before_s, origin_ns)
+            return area, turned / (after_s - before_s)
+
+    def _area(self, t_s: Floats, origin_ns: int) -> Floats:
         knots_s = (self.t_ns - origin_ns) * 1e-9
         after = np.clip(np.searchsorted(knots_s, t_s), 1, len(knots_s) - 1)
         width_s = knots_s[after] - knots_s[after - 1]
@@ -203,16 +213,20 @@ class _Integral(NamedTuple):
         value = self.values[after - 1] * (1.0 - part) + self.values[after] * part
         area = self.area[after - 1] + 0.5 * (self.values[after - 1] + value) * part * width_s
         known = (t_s >= knots_s[0]) & (t_s <= knots_s[-1]) & (width_s <= MAX_GAP_S)
-        return np.where(known, area, np.nan), value
+        return np.where(known, area, np.nan)
 
 
 class _Model(NamedTuple):
-    """Weighted residuals, their slopes by the delay, the linear columns and their factors."""
+    """Weighted residuals, their slopes by the delay, the linear columns and their factors.
+
+    The weight of a row, from 0 to 1, is Cauchy's.
+    """
 
     rest: Floats
     by_delay: Floats
     linear: Floats
     factors: Floats
+    weight: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,7 +264,7 @@ class _Fit:
         start, at_start = self.integral.at(self.start_s - late, self.origin_ns)
         good = np.isfinite(end) & np.isfinite(start)
         area = np.where(good, end - start, 0.0)
-        by_delay = np.where(good, at_start - at_end, 0.0)
+        by_delay = np.nan_to_num(at_start - at_end)
         if self.event is None:
             scale = np.ones((len(area), 1))
             linear = np.column_stack([area, self.end_s - self.start_s])
@@ -261,12 +275,11 @@ class _Fit:
             center = (mine * along).sum(axis=0) / np.maximum(mine.sum(axis=0), 1.0)
             scale = np.hstack([mine, mine * (along - center)])
             linear = scale * area[:, None]
-        weight = good.astype(np.float64)
+        weight, noisy = good.astype(np.float64), np.ones(len(area))
         for _ in range(6):
             root = np.sqrt(weight)[:, None]
             factors = np.linalg.lstsq(linear * root, self.seen * root[:, 0], rcond=None)[0]
             rest = self.seen - linear @ factors
-            noisy = np.ones(len(rest))
             if self.event is not None:
                 noisy = np.hypot(GROWTH_SD, SCENE_SD * (linear @ factors))
             scaled = rest / noisy
@@ -274,7 +287,8 @@ class _Fit:
             weight = good / noisy**2 / (1.0 + (scaled / (3.0 * sd)) ** 2)
         root = np.sqrt(weight)
         by_delay = by_delay * (scale @ factors[: scale.shape[1]])
-        return _Model(rest * root, by_delay * root, linear * root[:, None], factors)
+        linear = linear * root[:, None]
+        return _Model(rest * root, by_delay * root, linear, factors, weight * noisy**2)
 
     def slopes(self, model: _Model, *, has_drift: bool) -> Floats:
         """Return slopes by delay and drift, without what the linear part may explain."""
@@ -309,27 +323,21 @@ class _Fit:
         slopes = self.slopes(model, has_drift=has_drift)
         freedom = max(len(model.rest) - model.linear.shape[1] - slopes.shape[1], 1)
         var = float((model.rest**2).sum()) / freedom
-        left = slopes.T @ slopes + self.prior(model, has_drift=has_drift)
+        used, root = model.weight > 0.0, np.sqrt(model.weight)[:, None]
+        # Outliers pull less than they should by their weights.
+        bent = slopes.T @ (slopes * (2.0 * root**2 - 1.0))
+        left = bent + self.prior(model, has_drift=has_drift)
         if not left[0, 0] > 0.0:
             return CameraDelay(signal)
+        plain = np.hstack([slopes, model.linear])[used] / root[used]
+        noise = _noise(self.end_s[used], (model.rest * root[:, 0])[used], plain, slopes.shape[1])
         inverse = np.linalg.pinv(left)
-        score = slopes * model.rest[:, None]
-        step_s = max(float(np.median(self.end_s - self.start_s)), 1e-3)
-        lags = min(round(CORRELATED_S / step_s), len(score) // 4)
-        middle = score.T @ score
-        for lag in range(1, lags + 1):
-            both = score[lag:].T @ score[:-lag]
-            middle = middle + (1.0 - lag / (lags + 1.0)) * (both + both.T)
-        robust = inverse @ middle @ inverse * (len(score) / freedom)
-        sd = np.sqrt(np.maximum(np.diag(var * inverse), np.diag(robust)))
+        sd = np.sqrt(np.diag(inverse @ noise @ inverse))
         is_turn = self.event is None
-        seconds = float(np.sqrt(((self.end_s - self.start_s) ** 2).mean()))
-        turn_s = TURN_SD_RADPS * seconds / float(np.sqrt((slopes[:, 0] ** 2).mean()))
-        floor_s = float(np.hypot(FILTERS_SD_S, turn_s if is_turn else STOP_SD_S))
         return CameraDelay(
             signal,
             delay_s,
-            float(np.hypot(sd[0], floor_s)),
+            float(np.hypot(sd[0], 0.0 if is_turn else STOP_SD_S)),
             drift * 1e6 if has_drift else None,
             float(sd[1]) * 1e6 if has_drift else None,
             len(model.rest),
@@ -341,6 +349,50 @@ class _Fit:
         columns = np.column_stack([model.linear, model.by_delay])
         cov = var * np.linalg.pinv(columns.T @ columns)
         return float(model.factors[0]), float(np.sqrt(cov[0, 0]))
+
+
+def _noise(t_s: Floats, rest: Floats, columns: Floats, slopes: int) -> Floats:
+    """Return the covariance of the products of noise with the first columns.
+
+    Args:
+        t_s: Times of the residuals, ascending.
+        rest: Residuals.
+        columns: What was fitted, shape (N, C).
+        slopes: Number of the first columns.
+    """
+    from scipy.linalg import cholesky_banded, orth, solveh_banded
+
+    first, given = columns[:, :slopes], np.column_stack([orth(columns), rest])
+    freedom = max(len(rest) - given.shape[1] + 1, 1)
+    found, scores = [], []
+    for scale_s in SCALES_S:
+        kept = np.exp(-np.maximum(np.diff(t_s), 1e-6) / scale_s)
+        # Inverse of the correlated part, which has three diagonals.
+        ends = np.concatenate([[0.0], kept**2 / (1.0 - kept**2), [0.0]])
+        beside = np.concatenate([[0.0], -kept / (1.0 - kept**2)])
+        inverse = np.stack([beside, 1.0 + ends[1:] + ends[:-1]])
+        correlated = first.T @ solveh_banded(inverse, first)
+        for share in SHARES:
+            # Of white and correlated noise: times ``inverse``, from the left.
+            both = (1.0 - share) * inverse + [[0.0], [share]]
+            normal = given.T @ solveh_banded(both, _tridiagonal(inverse, given))
+            left, right = normal[:-1, :-1], normal[:-1, -1]
+            square = max(float(normal[-1, -1] - right @ np.linalg.solve(left, right)), 1e-30)
+            logs = 2.0 * np.log(cholesky_banded(both)[1]).sum() + np.log1p(-(kept**2)).sum()
+            logs += np.linalg.slogdet(left)[1] + freedom * np.log(square)
+            scores.append(-0.5 * logs)
+            part = (1.0 - share) * first.T @ first + share * correlated
+            found.append(square / max(freedom - 2, 1) * part)
+    weights = np.exp(np.array(scores) - max(scores))
+    return np.asarray(np.tensordot(weights / weights.sum(), found, 1), np.float64)
+
+
+def _tridiagonal(bands: Floats, columns: Floats) -> Floats:
+    """Return the product of a symmetric matrix, by its upper bands, with columns."""
+    product: Floats = bands[1][:, None] * columns
+    product[:-1] += bands[0, 1:, None] * columns[1:]
+    product[1:] += bands[0, 1:, None] * columns[:-1]
+    return product
 
 
 def _fitted(

@@ -84,13 +84,31 @@ def test_shift_of_the_clock_shifts_the_delay() -> None:
 def test_intervals_cover_injected_delays() -> None:
     """In 120 drives, seeds 100 to 219; the benchmark has more, and the real drives."""
     rng = np.random.default_rng(8)
-    inside = []
+    errors, sds = [], []
     for seed in range(100, 220):
         delay_s = float(rng.uniform(-0.25, 0.25))
         found = delay_by_yaw_rate(pictures(seed, delay_s), *yaw_rate(seed, 25.0))
-        inside.append(abs(found.delay_s - delay_s) < 1.96 * found.sd_s)
+        errors.append(found.delay_s - delay_s)
+        sds.append(found.sd_s)
 
-    assert 0.9 <= np.mean(inside) <= 1.0
+    scaled = np.array(errors) / np.array(sds)
+    assert 0.9 <= np.mean(np.abs(scaled) < 1.96) <= 0.985
+    # Neither too narrow nor too wide.
+    assert np.sqrt(np.mean(scaled**2)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_errors_that_last_widen_the_interval() -> None:
+    """Two noises of one s.d.: one of each picture, one that lasts for a second."""
+    rng, exact = np.random.default_rng(11), pictures(11, 0.05, noise=0.0)
+    white = rng.normal(size=len(exact.t_ns) + 9)
+    slow = np.convolve(white, np.ones(10) / 10.0**0.5, "valid")
+
+    sds = []
+    for noise in (white[9:], slow):
+        turned = exact.turn_rad + np.radians(0.01) * noise
+        sds.append(delay_by_yaw_rate(exact._replace(turn_rad=turned), *yaw_rate(11)).sd_s)
+
+    assert sds[1] > 2.0 * sds[0]
 
 
 def test_signals_that_contradict_each_other_widen_the_mean() -> None:
