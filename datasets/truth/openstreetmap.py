@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -20,7 +19,7 @@ from crosscue.datasets.geodesy import geodetic_to_enu
 from crosscue.replay.errors import AnnotationError
 from crosscue.replay.limits import MIB
 
-from .label_xml import XmlReader, parse_xml
+from .label_xml import XmlReader
 from .road_map import Control, Road, RoadMap
 
 MAX_BYTES: Final = 512 * MIB
@@ -45,11 +44,13 @@ class MapExtract:
         points: Latitude and longitude of each point, degrees.
         roads: Roads for cars.
         controls: Control at a point, with its direction ("forward", "backward" or other text).
+        rounds: Points of each roundabout.
     """
 
     points: Mapping[str, tuple[float, float]]
     roads: Sequence[Road]
     controls: Mapping[str, tuple[Control, str]]
+    rounds: Sequence[tuple[str, ...]]
 
     def around(self, origin: tuple[float, float, float]) -> RoadMap:
         """Return the roads in a local frame.
@@ -72,38 +73,29 @@ class MapExtract:
                     ahead = float(np.arctan2(y, x))
                     toward = {"forward": ahead, "backward": ahead + np.pi}.get(direction)
                     controls[at] = control, toward
-        return RoadMap(points_m, self.roads, controls)
-
-
-def read_openstreetmap(path: Path) -> MapExtract:
-    """Read an extract.
-
-    Raises:
-        AnnotationError: The file cannot be read, or has no road for cars.
-    """
-    reader = _Reader(str(path))
-    parse_xml(path, reader, MAX_BYTES)
-    if not reader.roads:
-        raise AnnotationError(f"{path}: no road for cars (way with highway=residential, ...)")
-    return MapExtract(reader.points, reader.roads, reader.controls)
+        return RoadMap(points_m, self.roads, controls, self.rounds)
 
 
 @dataclass(slots=True)
-class _Reader(XmlReader):
+class MapReader(XmlReader):
+    """Points, roads and controls of a file."""
+
     kind = "OpenStreetMap's XML"
     max_depth = 16
     points: dict[str, tuple[float, float]] = field(default_factory=dict)
     controls: dict[str, tuple[Control, str]] = field(default_factory=dict)
     roads: list[Road] = field(default_factory=list)
+    rounds: list[tuple[str, ...]] = field(default_factory=list)
     _key: str = ""
     _nodes: list[str] = field(default_factory=list)
     _tags: dict[str, str] = field(default_factory=dict)
 
     def start(self, tag: str, found: Mapping[str, str]) -> None:
+        """Begin an element; a point's position is noted."""
         if not self._path and tag != "osm":
             raise AnnotationError(f"{self.where}: <{tag}>: expected <osm> of {self.kind}")
         XmlReader.start(self, tag, found)
-        if tag in ("node", "way"):
+        if tag in ("node", "way", "relation"):
             self._key, self._nodes, self._tags = found.get("id", ""), [], {}
         if tag == "node":
             try:
@@ -120,7 +112,20 @@ class _Reader(XmlReader):
         elif tag == "tag":
             self._tags[found.get("k", "")] = found.get("v", "")
 
+    def extract(self) -> MapExtract:
+        """Return the roads.
+
+        Raises:
+            AnnotationError: There is none.
+        """
+        if not self.roads:
+            raise AnnotationError(
+                f"{self.where}: no road for cars (way with highway=residential, ...), no lanelet"
+            )
+        return MapExtract(self.points, self.roads, self.controls, self.rounds)
+
     def end(self, tag: str) -> None:
+        """End an element; a control or a road is noted."""
         XmlReader.end(self, tag)
         if tag == "node" and self._tags.get("highway") in _CONTROLS:
             tags = self._tags
@@ -132,16 +137,17 @@ class _Reader(XmlReader):
             if self._tags.get("oneway") == "-1":
                 nodes = nodes[::-1]
             if len(nodes) > 1:
-                self.roads.append(_road(nodes, self._tags))
+                is_round = self._tags.get("junction") in ("roundabout", "circular")
+                self.roads.append(_road(nodes, self._tags, is_round))
+                self.rounds += [nodes] * is_round
 
 
-def _road(nodes: tuple[str, ...], tags: Mapping[str, str]) -> Road:
-    is_round = tags.get("junction") in ("roundabout", "circular")
+def _road(nodes: tuple[str, ...], tags: Mapping[str, str], is_round: bool) -> Road:
     motorway = tags["highway"] == "motorway"
     one_way = tags.get("oneway", "yes" if is_round or motorway else "no") in ("yes", "1", "-1")
     lanes = _number(tags.get("lanes", "")) or (1.0 if one_way else 2.0)
     width_m = _number(tags.get("width", "")) or lanes * LANE_M
-    return Road(nodes, min(width_m, MAX_WIDTH_M), one_way, is_round)
+    return Road(nodes, min(width_m, MAX_WIDTH_M), one_way)
 
 
 def _number(text: str) -> float:

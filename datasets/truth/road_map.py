@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -22,6 +22,10 @@ MIN_LEG_M: Final = 8.0
 # Turn from which on a leg leads left or right, and from which on it leads back.
 SIDE_RAD: Final = np.radians(40.0)
 BACK_RAD: Final = np.radians(155.0)
+# Angle from which on a lane inside an intersection crosses a way, and does not join it.
+CROSS_RAD: Final = np.radians(60.0)
+# A side road's kerbs are prolonged by at most so much to the way straight on.
+LEG_REACH_M: Final = 15.0
 # Distance from which on a vehicle approaches an intersection.
 REACH_M: Final = 100.0
 # A control stands at most so far ahead of its intersection.
@@ -41,18 +45,17 @@ class Road:
         nodes: Keys of its points, in its direction.
         width_m: Width between its kerbs.
         is_one_way: True if it may only be driven in its direction.
-        is_inside: True if it lies inside an intersection, as a roundabout does.
     """
 
     nodes: tuple[str, ...]
     width_m: float
     is_one_way: bool = False
-    is_inside: bool = False
 
 
 class Leg(NamedTuple):
     """A road that leads away from an intersection."""
 
+    xy_m: Floats
     heading_rad: float
     width_m: float
     is_in: bool
@@ -83,7 +86,6 @@ class _Edge(NamedTuple):
     width_m: float
     is_out: bool
     is_in: bool
-    is_inside: bool
 
 
 @dataclass(slots=True)
@@ -94,14 +96,21 @@ class RoadMap:
         points_m: Position of each point by its key, shape (2,).
         roads: The roads.
         controls: Control at a point, with the heading that it is for; None for every heading.
+        inside: Points of each roundabout, and of lanes that cross without a common point.
+        min_leg_m: Length from which on a dead end is a leg.
     """
 
     points_m: Mapping[str, Floats]
     roads: Sequence[Road]
     controls: Mapping[str, tuple[Control, float | None]]
+    inside: Sequence[Sequence[str]] = ()
+    min_leg_m: float = MIN_LEG_M
     _edges: dict[str, list[_Edge]] = field(init=False, default_factory=dict)
     _junction: dict[str, int] = field(init=False, default_factory=dict)
     _legs: dict[int, tuple[Leg, ...]] = field(init=False, default_factory=dict)
+    _kerbs: dict[tuple[str, str], tuple[float, float] | None] = field(
+        init=False, default_factory=dict
+    )
 
     def __post_init__(self) -> None:
         """Connect the roads, and find the junctions."""
@@ -110,7 +119,7 @@ class RoadMap:
                 if a == b:
                     continue
                 two_way = not road.is_one_way
-                one = _Edge(b, road.width_m, True, two_way, road.is_inside)
+                one = _Edge(b, road.width_m, True, two_way)
                 self._edges.setdefault(a, []).append(one)
                 back = one._replace(to=a, is_out=two_way, is_in=True)
                 self._edges.setdefault(b, []).append(back)
@@ -126,16 +135,18 @@ class RoadMap:
                 at = parent[at]
             return at
 
-        for road in self.roads:
-            if road.is_inside:
-                for at in road.nodes:
-                    parent[root(parent.setdefault(at, at))] = root(road.nodes[0])
+        def join(points: Sequence[str]) -> None:
+            for at in points:
+                parent.setdefault(at, at)
+                parent[root(at)] = root(points[0])
+
+        for points in self.inside:
+            join(points)
         for fork in sorted(forks):
             for edge in self._edges[fork]:
                 chain, length_m = self._chain(fork, edge, SAME_M)
                 if length_m < SAME_M and chain[-1] in parent:
-                    for at in chain:
-                        parent[root(parent.setdefault(at, at))] = root(fork)
+                    join(chain)
         numbers = {one: n for n, one in enumerate(sorted({root(at) for at in parent}))}
         self._junction = {at: numbers[root(at)] for at in parent}
         members: dict[int, list[str]] = {}
@@ -162,9 +173,9 @@ class RoadMap:
                 if edge.to in inside:
                     continue
                 chain, length_m = self._chain(at, edge, LEG_M)
-                if length_m >= MIN_LEG_M:
+                if length_m >= self.min_leg_m:
                     heading = self._heading_rad(at, chain[-1])
-                    yield Leg(heading, edge.width_m, edge.is_in, edge.is_out)
+                    yield Leg(self.points_m[at], heading, edge.width_m, edge.is_in, edge.is_out)
 
     def _distance_m(self, a: str, b: str) -> float:
         return float(np.hypot(*(self.points_m[b] - self.points_m[a])))
@@ -200,7 +211,8 @@ class RoadMap:
         headings = np.arctan2(ways[:, 1], ways[:, 0])
         found: list[Ahead | None] = []
         last: set[str] = set()
-        for at, heading in zip(xy_m, heading_rad.tolist(), strict=True):
+        step_m = np.hypot(*np.diff(xy_m, axis=0, prepend=xy_m[:1]).T)
+        for at, heading, gone_m in zip(xy_m, heading_rad.tolist(), step_m.tolist(), strict=True):
             part = np.clip(((at - starts) * ways).sum(axis=1) / length**2, 0.0, 1.0)
             off = np.hypot(*(starts + part[:, None] * ways - at).T)
             turn = np.abs(_wrapped(headings - heading))
@@ -212,7 +224,13 @@ class RoadMap:
                 continue
             begin, edge = near[best]
             last = {begin, edge.to}
-            found.append(self._ahead(begin, edge, float((1.0 - part[best]) * length[best])))
+            one = self._ahead(begin, edge, float((1.0 - part[best]) * length[best]))
+            before = found[-1] if found else None
+            if one is None and before and self._junction.get(edge.to) == before.junction:
+                # Lanes of an intersection begin before its kerb, as at a stop line.
+                left_m, end_m = before.start_m - gone_m, before.end_m - gone_m
+                one = replace(before, start_m=left_m, end_m=end_m) if left_m > 0.0 else None
+            found.append(one)
         return found
 
     def _near(self, xy_m: Floats) -> list[tuple[str, _Edge]]:
@@ -238,14 +256,14 @@ class RoadMap:
             if stated and (stated[1] is None or abs(_wrapped(stated[1] - heading)) < SIDE_RAD):
                 control = stated[0], gone_m
             number = self._junction.get(at)
-            if number is not None:
+            kerbs = None if number is None else self._kerbs_of(number, before, at)
+            if number is not None and kerbs is not None:
                 if self._junction.get(before) == number:
                     return None
-                found = self._measured(number, before, at, gone_m)
-                if found is not None:
-                    stands = control is not None and gone_m - control[1] < CONTROL_M
-                    said = control[0] if control and stands else None
-                    return Ahead(*found, heading, said or self._control_in(number, heading))
+                stands = control is not None and gone_m - control[1] < CONTROL_M
+                said = control[0] if control and stands else None
+                said = said or self._control_in(number, heading)
+                return Ahead(number, gone_m + kerbs[0], gone_m + kerbs[1], heading, said)
             onward = [e for e in self._edges[at] if e.is_out and e.to != before]
             if not onward:
                 return None
@@ -255,29 +273,52 @@ class RoadMap:
             gone_m += self._distance_m(before, at)
         return None
 
-    def _measured(
-        self, number: int, before: str, at: str, gone_m: float
-    ) -> tuple[int, float, float] | None:
-        """Return number, start and end of an intersection; None if it has no side road."""
-        heading = self._heading_rad(before, at)
-        halves = [
-            0.5 * leg.width_m / abs(np.sin(leg.heading_rad - heading))
-            for leg in self._legs[number]
-            if _side(leg.heading_rad - heading) in ("left", "right")
-        ]
-        if not halves:
-            return None
-        across_m, seen = 0.0, {before}
-        while at not in seen:
-            seen.add(at)
-            within = [e for e in self._edges[at] if self._junction.get(e.to) == number]
-            turns = [abs(_wrapped(self._heading_rad(at, e.to) - heading)) for e in within]
-            if not turns or min(turns) > SIDE_RAD:
-                break
-            onward = within[int(np.argmin(turns))].to
-            across_m += self._distance_m(at, onward)
-            at = onward
-        return number, gone_m - max(halves), gone_m + across_m + max(halves)
+    def _kerbs_of(self, number: int, before: str, at: str) -> tuple[float, float] | None:
+        """Return the distances from a point to the kerbs of an intersection's side roads.
+
+        They are where the side roads, and lanes inside of it that cross, meet the way straight on.
+
+        Returns:
+            Near and far kerb; None if there is no side road.
+        """
+        if (before, at) not in self._kerbs:
+            heading = self._heading_rad(before, at)
+            sides = [
+                (leg.xy_m, leg.heading_rad, leg.width_m, -LEG_REACH_M, 0.0)
+                for leg in self._legs[number]
+                if _side(leg.heading_rad - heading) in ("left", "right")
+            ]
+            inside = [
+                (self.points_m[a], self._heading_rad(a, e.to), e.width_m, 0.0, length_m)
+                for a, edges in self._edges.items()
+                if self._junction.get(a) == number
+                for e in edges
+                if self._junction.get(e.to) == number and (length_m := self._distance_m(a, e.to))
+            ]
+            spans = self._spans(at, heading, [*sides, *inside])
+            # All side roads are far off the way straight on, and their lanes end beside it.
+            spans = spans or self._spans(at, heading, [(*one[:3], -np.inf, 0.0) for one in sides])
+            near_far = (min(a for a, _ in spans), max(b for _, b in spans)) if sides else None
+            self._kerbs[before, at] = near_far
+        return self._kerbs[before, at]
+
+    def _spans(
+        self, at: str, heading_rad: float, lines: Sequence[tuple[Floats, float, float, float, float]]
+    ) -> list[tuple[float, float]]:
+        """Return where lines with a width cross a way, from their least to their most distance."""
+        found = []
+        x, y = np.cos(heading_rad), np.sin(heading_rad)
+        for begin, toward_rad, width_m, least_m, most_m in lines:
+            sine = np.sin(toward_rad - heading_rad)
+            if abs(sine) < np.sin(CROSS_RAD) and most_m > 0.0:
+                continue
+            off_x, off_y = begin - self.points_m[at]
+            along_m = (off_x * y - off_y * x) / sine
+            if least_m - 0.01 <= along_m <= most_m + 0.01:
+                ahead_m = (off_x * np.sin(toward_rad) - off_y * np.cos(toward_rad)) / sine
+                half_m = 0.5 * width_m / abs(sine)
+                found.append((float(ahead_m - half_m), float(ahead_m + half_m)))
+        return found
 
     def _control_in(self, number: int, heading_rad: float) -> Control | None:
         """Return the control that stands at a point of the intersection itself."""

@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from crosscue.datasets.truth.openstreetmap import read_openstreetmap
+from crosscue.datasets.truth.lanelet2 import read_map
 from crosscue.datasets.truth.road_map import Ahead, Leg, RoadMap, approaches_along
 from crosscue.datasets.truth.truth import Approach, Features, WrittenTruth
 from crosscue.datasets.truth.tum import Trajectory
@@ -36,7 +36,7 @@ def truth_from_map(
     """Write the intersections of a map that a drive with GNSS positions comes to.
 
     Each approach has its legs, its control where the map states one, and its distances. The map is
-    an OpenStreetMap extract. An approach without a stated control has the control "none" and the
+    an OpenStreetMap extract, or a Lanelet2 map with latitude and longitude. An approach without a stated control has the control "none" and the
     condition control_not_stated: maps rarely contain stop signs. The track is that of truth
     from-gnss.
 
@@ -45,7 +45,7 @@ def truth_from_map(
 
     Args:
         log: The drive, or its path; ``log.part(...)`` for a part of it.
-        road_map: OpenStreetMap extract, .osm, around the drive.
+        road_map: OpenStreetMap extract or Lanelet2 map, .osm, around the drive.
         output: Folder for the truth file, its track and its ranges.
         vehicle: Vehicle file with the antenna's mounting.
 
@@ -56,7 +56,7 @@ def truth_from_map(
     """
     settings = vehicle_given(vehicle)
     path = Path(road_map)
-    extract = read_openstreetmap(path)
+    extract = read_map(path)
     with opened(log) as drive:
         truth, track = gnss_truth(drive.logs, settings, drive.selection)
     assert truth.origin is not None

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.datasets.truth.openstreetmap import read_openstreetmap
+from crosscue.datasets.truth.lanelet2 import read_map
 from crosscue.datasets.truth.road_map import Ahead, RoadMap, approaches_along
 from crosscue.replay.errors import AnnotationError
 from support.street_map import ORIGIN, write_map
@@ -21,7 +21,7 @@ STREETS = [("abc", "lanes=2"), ("cf", "lanes=2"), ("ebd", "lanes=4"), ("cg", "")
 
 
 def _map(path: Path, roads: list[tuple[str, str]], tags: dict[str, str] | None = None) -> RoadMap:
-    return read_openstreetmap(write_map(path, POINTS, roads, tags)).around((*ORIGIN, 0.0))
+    return read_map(write_map(path, POINTS, roads, tags)).around((*ORIGIN, 0.0))
 
 
 def _ahead(roads: RoadMap, x_m: float, y_m: float = -2.0, heading_rad: float = 0.0) -> Ahead | None:
@@ -68,7 +68,7 @@ def test_a_turned_or_mirrored_map_gives_the_same_distances_and_turned_legs(
     sign = -1.0 if mirrored else 1.0
     turned = {k: (c * x - s * sign * y, s * x + c * sign * y) for k, (x, y) in POINTS.items()}
     path = write_map(tmp_path / "a.osm", turned, STREETS)
-    roads = read_openstreetmap(path).around((*ORIGIN, 0.0))
+    roads = read_map(path).around((*ORIGIN, 0.0))
 
     ahead = _ahead(roads, c * 130.0, s * 130.0, np.radians(turn_deg))
 
@@ -89,7 +89,7 @@ def test_control_counts_for_its_direction(tmp_path: Path) -> None:
     for name, tags in said.items():
         at = {"b" if name == "here" else "s": tags}
         path = write_map(tmp_path / f"{name}.osm", points, roads, at)
-        ahead = _ahead(read_openstreetmap(path).around((*ORIGIN, 0.0)), 0.0)
+        ahead = _ahead(read_map(path).around((*ORIGIN, 0.0)), 0.0)
         assert ahead is not None
         found[name] = ahead.control
 
@@ -100,7 +100,7 @@ def test_a_ramp_or_a_driveway_is_no_intersection(tmp_path: Path) -> None:
     points = POINTS | {"r": (200.0, -30.0), "p": (80.0, -40.0)}
     motorway = [("abcf", "highway=motorway"), ("cr", "highway=motorway_link oneway=yes")]
     path = write_map(tmp_path / "a.osm", points, [*motorway, ("bp", "highway=service")])
-    roads = read_openstreetmap(path).around((*ORIGIN, 0.0))
+    roads = read_map(path).around((*ORIGIN, 0.0))
 
     assert _ahead(roads, 30.0) is None
     assert _ahead(roads, 120.0) is None
@@ -110,7 +110,7 @@ def test_dual_carriageway_is_one_intersection(tmp_path: Path) -> None:
     points = POINTS | {"h": (75.0, 0.0), "i": (75.0, 70.0), "j": (75.0, -70.0)}
     roads = [("abhc", ""), ("dbe", "oneway=yes lanes=2"), ("jhi", "oneway=yes lanes=2")]
     path = write_map(tmp_path / "a.osm", points, roads)
-    road_map = read_openstreetmap(path).around((*ORIGIN, 0.0))
+    road_map = read_map(path).around((*ORIGIN, 0.0))
 
     ahead = _ahead(road_map, 0.0)
 
@@ -142,7 +142,7 @@ def test_unusable_map_is_refused_in_one_line(tmp_path: Path, content: str, said:
     path.write_text(content)
 
     with pytest.raises(AnnotationError, match=said) as caught:
-        read_openstreetmap(path)
+        read_map(path)
 
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
