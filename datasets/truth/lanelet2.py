@@ -1,7 +1,7 @@
 """Read the lanes of a Lanelet2 map, ``.osm``, as one-way roads of a ``RoadMap``.
 
-Lanelets for cars are read: ``subtype`` road, highway or play_street, unless ``participant`` excludes
-vehicles. A lanelet continues another one whose last points are its first points. Lanelets that
+Lanelets for cars are read: ``subtype`` road, highway or play_street, unless ``participant`` names
+others alone. A lanelet continues another one whose last points are its first points. Lanelets that
 cross without a common end are inside one intersection, and so are those with ``turn_direction``.
 Controls are the regulatory elements ``traffic_light`` and ``all_way_stop``, and ``right_of_way`` or
 ``traffic_sign`` with a stop sign. Positions are latitude and longitude.
@@ -24,13 +24,15 @@ from crosscue.replay.errors import AnnotationError
 
 from .label_xml import parse_xml
 from .openstreetmap import MAX_BYTES, MapExtract, MapReader
-from .road_map import Control, Road, RoadMap
+from .road_map import SIDE_RAD, Control, Road, RoadMap
 
 SUBTYPES: Final = ("road", "highway", "play_street")
 CARS: Final = ("participant:vehicle", "participant:vehicle:car", "participant:car")
 # Subtypes of a stop sign: Lanelet2's country and number, and Autoware's name.
 STOP_SIGNS: Final = ("de206", "usR1-1", "stop_sign")
 STEP_M: Final = 4.0
+# Longest turn from one road into another.
+TURN_M: Final = 50.0
 # Lanes that cross at another height do not meet.
 BRIDGE_M: Final = 3.0
 
@@ -90,8 +92,13 @@ class LaneMap:
                 continue
             one_way = one.tags.get("one_way", "yes") not in ("no", "false")
             roads[lane.ends] = Road(tuple(names), lane.width_m, one_way)
-        turns = [lanes[one.key].ends for one in self.lanelets if "turn_direction" in one.tags]
         count = Counter(at for lane in lanes.values() for at in lane.ends)
+        turns = [
+            lanes[one.key].ends
+            for one in self.lanelets
+            if "turn_direction" in one.tags
+            or (max(count[at] for at in lanes[one.key].ends) > 2 and _turns(lanes[one.key]))
+        ]
         # A lanelet that nothing continues may be a crossing for people, drawn as a road.
         linked = [lane for lane in lanes.values() if any(count[at] > 1 for at in lane.ends)]
         crossed = [(*a.ends, *b.ends) for a, b in _crossings(linked)]
@@ -121,9 +128,18 @@ def _nodes(roads: Mapping[tuple[str, str], Road], a: str, b: str) -> tuple[str, 
     return (roads.get((a, b)) or roads[b, a]).nodes
 
 
-def _lane(one: _Lanelet, xyz_m: Mapping[str, Floats]) -> _Lane:
-    left, right = (np.array([xyz_m[at] for at in side]) for side in (one.left, one.right))
-    names = [(side[0], side[-1]) for side in (one.left, one.right)]
+def _turns(lane: _Lane) -> bool:
+    """Whether a lane is as short as one inside an intersection, and leads left or right."""
+    ways = np.diff(lane.middle_m, axis=0)
+    (x0, y0), (x1, y1) = ways[0], ways[-1]
+    turn_rad = abs(np.arctan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1))
+    return bool(turn_rad > SIDE_RAD and np.hypot(*ways.T).sum() < TURN_M)
+
+
+def _lane(lanelet: _Lanelet, xyz_m: Mapping[str, Floats]) -> _Lane:
+    bounds = lanelet.left, lanelet.right
+    left, right = (np.array([xyz_m[at] for at in side]) for side in bounds)
+    names = [(side[0], side[-1]) for side in bounds]
     gaps = np.linalg.norm(left[[0, -1]] - right[[0, -1]], axis=1).sum()
     if gaps > np.linalg.norm(left[[0, -1]] - right[[-1, 0]], axis=1).sum():
         right, names[1] = right[::-1], names[1][::-1]
@@ -131,7 +147,7 @@ def _lane(one: _Lanelet, xyz_m: Mapping[str, Floats]) -> _Lane:
     if (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() > 0.0:
         # The bounds are drawn against the lane's direction, in which left is on the left.
         left, right, names = left[::-1], right[::-1], [name[::-1] for name in names]
-    length_m = np.linalg.norm(np.diff(left, axis=0), axis=1).sum()
+    length_m = max(np.linalg.norm(np.diff(one, axis=0), axis=1).sum() for one in (left, right))
     count = max(int(length_m / STEP_M), 1) + 1
     left, right = _resampled(left, count), _resampled(right, count)
     middle = 0.5 * (left + right)

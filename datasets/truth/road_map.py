@@ -303,7 +303,10 @@ class RoadMap:
         return self._kerbs[before, at]
 
     def _spans(
-        self, at: str, heading_rad: float, lines: Sequence[tuple[Floats, float, float, float, float]]
+        self,
+        at: str,
+        heading_rad: float,
+        lines: Sequence[tuple[Floats, float, float, float, float]],
     ) -> list[tuple[float, float]]:
         """Return where lines with a width cross a way, from their least to their most distance."""
         found = []

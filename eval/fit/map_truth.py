@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, Literal
 
@@ -36,9 +37,9 @@ def truth_from_map(
     """Write the intersections of a map that a drive with GNSS positions comes to.
 
     Each approach has its legs, its control where the map states one, and its distances. The map is
-    an OpenStreetMap extract, or a Lanelet2 map with latitude and longitude. An approach without a stated control has the control "none" and the
-    condition control_not_stated: maps rarely contain stop signs. The track is that of truth
-    from-gnss.
+    an OpenStreetMap extract, or a Lanelet2 map with latitude and longitude. An approach without a
+    stated control has the control "none" and the condition control_not_stated: maps rarely contain
+    stop signs. The track is that of truth from-gnss.
 
     Examples:
         crosscue truth from-map drive.mcap map.osm --vehicle car.toml -o truth/
@@ -100,6 +101,9 @@ def _approaches(
         near = found[stop - 1]
         assert near is not None
         number = len(approaches) + 1
+        stated = [one.control for one in found[first:stop] if one and one.control]
+        # A sign that stands before the kerb is not ahead of the last positions.
+        near = replace(near, control=stated[-1] if stated else None)
         approaches.append(_approach(number, near, roads, t_ns[first:stop], enter_ns))
         for t, one in zip(t_ns[first:stop].tolist(), found[first:stop], strict=True):
             assert one is not None

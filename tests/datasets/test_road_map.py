@@ -119,6 +119,24 @@ def test_dual_carriageway_is_one_intersection(tmp_path: Path) -> None:
     assert _ahead(road_map, 66.0) is None
 
 
+def test_roundabout_begins_at_its_ring_and_ends_behind_it(tmp_path: Path) -> None:
+    ring = {k: (60.0 + 20.0 * np.cos(a), 20.0 * np.sin(a)) for k, a in zip(
+        "pqrstuvw", np.radians(22.5 + 45.0 * np.arange(8)), strict=True
+    )}  # fmt: skip
+    points = ring | {"a": (-80.0, 0.0), "b": (40.0, 0.0), "c": (80.0, 0.0), "f": (160.0, 0.0)}
+    # The ring's first point has no arm.
+    roads = [("ab", ""), ("cf", ""), ("pqrsbtuvwcp", "junction=roundabout lanes=1")]
+    roads += [("qd", ""), ("vg", "")]
+    points |= {"d": (67.0, 90.0), "g": (52.0, -90.0)}
+    road_map = read_map(write_map(tmp_path / "a.osm", points, roads)).around((*ORIGIN, 0.0))
+
+    ahead = _ahead(road_map, 0.0)
+
+    assert ahead is not None
+    assert [ahead.start_m, ahead.end_m] == pytest.approx([40.0 - 1.6, 80.0 + 1.6], abs=0.3)
+    assert _sides(road_map, ahead) == {"left", "right", "straight", "back"}
+
+
 def test_off_the_roads_there_is_nothing_ahead(tmp_path: Path) -> None:
     roads = _map(tmp_path / "a.osm", STREETS)
 

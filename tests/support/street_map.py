@@ -1,4 +1,4 @@
-"""Write OpenStreetMap extracts of made-up streets."""
+"""Write OpenStreetMap extracts and Lanelet2 maps of made-up streets."""
 
 from __future__ import annotations
 
@@ -28,19 +28,82 @@ def write_map(
         tags: Tags of points.
         origin: Latitude and longitude of the origin.
     """
-    latitude = math.radians(origin[0])
-    north_m = 111_132.92 - 559.82 * math.cos(2.0 * latitude)
-    east_m = 111_412.84 * math.cos(latitude) - 93.5 * math.cos(3.0 * latitude)
     lines = ["<osm version='0.6'>"]
-    for name, (x, y) in points_m.items():
-        at = f"lat='{origin[0] + y / north_m:.8f}' lon='{origin[1] + x / east_m:.8f}'"
-        lines.append(f"<node id='{name}' {at}>{_tags((tags or {}).get(name, ''))}</node>")
+    for name, xy_m in points_m.items():
+        said = _tags((tags or {}).get(name, ""))
+        lines.append(f"<node id='{name}' {_degrees(xy_m, origin)}>{said}</node>")
     for number, (names, said) in enumerate(roads):
         inside = "".join(f"<nd ref='{name}'/>" for name in names)
         kind = "" if "highway=" in said else "highway=residential "
         lines.append(f"<way id='{number}'>{inside}{_tags(kind + said)}</way>")
     path.write_text("\n".join([*lines, "</osm>"]))
     return path
+
+
+def _degrees(xy_m: tuple[float, float], origin: tuple[float, float]) -> str:
+    latitude = math.radians(origin[0])
+    north_m = 111_132.92 - 559.82 * math.cos(2.0 * latitude)
+    east_m = 111_412.84 * math.cos(latitude) - 93.5 * math.cos(3.0 * latitude)
+    return f"lat='{origin[0] + xy_m[1] / north_m:.8f}' lon='{origin[1] + xy_m[0] / east_m:.8f}'"
+
+
+Bound = Sequence[tuple[float, float]]
+
+
+def write_lanelets(
+    path: Path,
+    lanelets: Mapping[str, tuple[Bound, Bound, str]],
+    rules: Mapping[str, tuple[str, str]] | None = None,
+    *,
+    heights_m: Mapping[str, float] | None = None,
+    reversed_bounds: bool = False,
+) -> Path:
+    """Write a Lanelet2 map.
+
+    Args:
+        path: The file.
+        lanelets: Left bound, right bound and tags of each lanelet; equal points are one node.
+        rules: Kind of each regulatory element, and the lanelets it is for; "stop" stands for a
+            right of way with a stop sign.
+        heights_m: Height of a lanelet's points.
+        reversed_bounds: Draw the left bounds against their lanes, as Lanelet2 allows.
+    """
+    nodes: dict[tuple[float, float], int] = {}
+    lines, ways, relations = [], [], []
+    rules = rules or {}
+    for key, (left, right, said) in lanelets.items():
+        for role, bound in (("left", left), ("right", right)):
+            for point in bound:
+                xy_m = round(point[0], 3), round(point[1], 3)
+                if xy_m not in nodes:
+                    nodes[xy_m] = len(nodes) + 1
+                    height = _tags(f"ele={(heights_m or {}).get(key, 0.0)}")
+                    at = _degrees(xy_m, ORIGIN)
+                    lines.append(f"<node id='{nodes[xy_m]}' {at}>{height}</node>")
+            drawn = [nodes[round(x, 3), round(y, 3)] for x, y in bound]
+            drawn = drawn[::-1] if reversed_bounds and role == "left" else drawn
+            inside = "".join(f"<nd ref='{node}'/>" for node in drawn)
+            ways.append(f"<way id='{key}-{role}'>{inside}</way>")
+        members = [("way", f"{key}-{role}", role) for role in ("left", "right")]
+        members += [
+            ("relation", rule, "regulatory_element")
+            for rule, (_, of) in rules.items()
+            if key in of.split()
+        ]
+        kind = "" if "subtype=" in said else "subtype=road "
+        relations.append(_relation(key, members, f"type=lanelet {kind}{said}"))
+    for rule, (kind, of) in rules.items():
+        members = [("way", "sign", "refers")] + [("relation", key, "yield") for key in of.split()]
+        kind = "right_of_way" if kind == "stop" else kind
+        relations.append(_relation(rule, members, f"type=regulatory_element subtype={kind}"))
+    ways.append(f"<way id='sign'>{_tags('type=traffic_sign subtype=de206')}</way>")
+    path.write_text("\n".join(["<osm version='0.6'>", *lines, *ways, *relations, "</osm>"]))
+    return path
+
+
+def _relation(key: str, members: Sequence[tuple[str, str, str]], said: str) -> str:
+    inside = "".join(f"<member type='{t}' ref='{ref}' role='{role}'/>" for t, ref, role in members)
+    return f"<relation id='{key}'>{inside}{_tags(said)}</relation>"
 
 
 def write_crossing(path: Path) -> Path:
