@@ -169,7 +169,7 @@ def _crossings(lanes: Sequence[_Lane]) -> Iterator[tuple[_Lane, _Lane]]:
     high = np.array([one.middle_m.max(axis=0) for one in lanes])
     for row, one in enumerate(lanes):
         near = ((low[row + 1 :] <= high[row]) & (high[row + 1 :] >= low[row])).all(axis=1)
-        for other in (lanes[at] for at in np.flatnonzero(near) + row + 1):
+        for other in (lanes[row + 1 + at] for at in np.flatnonzero(near).tolist()):
             apart = {*one.ends}.isdisjoint(other.ends)
             if apart and abs(one.height_m - other.height_m) < BRIDGE_M and _cross(one, other):
                 yield one, other

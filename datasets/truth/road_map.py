@@ -169,7 +169,16 @@ class RoadMap:
     def _legs_of(self, members: Sequence[str]) -> Iterator[Leg]:
         inside = set(members)
         for at in sorted(members):
-            for edge in self._edges[at]:
+            edges = self._edges[at]
+            ways = np.array([self._heading_rad(at, edge.to) for edge in edges])
+            inward = float(np.angle(np.exp(1j * ways).sum()))
+            if self.min_leg_m == 0.0 and (np.abs(_wrapped(ways - inward)) < CROSS_RAD).all():
+                # The map ends here, with the lanes inside of the intersection.
+                into, out_of = any(e.is_out for e in edges), any(e.is_in for e in edges)
+                heading = float(_wrapped(inward + np.pi))
+                yield Leg(self.points_m[at], heading, edges[0].width_m, into, out_of)
+                continue
+            for edge in edges:
                 if edge.to in inside:
                     continue
                 chain, length_m = self._chain(at, edge, LEG_M)

@@ -4,6 +4,7 @@ An interrupted transfer continues where it stopped. The incomplete file is store
 in the same folder.
 """
 
+import contextlib
 import os
 import shutil
 from collections.abc import Callable
@@ -100,6 +101,7 @@ def download(
         _resume(url, partial, file, lambda done: on_progress(file.name, done, file.size_bytes))
         partial.replace(output_file)
 
+    made = [one for one in (place.parent, *place.parent.parents) if not one.exists()]
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         pooch.retrieve(
@@ -122,6 +124,11 @@ def download(
         ) from None
     except OSError as error:
         raise cannot_write(place, error) from None
+    finally:
+        with contextlib.suppress(OSError):
+            # Folders made for a file of which nothing came are empty.
+            for folder in made:
+                folder.rmdir()
 
 
 def _resume(url: str, partial: Path, file: KnownFile, on_bytes: Callable[[int], None]) -> None:

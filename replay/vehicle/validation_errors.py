@@ -20,6 +20,8 @@ from .section import tuples
 
 # Maximum number of characters of an invalid value in a message.
 GIVEN_CHARACTERS: Final = 80
+# Maximum number of missing fields that a message names.
+MAX_MISSING: Final = 8
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -54,7 +56,7 @@ def explain(error: ValidationError, text: str | None, where: str, root: type[Bas
         where: Name of the file.
         root: Model of the file.
     """
-    first, *others = error.errors(include_url=False)
+    first, *others = found = error.errors(include_url=False)
     keys = [str(part) for part in first["loc"]]
     more = f" (and {len(others)} more)" if others else ""
     line = "" if text is None else f":{_line_of(keys, text)}"
@@ -62,7 +64,11 @@ def explain(error: ValidationError, text: str | None, where: str, root: type[Bas
     if first["type"] == "extra_forbidden":
         return f"{place}: no such key; {_suggestion(keys, root)}{more}"
     if first["type"] == "missing":
-        return f"{place}: missing; add it{more}"
+        missing = [".".join(map(str, one["loc"])) for one in found if one["type"] == "missing"]
+        named = missing[:MAX_MISSING]
+        more = f" (and {len(found) - len(named)} more)" if len(found) > len(named) else ""
+        them = "it" if len(named) == 1 else "them"
+        return f"{where}{line}: {', '.join(named)}: missing; add {them}{more}"
     if not keys:
         return f"{where}: {first['msg'].removeprefix('Value error, ')}{more}"
     given = repr(first["input"])

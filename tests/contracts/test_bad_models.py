@@ -28,7 +28,7 @@ BAD = {
     "other-classes": "class numbers 1 to 1, but 1 classes are listed; correct the card",
     "no-classes": "net.toml: output.classes is empty; list the network's classes",
     "other-size": "the network does not run on input 40 x 32",
-    "empty-card": "net.toml:1: version: missing; add it",
+    "empty-card": "net.toml:1: version, weights, sha256, input, output: missing; add them",
     "other-weights": "; fetch the weights again, or write a card for this file",
     "no-weights": "net.onnx: No such file",
     "other-camera": "outside the images of 24 x 16 pixels",

@@ -6,11 +6,13 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from crosscue.datasets.real import recordings
 from crosscue.datasets.real.recordings import FOLDER
 from crosscue.datasets.truth.truth import read_truth as load_truth
 from crosscue.detectors.catalog import fetch as weights
 from crosscue.detectors.catalog import places
 from crosscue.eval.cli import run
+from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
 from support.data import shared
 
@@ -69,3 +71,32 @@ def test_can_segment_and_single_picture_are_replayed_as_one_drive(
 
     cues = pq.read_table("run/cues.parquet", filters=[("cue", "=", "traffic_light")])
     assert [count > 0 for count in cues["count"].to_pylist()] == [True]
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+def test_fetching_without_a_network_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_there: bool
+) -> None:
+    monkeypatch.delenv(weights.DATA, raising=False)
+    monkeypatch.setenv(recordings.MIRROR, "http://127.0.0.1:9")
+    folder = tmp_path / "drives" / "pandaset"
+    if is_there:
+        folder.mkdir(parents=True)
+
+    with pytest.raises(CrosscueError, match="not fetched"):
+        recordings.fetch("pandaset_002", folder)
+
+    assert [*tmp_path.rglob("*")] == ([folder.parent, folder] if is_there else [])
+
+
+def test_fetching_a_model_without_a_network_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(weights.DATA, raising=False)
+    monkeypatch.setenv(places.VARIABLE, str(tmp_path / "models"))
+    monkeypatch.setenv(weights.MIRROR, "http://127.0.0.1:9")
+
+    with pytest.raises(CrosscueError, match="not fetched"):
+        weights.fetch_weights("yolox-nano")
+
+    assert not [*tmp_path.iterdir()]

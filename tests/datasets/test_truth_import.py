@@ -11,7 +11,7 @@ import pytest
 from crosscue.datasets.truth.label_xml import read_cvat
 from crosscue.datasets.truth.truth import read_truth
 from crosscue.eval import cli
-from crosscue.replay.errors import SchemaError
+from crosscue.replay.errors import AnnotationError, SchemaError
 from support.refusals import refusal
 
 WIDE, HIGH = 64, 36
@@ -291,3 +291,18 @@ def test_truth_that_contradicts_its_log_is_refused(
     tmp_path: Path, log: Path, tree: dict[str, Any], message: str
 ) -> None:
     assert message in refusal((1, 4), "check", _write(tmp_path / "truth.json", tree), log)
+
+
+def test_every_missing_field_of_a_truth_is_named_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "truth.json"
+    path.write_text('{"version": 1, "approaches": [{"id": 1}, {"id": 2}]}')
+
+    with pytest.raises(AnnotationError) as caught:
+        read_truth(path)
+
+    fields = ("intersection", "start_ns", "enter_ns", "control", "features")
+    named = [f"approaches.0.{name}" for name in fields]
+    assert str(caught.value) == (
+        f"{path}: start_ns, end_ns, {', '.join(named)}, approaches.1.intersection: missing; "
+        "add them (and 4 more)"
+    )

@@ -35,7 +35,7 @@ def test_box_detector_meets_the_detector_contract() -> None:
 
 
 def test_settings_are_checked_and_decide_the_identity() -> None:
-    with pytest.raises(VehicleError, match="detector corner: side: no such setting"):
+    with pytest.raises(VehicleError, match="detector corner: side: no such key"):
         Corner.build(side=4)
 
     changed = type("Corner", (Corner,), {"version": 2, "__module__": __name__})

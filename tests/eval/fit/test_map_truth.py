@@ -59,7 +59,8 @@ def test_approaches_of_a_lanelet2_map_are_read_as_those_of_an_extract(tmp_path: 
 
     (one,) = read_truth(written.path).approaches
     assert one.features.model_dump() == {"left": True, "right": False, "straight": True}
-    assert (one.control, one.length_m) == ("traffic_light", pytest.approx(8.0, abs=0.2))
+    assert one.control == "traffic_light"
+    assert one.length_m == pytest.approx(8.0, abs=0.2)
     row = (tmp_path / "truth" / "ranges.csv").read_text().splitlines()[1].split(",")
     assert float(row[2]) == pytest.approx(56.0, abs=0.5)
 

@@ -24,6 +24,10 @@ from support.memory_log import MAGNETOMETER
         ),
         ("version = 1\n[compass]\nheading_sd_deg = 3.0", r":3: .*did you mean heading_sd_rad"),
         ("version = 1\n\n[can.wheel_speeds]\nrear_left = 'A.B'", r":3: .*rear_right: missing"),
+        (
+            "version = 1\n\n[can.wheel_speeds]\nunit = 'm/s'",
+            r":3: can.wheel_speeds.rear_left, can.wheel_speeds.rear_right: missing; add them$",
+        ),
         ("version = 1\n[odometry]\nwheelbase_m = '2.7'", r":3: .*valid number, got '2.7'"),
         ("version = 1\n[odometry]\nwheelbase_m = -2.7", r":3: .*greater than 0"),
         ("version = 1\n[odometry]\nwheelbase_m = nan", r":3: odometry.wheelbase_m"),
