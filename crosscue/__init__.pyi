@@ -63,7 +63,6 @@ from crosscue.eval.scoring.drives import score as score
 from crosscue.eval.studies.intersections.run import run_intersection_study as run_intersection_study
 from crosscue.eval.studies.layouts.run import run_layout_study as run_layout_study
 from crosscue.eval.studies.town.field_study import run_field_study as run_field_study
-from crosscue.eval.studies.town.replayed import run_study_drive as run_study_drive
 from crosscue.eval.studies.town.run import run_landmark_study as run_landmark_study
 from crosscue.eval.studies.town.run import run_range_study as run_range_study
 from crosscue.eval.training.frames import render_training_frames as render_training_frames

@@ -90,7 +90,6 @@ COMMANDS: Final = {
     "study range": "eval.studies.town.run:run_range_study",
     "study landmarks": "eval.studies.town.run:run_landmark_study",
     "study field": "eval.studies.town.field_study:run_field_study",
-    "study drive": "eval.studies.town.replayed:run_study_drive",
     "demo": "eval.drives.demo:demo",
     "plugins": "detectors.plugins:plugins",
     "completion": "eval.completion:completion",

@@ -14,7 +14,6 @@
     * RunError               a run folder is locked, or lacks the requested results
         * UnreadableRunError it is missing, damaged or of another version (exit status 4)
     * OutputError            a result cannot be written (disk full, no permission)
-    * StudyFileError         a study file is unreadable or does not match (exit status 2)
     * WorkerError            a worker process died; finished parts are kept
     * EmptyResultError       the logs contain nothing that was requested
     * FitError               a fit is worse on held-out data than the values before it
@@ -110,12 +109,6 @@ class UnreadableRunError(RunError):
 
 class OutputError(CrosscueError):
     """A result cannot be written."""
-
-
-class StudyFileError(CrosscueError):
-    """A study file is unreadable or does not match."""
-
-    exit_status = 2
 
 
 class WorkerError(CrosscueError):

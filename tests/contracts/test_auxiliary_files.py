@@ -149,9 +149,6 @@ SETTINGS_FILES: Final[dict[tuple[str, str], str]] = {
     ("check", "--spec"): "{log} --spec {gone}",
     ("model fetch", "--from"): "yolox-nano --from {gone}",
     ("study intersections", "--vehicle"): "-o {out} --vehicle {gone}",
-    ("study range", "--settings"): "-o {out} --settings {gone}",
-    ("study landmarks", "--settings"): "-o {out} --settings {gone}",
-    ("study field", "--settings"): "-o {out} --settings {gone}",
     ("train road", "--init"): "--data {masks} -o {out}.safetensors --init {gone}",
     ("train road", "--measure"): "--data {masks} --measure {gone}",
     (

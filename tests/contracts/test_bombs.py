@@ -74,7 +74,6 @@ OPENS_NO_LOG: dict[str, str] = {
     "model fetch": "a network", "model init": "a network", "model list": "nothing",
     "model show": "a card", "completion": "nothing", "plugins": "nothing",
     "study intersections": "what it made", "study layouts": "what it made",
-    "study drive": "what it made",
     "seal": "bytes as they are", "truth": "arrays and texts of data sets, not compressed",
 }  # fmt: skip
 

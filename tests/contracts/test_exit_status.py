@@ -59,7 +59,6 @@ STATUS: Final[dict[str, list[tuple[int, str]]]] = {
         (2, "info {log} --topics /gone"),
         (2, "replay {log} -o {out} --vehicle {noise}"),
         (2, "replay {log} -o {out} --vehicle {mute}"),
-        (2, "study range -o {out} --settings {noise}"),
         (2, "score {run} --truth {truth} --gate {noise}"),
         (2, "model show {noise}"),
     ],

@@ -70,7 +70,6 @@ MADE: Final[dict[str, tuple[str, int]]] = {
     "truth import": ("road/coco.json --log LOG -o imported.json", 0),
     "simulate": ("A -o simulated --width 64 --fps 10", 0),
     "study landmarks": ("-o marks --drives 1", 0),
-    "study drive": ("-o study", 0),
     "train frames": ("L400 -o frames --per-layout 1 --width 64", 0),
     "train road": (
         "--data road -o road.safetensors --steps 1 --batch 1 --width 128 --device cpu",

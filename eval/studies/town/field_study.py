@@ -118,7 +118,6 @@ class FieldResult(StudyResult):
 
 def field_study_of(
     *,
-    settings: Annotated[Path | None, Option(metavar="X.toml")] = None,
     seed: int | None = None,
     range_runs: int | None = None,
     landmark_runs: int | None = None,
@@ -127,7 +126,6 @@ def field_study_of(
     """Return the settings of a study of the field protocol.
 
     Args:
-        settings: Settings of your own study.
         seed: Random seed.
         range_runs: Runs without landmarks.
         landmark_runs: Runs with landmarks.
@@ -135,7 +133,6 @@ def field_study_of(
     """
     return study_of(
         FieldStudy,
-        settings,
         seed=seed,
         range_runs=range_runs,
         landmark_runs=landmark_runs,

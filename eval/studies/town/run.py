@@ -68,8 +68,8 @@ class Calibration(Result):
     compass_interval_m: float
 
     def lines(self) -> Iterator[str]:
-        """Yield the setting of a study file."""
-        yield f"[drive.sensors]\ncompass_interval_m = {self.compass_interval_m:.4f}"
+        """Yield the setting of the simulated sensors."""
+        yield f"compass_interval_m = {self.compass_interval_m:.4f}"
 
 
 @overload
@@ -104,7 +104,6 @@ def run_range_study(
     Examples:
         crosscue study range -o range
         crosscue study range --drives 50 --workers 2
-        crosscue study range --settings my_car.toml -o mine
         crosscue study range --calibrate
 
     Args:
@@ -143,7 +142,6 @@ def run_landmark_study(
     Examples:
         crosscue study landmarks -o landmarks
         crosscue study landmarks --drives 50 --workers 2
-        crosscue study landmarks --settings my_car.toml -o mine
 
     Args:
         study: Settings of the study.

@@ -1,37 +1,19 @@
-"""Settings of a study, by default or from a TOML file.
-
-A study file has its ``kind`` and the settings that differ from the published study of that kind:
-
-    version = 1
-    kind = "range"
-    drives = 200
-    compass_2sigma_deg = [5.0, 15.0]
-    [drive.car]
-    cruise_mps = 14.0
-"""
+"""Settings of a study, by default those of the published one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import product
-from pathlib import Path
-from typing import Annotated, ClassVar, Final, Literal, NamedTuple, Self, TypeVar
+from typing import Annotated, Final, Literal, NamedTuple, TypeVar
 
-from pydantic import Field, ValidationError, model_validator
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import Field, ValidationError
 
 from crosscue.localization.town.settings import City, Proportion, TownDrive
-from crosscue.replay.errors import StudyFileError, UsageError
-from crosscue.replay.files.bounded import read_text
-from crosscue.replay.files.tree_text import toml_tree
-from crosscue.replay.limits import MIB
+from crosscue.replay.errors import UsageError
 from crosscue.replay.vehicle.section import Section
-from crosscue.replay.vehicle.validation_errors import parse_model
-from crosscue.verb import Option
 
 VERSION: Final = 1
 UNTIL_LOST: Final = 1_000_000
-VARIED: Final = "set by the study; remove it from the file"
 
 StrategyName = Literal["straight to goal", "landmark to landmark", "hybrid"]
 Degrees = Annotated[float, Field(gt=0.0, le=180.0)]
@@ -57,20 +39,6 @@ class _Study(Section):
     seed: Seed = 1
     drive: TownDrive = TownDrive()
 
-    varied: ClassVar[tuple[str, ...]] = ()
-    """Settings of the drive that the study sets."""
-
-    @model_validator(mode="after")
-    def _leaves_the_varied_alone(self) -> Self:
-        for path in self.varied:
-            section: Section = self.drive
-            *outer, last = path.split(".")
-            for name in outer:
-                section = getattr(section, name)
-            if last in section.model_fields_set:
-                raise _misfit(VARIED, getattr(section, last), "drive", *outer, last)
-        return self
-
 
 class RangeStudy(_Study):
     """Range without landmarks: drives from goal to goal until lost."""
@@ -80,14 +48,6 @@ class RangeStudy(_Study):
     """Number of drives with each compass."""
     compass_2sigma_deg: tuple[Degrees, ...] = (10.0, 20.0, 30.0)
     without_compass: bool = True
-
-    varied: ClassVar[tuple[str, ...]] = ("sensors.compass_2sigma_deg", "goals", "landmarks_per_km2")
-
-    @model_validator(mode="after")
-    def _has_a_compass_or_none(self) -> Self:
-        if not self.compass_2sigma_deg and not self.without_compass:
-            raise _misfit("expected a compass, or drives without one", False, "without_compass")
-        return self
 
     def cases(self) -> tuple[Case, ...]:
         """Return one case per compass."""
@@ -126,13 +86,6 @@ class LandmarkStudy(_Study):
     points: tuple[tuple[Density, Proportion], ...] = ((0.55, 0.6),)
     """Further pairs of density and rate, only for landmark to landmark."""
 
-    varied: ClassVar[tuple[str, ...]] = (
-        "navigation.strategy",
-        "sensors.detection_rate",
-        "landmarks_per_km2",
-        "goals",
-    )
-
     def cases(self) -> tuple[Case, ...]:
         """Return all cases, strategies outermost.
 
@@ -162,18 +115,6 @@ class FieldStudy(_Study):
     compass_2sigma_deg: Degrees = 25.0
     landmarks_per_km2: Density = 0.55
     detection_rate: Proportion = 0.6
-
-    varied: ClassVar[tuple[str, ...]] = (
-        "navigation.strategy",
-        "sensors.detection_rate",
-        "sensors.compass_2sigma_deg",
-        "landmarks_per_km2",
-        "landmark_per_goal",
-        "goals",
-        "longest_s",
-        "city.smallest_km2",
-        "city.largest_km2",
-    )
 
     def settings(self, *, has_landmarks: bool) -> TownDrive:
         """Return the settings of one kind of run."""
@@ -213,42 +154,19 @@ def changed(drive: TownDrive, **values: object) -> TownDrive:
     )
 
 
-def load_study(path: Path, kind: type[Study]) -> Study:
-    """Read and check a study file.
-
-    Raises:
-        StudyFileError: The file is missing, not TOML or of another kind, or a key or value is not
-            valid; the message names the line.
-    """
-    text = read_text(path, MIB, StudyFileError, "expected a study file")
-    try:
-        tree = toml_tree(text)
-    except ValueError as error:
-        raise StudyFileError(f"{path}: not TOML: {error}; correct that line") from None
-    wanted = kind.model_fields["kind"].default
-    if tree.get("kind") != wanted:
-        raise StudyFileError(f'{path}: kind: expected "{wanted}" here, got {tree.get("kind")!r}')
-    if "version" not in tree:
-        raise StudyFileError(f"{path}:1: version: missing; add version = {VERSION}")
-    return parse_model(text, str(path), kind, StudyFileError)
-
-
-def study_of(kind: type[Study], settings: Path | None, **given: object) -> Study:
-    """Return the settings of a file or of the published study, with others in their place.
+def study_of(kind: type[Study], **given: object) -> Study:
+    """Return the settings of the published study, with others in their place.
 
     Args:
         kind: Kind of the study.
-        settings: The file; None for the published study.
         given: The settings to replace; None for none.
 
     Raises:
         UsageError: A value is out of range.
-        StudyFileError: The file is not valid.
     """
-    study = kind() if settings is None else load_study(settings, kind)
     changed = {name: value for name, value in given.items() if value is not None}
     try:
-        return kind.model_validate({**dict(study), **changed})
+        return kind.model_validate(changed)
     except ValidationError as error:
         first = error.errors()[0]
         name = str(first["loc"][0])
@@ -258,30 +176,16 @@ def study_of(kind: type[Study], settings: Path | None, **given: object) -> Study
 def drives_of(kind: type[Study]) -> Callable[..., Study]:
     """Return a function that makes the settings of a study from the options of its command."""
 
-    def make(
-        *,
-        settings: Annotated[Path | None, Option(metavar="X.toml")] = None,
-        seed: int | None = None,
-        drives: int | None = None,
-    ) -> Study:
+    def make(*, seed: int | None = None, drives: int | None = None) -> Study:
         """Return the settings of a study.
 
         Args:
-            settings: Settings of your own study.
             seed: Random seed.
             drives: Drives per combination.
         """
-        return study_of(kind, settings, seed=seed, drives=drives)
+        return study_of(kind, seed=seed, drives=drives)
 
     return make
-
-
-def _misfit(why: str, given: object, *keys: str) -> ValidationError:
-    """Return an error with its key, which a ValueError in a model's validator cannot have."""
-    kind = PydanticCustomError("misfit", "{why}", {"why": why})
-    return ValidationError.from_exception_data(
-        why, [InitErrorDetails(type=kind, loc=keys, input=given)]
-    )
 
 
 def _landmarks(drive: TownDrive, strategy: str, per_km2: float, rate: float) -> TownDrive:
