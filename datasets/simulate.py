@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
-from crosscue.datasets.scenes.drive import SceneFiles, jpeg, refuse_other_drive, write_scene
+from crosscue.datasets.scenes.drive import SceneFiles, refuse_other_drive, write_scene
 from crosscue.datasets.scenes.layout import SCORED, Side
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
-from crosscue.replay.errors import OutputError, UsageError
-from crosscue.replay.files.whole_file import write_bytes
+from crosscue.replay.errors import UsageError
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
-from crosscue.results import Listing, Result
+from crosscue.results import Listing
 from crosscue.verb import Option
 
 if TYPE_CHECKING:
     from crosscue.datasets.simulated.log_files import DriveFiles
 
 PUBLISHED_RUNS: Final = 10
-SHEET_QUALITY: Final = 82
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,23 +90,6 @@ class SimulatedDrives(Listing[SceneFiles]):
         return (row.name, row.log, row.pictures, row.seconds)
 
 
-@dataclass(frozen=True, slots=True, repr=False)
-class ContactSheet(Result):
-    """A contact sheet with one picture per drive.
-
-    Attributes:
-        sheet: The picture.
-        drives: Names of the drives.
-    """
-
-    sheet: Path
-    drives: tuple[str, ...]
-
-    def lines(self) -> Iterator[str]:
-        """Yield the path of the picture."""
-        yield str(self.sheet)
-
-
 def simulate_approach(
     folder: Path | str,
     layout: str = "A",
@@ -142,13 +123,8 @@ def simulate_approach(
 
 
 def simulate_approaches(
-    approaches: Approaches,
-    output: Path | str | None = None,
-    *,
-    sheet: Annotated[Path | str | None, Option(metavar="JPEG")] = None,
-    workers: int = 1,
-    overwrite: bool = False,
-) -> SimulatedDrives | ContactSheet:
+    approaches: Approaches, output: Path | str, *, workers: int = 1, overwrite: bool = False
+) -> SimulatedDrives:
     """Simulate drives up to intersections: a log with all sensors, and its truth.
 
     Layouts A to H are those of the published study; L0, L1, ... are random layouts for training.
@@ -158,29 +134,20 @@ def simulate_approaches(
         crosscue simulate A --run 3 -o drives
         crosscue simulate --all -o drives
         crosscue simulate L17 L18 --runs 2 --seed 5 -o training
-        crosscue simulate --all --sheet sheet.jpg
 
     Args:
         approaches: The drives to simulate.
         output: Output folder, with one folder per drive.
-        sheet: Write only a contact sheet with one frame per drive.
         workers: Number of drives in parallel.
         overwrite: Replace existing drives.
 
     Raises:
         UsageError: A value is out of range, a layout is named twice, or a folder has another drive.
-        OutputError: A drive or the sheet already exists, or cannot be written.
+        OutputError: A drive already exists, or cannot be written.
     """
     if approaches.has_all == bool(approaches.layouts):
         raise UsageError("simulate: expected layouts (A to H, L0, L1, ..., M0, M1, ...), or --all")
-    if (output is None) == (sheet is None):
-        raise UsageError(
-            "simulate: expected -o DIR for drives, or --sheet JPEG for pictures of them"
-        )
     wanted = approaches.scenes()
-    if output is None:
-        assert sheet is not None
-        return _drawn(Path(sheet), wanted, overwrite=overwrite)
     if workers < 1:
         raise UsageError(f"workers: {workers}, expected 1 or more")
     place, made = Path(output), []
@@ -192,16 +159,6 @@ def simulate_approaches(
         emit(files)
         emit(Progress("simulating", len(made), len(wanted), "drives"))
     return SimulatedDrives(made)
-
-
-def _drawn(sheet: Path, wanted: Sequence[SceneSettings], *, overwrite: bool) -> ContactSheet:
-    from crosscue.datasets.scenes.single_frames import contact_sheet
-
-    if sheet.exists() and not overwrite:
-        raise OutputError(f"{sheet}: exists; give another name or --overwrite")
-    columns = len({(one.run, one.seed) for one in wanted})
-    write_bytes(sheet, jpeg(contact_sheet(wanted, columns), SHEET_QUALITY))
-    return ContactSheet(sheet, tuple(one.name for one in wanted))
 
 
 def _write_scene(settings: SceneSettings, output: Path, overwrite: bool) -> SceneFiles:

@@ -171,7 +171,6 @@ class LandmarkSource:
             of the poses.
         source: Name of the source (default: the log's name).
         vehicle: Vehicle file: camera and matcher.
-        matcher: ``orb``, or your own ``module:factory``.
     """
 
     poses: Annotated[Path | str | None, Option(metavar="RUN|T.json")] = None
@@ -181,7 +180,6 @@ class LandmarkSource:
     sd_m: Annotated[float, Option("--sd", convert=metres)] = 3.0
     source: str | None = None
     vehicle: Vehicle | Path | str | None = None
-    matcher: str | None = None
 
 
 @keywords(LandmarkSource, 2)
@@ -212,7 +210,7 @@ def add_landmarks(
     poses, images, coordinates = settings.poses, settings.images, settings.coordinates
     car, source = vehicle_given(settings.vehicle), settings.source
     if log is not None and poses is not None and images is None and coordinates is None:
-        describing = matcher_for(car, settings.matcher)
+        describing = matcher_for(car)
         known = read_poses(Path(poses), car)
         with opened(log) as drive:
             name = visible(source or drive.logs[0].path.resolve().stem)
@@ -226,7 +224,7 @@ def add_landmarks(
 
             return _added(Path(database), describing, add)
     if log is None and poses is None and images is not None and coordinates is not None:
-        describing, folder = matcher_for(car, settings.matcher), Path(images)
+        describing, folder = matcher_for(car), Path(images)
         table, name = Path(coordinates), visible(source or folder.resolve().name)
         return _added(
             Path(database),
@@ -284,7 +282,6 @@ def match_landmarks(
     near: NearGiven = None,
     best: int = 5,
     vehicle: Vehicle | Path | str | None = None,
-    matcher: str | None = None,
 ) -> LandmarkMatches:
     """Match one picture against a database's landmarks, or those near a place.
 
@@ -297,7 +294,6 @@ def match_landmarks(
         near: Only landmarks within R metres of a place; --near=-5,3,10 for x < 0.
         best: Number of matches to show.
         vehicle: Vehicle file: camera and matcher.
-        matcher: ``orb``, or your own ``module:factory``.
 
     Raises:
         UsageError: ``near`` is not a place, or the database has features of another matcher.
@@ -307,7 +303,7 @@ def match_landmarks(
     if best < 1:
         raise UsageError(f"best: {best}, expected 1 or more")
     settings = vehicle_given(vehicle)
-    comparing = matcher_for(settings, matcher)
+    comparing = matcher_for(settings)
     seen = comparing.describe(grey_of(read_encoded(Path(image))))
     compared = 0
     found: list[tuple[float, int, Match, str]] = []

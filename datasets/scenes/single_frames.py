@@ -1,4 +1,4 @@
-"""Single pictures of simulated runs: with objects or roads to train networks, or on one sheet.
+"""Single pictures of simulated runs, with objects or roads, to train networks.
 
 Consecutive pictures of a drive are very similar, so a network learns more from eight pictures of
 each of a hundred intersections than from a thousand pictures of one. Road pictures may also come
@@ -19,7 +19,6 @@ from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.datasets.simulated.drive import START_NS
 from crosscue.detectors.base import View
 from crosscue.detectors.images import decode, read_file
-from crosscue.detectors.overlay import write_label
 from crosscue.replay.columns import Bytes, Floats
 from crosscue.replay.errors import EmptyResultError, LogError, UsageError
 from crosscue.replay.files.whole_file import write_bytes
@@ -136,45 +135,6 @@ def shrunk(picture: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.u
     import cv2
 
     return np.asarray(cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-# Distance of the pictures before the intersection.
-BEFORE_M: Final = 25.0
-# Width and height of a picture in the sheet; it is rendered as in a drive and resized.
-SHEET_PX: Final = (192, 108)
-# Central fraction of each picture's width and height that is shown; the rest is mostly sky.
-SHOWN: Final = 0.7
-
-
-def contact_sheet(runs: Sequence[SceneSettings], columns: int) -> NDArray[np.uint8]:
-    """Return pictures of all runs, ``columns`` in a row, each with its name in a corner.
-
-    Args:
-        runs: Runs, row by row.
-        columns: Number of pictures in a row.
-    """
-    import cv2
-
-    width_px, high = SHEET_PX
-    rows = -(-len(runs) // columns)
-    sheet = np.full((rows * high, columns * width_px, 3), 255, np.uint8)
-    for place, settings in enumerate(runs):
-        _, _, world = world_of(settings)
-        motion = world.approach.motion
-        t_s = float(np.argmax(motion.x_m >= -BEFORE_M)) / 100.0
-        rgb = _middle(Renderer(world, settings.camera, settings.picture).picture(t_s).rgb)
-        small = np.asarray(
-            cv2.resize(rgb, (width_px, high), interpolation=cv2.INTER_AREA), np.uint8
-        )
-        write_label(small, settings.name, (4, high - 5), (255, 255, 255), 0.4)
-        y, x = place // columns * high, place % columns * width_px
-        sheet[y : y + high, x : x + width_px] = small
-    return sheet
-
-
-def _middle(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    y, x = (round(side * (1.0 - SHOWN) / 2.0) for side in rgb.shape[:2])
-    return np.ascontiguousarray(rgb[y : rgb.shape[0] - y, x : rgb.shape[1] - x])
 
 
 SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp")

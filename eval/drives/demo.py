@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib import util
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Final
 
 from crosscue.datasets.simulate import simulate_approach
 from crosscue.eval.drives.replay import replay_drive
@@ -60,9 +60,6 @@ class DemoSettings:
         road: Also find the road of the real drive, with road-segmentation-adas-0001 (Apache-2.0,
             0.7 MB, needs openvino), for as much CPU time again as yolox-nano takes.
         source: Folder with the real drive and the weights, to use instead of downloading them.
-        layout: Layout of the intersection (default: C).
-        run: Run of the layout, from 1 (default: 1).
-        seed: Random seed (default: 0).
         width_px: Image width in pixels (default: 1280); height is 9/16.
         overwrite: Replace an existing demo.
     """
@@ -71,9 +68,6 @@ class DemoSettings:
     real: bool = False
     road: bool = False
     source: Annotated[Path | str | None, Option("--data", metavar="FOLDER")] = None
-    layout: Literal["A", "B", "C", "D", "E", "F", "G", "H"] | None = None
-    run: Annotated[int | None, Option(metavar="N")] = None
-    seed: int | None = None
     width_px: Annotated[int | None, Option("--width")] = None
     overwrite: bool = False
 
@@ -87,9 +81,8 @@ class DemoSettings:
             raise UsageError("source: applies only to a real drive; add real=True")
         if not self.real and self.road:
             raise UsageError("road: applies only to a real drive; add real=True")
-        for name in ("layout", "run", "seed", "width_px") if self.real else ():
-            if getattr(self, name) is not None:
-                raise UsageError(f"{name}: applies only to a simulated drive; omit it or real=True")
+        if self.real and self.width_px is not None:
+            raise UsageError("width_px: applies only to a simulated drive; omit it or real=True")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -233,13 +226,10 @@ def _simulated(folder: Path, settings: DemoSettings) -> KnownDrive:
     """
     from crosscue.detectors.registry import EMBEDDED
 
-    layout = settings.layout or "C"
-    emit(f"simulating a drive up to intersection {layout} ...")
+    emit("simulating a drive up to intersection C ...")
     files = simulate_approach(
         folder / "drive",
-        layout,
-        1 if settings.run is None else settings.run,
-        settings.seed or 0,
+        "C",
         width_px=1280 if settings.width_px is None else settings.width_px,
         overwrite=settings.overwrite,
     )

@@ -44,6 +44,8 @@ MEASURES: Final = ("ap50", "ap", "precision", "recall")
 
 # Pictures closer in time than this show the same mistakes, so only the worst is shown.
 APART_NS: Final = 1_000_000_000
+# Min IoU of a right detection, for precision, recall and calibration.
+OVERLAP: Final = 0.5
 WIDTH_PX: Final = 960
 QUALITY: Final = 80
 WRONG: Final = colours.bgr(colours.WRONG)
@@ -226,7 +228,6 @@ class DetectorScoreSettings:
         class_names: Class names, one per line: for YOLO in index order, for VOC and KITTI all
             classes.
         meanings: Class that a label of the file or detector counts as; an empty one ignores it.
-        overlap: Min IoU of a correct detection, for precision, recall and calibration.
         block_s: Count images within this many seconds as one, because they are similar.
         draw: Draw the N worst images.
         logs: Folder that the run's logs have moved to; they are recognised by content.
@@ -241,7 +242,6 @@ class DetectorScoreSettings:
     kind: Annotated[LabelFormat | None, Option("--format")] = None
     class_names: Annotated[Path, Option(metavar="FILE")] | Sequence[str] | str = ()
     meanings: Meanings = field(default_factory=lambda: MappingProxyType({}))
-    overlap: float = 0.5
     block_s: float = 1.0
     draw: int = 8
     logs: Annotated[Path | str | None, Option(metavar="DIR")] = None
@@ -255,8 +255,6 @@ class DetectorScoreSettings:
         Raises:
             UsageError: A number is out of range.
         """
-        if not 0.0 < self.overlap <= 1.0:
-            raise UsageError(f"overlap: {self.overlap}, expected above 0, at most 1")
         if not 0.0 <= self.block_s < 1e6:
             raise UsageError(f"block_s: {self.block_s}, expected seconds from 0")
         if self.draw < 0:
@@ -295,7 +293,7 @@ def score_detector(
         EmptyResultError: No labelled box has a class that the detector reports.
         RunError: The run does not exist or is damaged, or its log is missing.
     """
-    output, overlap = settings.output, settings.overlap
+    output = settings.output
     path = run.path if isinstance(run, Run) else run
     folder = open_run(
         path, settings.logs, without_images=settings.without_images, limits=settings.limits
@@ -313,7 +311,7 @@ def score_detector(
         of.classes,
         {name: of.threshold(name) for name in of.classes},
         of.blocks(settings.block_s),
-        overlap,
+        OVERLAP,
     )
     place = folder.file(FOLDER) if output is None else Path(output)
     stem = "detector_" + re.sub(r"[^\w.-]", "_", of.detector.name)
@@ -321,11 +319,11 @@ def score_detector(
         of,
         read,
         tuple(scores),
-        calibration_of(of, overlap),
+        calibration_of(of),
         settings.block_s,
         place / f"{stem}.html",
     )
-    worst = [] if settings.without_images else worst_pictures(of, overlap, settings.draw)
+    worst = [] if settings.without_images else worst_pictures(of, settings.draw)
     place.mkdir(parents=True, exist_ok=True)
     content = {
         "title": of.detector.name,
@@ -334,7 +332,7 @@ def score_detector(
         "worst": worst,
         "boxes": int((~of.truth.is_ignored).sum()),
         "lowest": float(of.found.scores.min()) if len(of.found.scores) else None,
-        "overlap": overlap,
+        "overlap": OVERLAP,
         "seed": SEED,
         "figure": draw_calibration(found.calibration) if settings.has_figures else None,
     }
@@ -343,11 +341,11 @@ def score_detector(
     return found
 
 
-def calibration_of(of: LabelledRun, overlap: float) -> tuple[Reliability, ...]:
+def calibration_of(of: LabelledRun) -> tuple[Reliability, ...]:
     """Return the reliability of each class's scores as probabilities."""
     found = []
     for k, name in enumerate(of.classes):
-        matched = match(of.truth, of.found, k, overlaps=np.array([overlap]))
+        matched = match(of.truth, of.found, k, overlaps=np.array([OVERLAP]))
         judged = ~matched.is_out[0] & bool(len(matched.labels))
         found.append(class_calibration(name, matched.scores[judged], matched.is_right[0][judged]))
     return tuple(found)
@@ -381,14 +379,14 @@ class WorstPicture:
     picture: str | None = None
 
 
-def worst_pictures(labelled: LabelledRun, overlap: float, max_count: int) -> list[WorstPicture]:
+def worst_pictures(labelled: LabelledRun, max_count: int) -> list[WorstPicture]:
     """Return the pictures with the most mistakes, at most one for each moment.
 
     Raises:
         RunError: The log with the pictures is not found.
         LogError: That log cannot be opened.
     """
-    marks = _marks(labelled, overlap)
+    marks = _marks(labelled)
     order = sorted(
         (i for i in range(len(marks)) if any(one.colour in (WRONG, TRUE) for one in marks[i])),
         key=lambda i: (-sum(one.colour in (WRONG, TRUE) for one in marks[i]), i),
@@ -412,14 +410,14 @@ def worst_pictures(labelled: LabelledRun, overlap: float, max_count: int) -> lis
     ]
 
 
-def _marks(labelled: LabelledRun, overlap: float) -> list[list[Drawn]]:
+def _marks(labelled: LabelledRun) -> list[list[Drawn]]:
     """Return the ignored, right, missed and wrong boxes of each picture."""
     truth, found = labelled.truth, labelled.found
     marks: list[list[Drawn]] = [[] for _ in labelled.names]
     for row in np.flatnonzero(truth.is_ignored).tolist():
         marks[truth.picture[row]].append(Drawn(truth.boxes_px[row], GREY, ""))
     for k, name in enumerate(labelled.classes):
-        matched = match(truth, found, k, overlaps=np.array([overlap]))
+        matched = match(truth, found, k, overlaps=np.array([OVERLAP]))
         sure = matched.scores > labelled.threshold(name)
         hit = set(matched.took[0][sure].tolist())
         for row in np.flatnonzero((truth.label == k) & ~truth.is_ignored).tolist():

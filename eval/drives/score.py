@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field
 from pathlib import Path
@@ -66,7 +65,6 @@ class ScoringSettings:
         threshold: Probability above which a feature counts as detected.
         detection: Confirmed: a detection counts when 3 frames confirm it and its range is within
             its 95 % interval; published: from the first frame, with any range.
-        rpe_m: Distances of the relative pose error, in metres.
         has_attribution: Run an ablation: estimate without each cue, and report the change in every
             metric.
         smoother: Also run a batch smoother on the same measurements and compare its error.
@@ -86,7 +84,6 @@ class ScoringSettings:
     gates: Annotated[Path | str | None, Option("--gate", metavar="G.toml")] = None
     threshold: float = 0.9
     detection: Definition = "confirmed"
-    rpe_m: Annotated[Sequence[float], Option("--rpe", metavar="M")] = (10.0, 100.0)
     has_attribution: bool = False
     smoother: bool = False
     any_log: bool = False
@@ -106,9 +103,6 @@ class ScoringSettings:
         """
         if self.workers < 1:
             raise UsageError(f"workers: {self.workers}, expected 1 or more")
-        for distance_m in self.rpe_m:
-            if not (math.isfinite(distance_m) and distance_m > 0.0):
-                raise UsageError(f"rpe_m: {distance_m}, expected metres, above 0")
 
     @property
     def judged_by(self) -> ScoreSettings:
@@ -132,7 +126,7 @@ class ScoringSettings:
         folder = open_run(path, logs, without_images=self.without_images, limits=self.limits)
         truth_path = find_truth(folder, None if self.truth is None else Path(self.truth))
         with locked(folder):
-            one = judge_run(folder, truth_path, judged_by, tuple(self.rpe_m), any_log=self.any_log)
+            one = judge_run(folder, truth_path, judged_by, any_log=self.any_log)
             scores = pooled_scores([one], judged_by)
             metrics = metrics_of([one], scores)
             smoothed = None
@@ -257,7 +251,6 @@ def score_run(
     *,
     threshold: float = 0.9,
     detection: Definition = "confirmed",
-    rpe_m: Sequence[float] = (10.0, 100.0),
     any_log: bool = False,
     has_figures: bool = True,
 ) -> ScoredRun:
@@ -269,7 +262,6 @@ def score_run(
         threshold: Probability above which a feature counts as detected.
         detection: ``confirmed``: a detection counts when three frames confirm it and its range is
             within its 95 % interval; ``published``: from the first frame, with any range.
-        rpe_m: Distances of the relative pose error.
         any_log: Accept truth made for another file of the same drive, such as a converted log.
         has_figures: Draw figures, which needs matplotlib.
 
@@ -282,7 +274,6 @@ def score_run(
         truth,
         threshold=threshold,
         detection=detection,
-        rpe_m=rpe_m,
         any_log=any_log,
         logs=of.folder.logs,
         limits=of.folder.limits,

@@ -10,8 +10,7 @@ from typing import Annotated, ClassVar, Final
 from crosscue.eval.failures.order import ranked
 from crosscue.eval.failures.record import Failure, read_failures
 from crosscue.eval.failures.site import MARKER, RunWork, by_run, site_entries, write_lists
-from crosscue.eval.pipeline.run import moved_to, open_run
-from crosscue.eval.recording.view import save_recording
+from crosscue.eval.pipeline.run import moved_to
 from crosscue.eval.runs import owned
 from crosscue.replay.errors import CrosscueError, EmptyResultError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
@@ -78,13 +77,11 @@ class BrowseSettings(FailureSettings):
     Attributes:
         logs: Folder that the run's logs have moved to; they are recognised by content.
         limits: Limits for reading the logs.
-        has_recordings: Also write a recording of each failure, of some megabytes each.
         overwrite: Replace an existing site.
     """
 
     logs: Annotated[Path | str | None, Option(metavar="DIR")] = None
     limits: LimitsGiven = DEFAULT_LIMITS
-    has_recordings: bool = False
     overwrite: bool = False
 
 
@@ -102,7 +99,7 @@ def browse(
 
     Examples:
         crosscue browse runs -o site
-        crosscue browse worst.parquet -o site --recordings
+        crosscue browse worst.parquet -o site
 
     Args:
         runs: Run folders, folders of them, or a table.
@@ -115,7 +112,7 @@ def browse(
         UsageError: ``overwrite`` would delete files that an earlier call did not write.
         OutputError: The folder is not empty, or cannot be written.
     """
-    folder, has_recordings = Path(output), settings.has_recordings
+    folder = Path(output)
     owned.check_place(folder, MARKER, overwrite=settings.overwrite)
     moved = moved_to(settings.logs)
     chosen, found = _given(runs, settings)
@@ -123,20 +120,15 @@ def browse(
         raise EmptyResultError(f"{folder}: no failure to show; nothing was written")
     entries = site_entries(chosen)
     with owned.new_folder(folder, MARKER) as made:
-        for part in ("f", "p", "t", "by", *(["r"] if has_recordings else [])):
+        for part in ("f", "p", "t", "by"):
             (made / part).mkdir()
         truth = None if settings.truth is None else Path(settings.truth)
-        work = RunWork(made, len(entries), moved, has_recordings, settings.limits, truth)
+        work = RunWork(made, len(entries), moved, settings.limits, truth)
         groups, pictures, reasons = by_run(entries), frozenset[str](), []
         for done, (written, why) in enumerate(in_processes(work, groups, settings.workers), 1):
             pictures |= written
             reasons += [why] if why else []
             emit(Progress("drawing", done, len(groups), "runs"))
-        if has_recordings:
-            for one in entries:
-                path = made / "r" / f"{one.number:05d}.rrd"
-                run = open_run(one.failure.run, moved, limits=settings.limits)
-                save_recording(run, path, settings.truth, at=f"{one.failure.t_ns}ns")
         write_lists(made, entries, pictures)
     bare = sum(one.picture not in pictures for one in entries)
     return Site(

@@ -92,7 +92,6 @@ class RunWork:
         site: Folder of the site.
         total: Number of failures of the site.
         logs: Folder to which the runs' logs have moved, if any.
-        has_recordings: True if each failure has a recording next to its page.
         limits: Limits on the declared size of a chunk of a log.
         truth: Truth of all runs; None for that of each run's last score.
     """
@@ -100,7 +99,6 @@ class RunWork:
     site: Path
     total: int
     logs: Path | None
-    has_recordings: bool
     limits: Limits
     truth: Path | None = None
 
@@ -134,7 +132,6 @@ class RunWork:
                 "chart": belief_around(rows, one.failure),
                 "before": f"{one.number - 1:05d}.html" if one.number > 1 else None,
                 "after": f"{one.number + 1:05d}.html" if one.number < self.total else None,
-                "recording": f"{one.number:05d}.rrd" if self.has_recordings else None,
                 "viewer": WEB_VIEWER,
                 "command": f"{command} --at {one.failure.at_s:.3f}",
                 "has_truth": truth is not None,

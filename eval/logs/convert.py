@@ -17,7 +17,6 @@ from crosscue.replay.progress import Progress, emit
 from crosscue.replay.safe_text import counted, terminal_width, visible, wrapped
 from crosscue.replay.seal.seal import seal_path
 from crosscue.replay.write.convert import LogWriter
-from crosscue.replay.write.mcap import Compression
 from crosscue.results import HIDDEN, Result, json_key, listing
 from crosscue.verb import Option
 
@@ -146,7 +145,6 @@ def convert(
     log: LogGiven,
     output: Annotated[Path | str, Option(metavar="OUT.mcap")],
     *,
-    compression: Compression = "zstd",
     salvage: bool = False,
     overwrite: bool = False,
 ) -> Converted:
@@ -162,13 +160,12 @@ def convert(
     Examples:
         crosscue convert drive.bag -o drive.mcap
         crosscue convert can0.log -o can0.mcap --from 10 --to 70
-        crosscue convert segment/ -o segment.mcap --topics wheels compass --compression lz4
+        crosscue convert segment/ -o segment.mcap --topics wheels compass
         crosscue convert damaged.mcap -o rescued.mcap --salvage
 
     Args:
         log: One log, or its path.
         output: MCAP file to write.
-        compression: Compression of the chunks.
         salvage: List every damaged place, with its byte range if the format has byte ranges.
         overwrite: Replace an existing file.
 
@@ -184,7 +181,7 @@ def convert(
             raise UsageError(f"convert: expected one log, found {len(drive.logs)}; convert each")
         _check_output(path, drive.paths[0])
         ledger = Ledger(drive.paths[0])
-        with LogWriter(path, ledger, compression=compression, overwrite=overwrite) as writer:
+        with LogWriter(path, ledger, overwrite=overwrite) as writer:
             _copy(drive, ledger, writer)
             # Rows found = rows written + rows skipped, for every topic.
             ledger.check({name: writer.kept[name] for name in ledger.accounts})

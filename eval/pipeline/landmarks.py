@@ -34,14 +34,14 @@ def landmark_settings(vehicle: Vehicle) -> LandmarkSettings:
     return LandmarkSettings(**fields, lever_m=(camera.x_m, camera.y_m))
 
 
-def matcher_for(vehicle: Vehicle, name: str | None = None) -> Matcher:
-    """Return the matcher named by the vehicle file or an option.
+def matcher_for(vehicle: Vehicle) -> Matcher:
+    """Return the matcher named by the vehicle file.
 
     Raises:
         UsageError: The matcher does not exist.
     """
     camera = CameraGeometry(vehicle.camera.focal_px, vehicle.camera.center_px)
-    return make_matcher(name or vehicle.landmarks.matcher, camera)
+    return make_matcher(vehicle.landmarks.matcher, camera)
 
 
 def open_for(path: Path, matcher: Matcher) -> LandmarkDatabase:

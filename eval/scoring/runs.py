@@ -172,7 +172,6 @@ def judge_run(
     run: RunFolder,
     truth_path: Path,
     settings: ScoreSettings = DEFAULTS,
-    rpe_m: Sequence[float] = (10.0, 100.0),
     *,
     any_log: bool = False,
 ) -> RunScored:
@@ -182,7 +181,6 @@ def judge_run(
         run: A finished run.
         truth_path: Its truth.
         settings: Settings of the scores.
-        rpe_m: Distances of the relative pose error.
         any_log: Accept truth made for another file of the same drive, such as a converted log.
 
     Raises:
@@ -191,7 +189,7 @@ def judge_run(
     """
     truth, judged = judge_scene(run, truth_path, settings, any_log=any_log)
     why = _why_no_pose(run, truth.truth)
-    pose, poses = (None, None) if why else score_pose.measure_pose(run, truth_path, rpe_m)
+    pose, poses = (None, None) if why else score_pose.measure_pose(run, truth_path)
     nothing = judged.coverage.not_scored
     if why and {"cues", "belief", "range"} <= nothing.keys():
         reasons = "; ".join(dict.fromkeys([*nothing.values(), why]))

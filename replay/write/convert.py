@@ -24,7 +24,7 @@ from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.roles import OF_TABLES
 
-from .mcap import ChannelMessages, Compression, McapWriter
+from .mcap import ChannelMessages, McapWriter
 
 NO_TYPE: Final = "unknown type, which ROS 2 cannot store"
 BAD_SCHEMA: Final = "its definition is damaged"
@@ -44,7 +44,6 @@ class LogWriter:
         path: Path,
         ledger: Ledger,
         *,
-        compression: Compression = "zstd",
         overwrite: bool = False,
         beside: Sequence[str] = (),
     ) -> None:
@@ -53,7 +52,6 @@ class LogWriter:
         Args:
             path: Final path of the file.
             ledger: Ledger of the log that is read; rows that cannot be written are skipped in it.
-            compression: Compression of chunks.
             overwrite: Replace an existing file.
             beside: As in ``McapWriter``.
 
@@ -71,7 +69,7 @@ class LogWriter:
         self._known: dict[str, Encoder | str] = {}
         self._details: dict[str, str] = {}
         self._from: dict[str, str] = {}
-        self._mcap = McapWriter(path, compression=compression, overwrite=overwrite, beside=beside)
+        self._mcap = McapWriter(path, overwrite=overwrite, beside=beside)
 
     def add_topic(self, topic: Topic) -> bool:
         """Prepare a topic; False if ROS 2 cannot represent it, so that its rows will be skipped.

@@ -37,7 +37,6 @@ INPUT_FILES: Final[dict[tuple[str, str], str]] = {
     ("truth from-map", "LOG"): "{gone} {streets} -o {out}",
     ("truth from-map", "FILE"): "{log} {gone} -o {out}",
     ("fit odometry", "LOG"): "{gone} --vehicle {car}",
-    ("fit landmarks", "LOG"): "{gone} --poses {truth} --database {db} --vehicle {car}",
     ("landmarks add", "LOG"): "{out}.db {gone} --poses {truth} --vehicle {car}",
     ("truth", "LOG"): "{gone} -o {out}",
     ("estimate", "RUN"): "{gone}",
@@ -97,8 +96,6 @@ INPUT_FILES: Final[dict[tuple[str, str], str]] = {
     ("fit temporal", "--truth"): "{run} --truth {gone} -o {out}.toml",
     ("fit messages", "--truth"): "{run} --truth {gone} -o {out}.toml",
     ("fit landmarks", "--pairs"): "--pairs {gone}",
-    ("fit landmarks", "--database"): "{log} --vehicle {car} --poses {truth} --database {gone}",
-    ("fit landmarks", "--poses"): "{log} --vehicle {car} --database {db} --poses {gone}",
     ("landmarks add", "--poses"): "{out}.db {log} --vehicle {car} --poses {gone}",
     ("landmarks add", "--images"): "{out}.db --images {gone} --coordinates {places}",
     ("landmarks add", "--coordinates"): "{out}.db --images {pictures} --coordinates {gone}",
@@ -140,7 +137,7 @@ SETTINGS_FILES: Final[dict[tuple[str, str], str]] = {
     ("truth from-gnss", "--vehicle"): "{log} -o {out} --vehicle {gone}",
     ("truth from-map", "--vehicle"): "{log} {streets} -o {out} --vehicle {gone}",
     ("fit odometry", "--vehicle"): "{log} --vehicle {gone}",
-    ("fit landmarks", "--vehicle"): "{log} --poses {truth} --database {db} --vehicle {gone}",
+    ("fit landmarks", "--vehicle"): "--pairs {gone} --vehicle {gone}",
     ("landmarks add", "--vehicle"): "{out}.db {log} --poses {truth} --vehicle {gone}",
     ("landmarks match", "--vehicle"): "{db} {picture} --vehicle {gone}",
     ("truth import", "--vehicle"): "{coco} --log {log} -o {out}.json --vehicle {gone}",
@@ -169,7 +166,7 @@ READS_DBC_FILES: Final[dict[str, str]] = {
     "info": "{log} --vehicle {vehicle}",
 }
 # Options whose file is created if it is missing.
-WRITTEN: Final = {"--output", "--junit", "--cache", "--figure", "--sheet"}
+WRITTEN: Final = {"--output", "--junit", "--cache", "--figure"}
 # Arguments that are not files.
 NO_FILES: Final = {"LAYOUT", "NAME", "SQL"}
 # Commands whose arguments accept any file, or no file.

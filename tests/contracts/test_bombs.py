@@ -52,7 +52,6 @@ OPENS_LOGS: dict[str, tuple[str, int]] = {
     "truth from-map": ("{compass} {streets} -o {out} --vehicle {gnss_car}", 4),
     "fit odometry": ("{compass} --vehicle {its_car} --truth {its_truth}", 4),
     "fit signs": ("{drive} --label stop_sign", 1),
-    "fit landmarks": ("{log} --database {db} --poses {truth} --vehicle {car}", 1),
     "landmarks add": ("{out}.db {log} --poses {truth} --vehicle {car}", 1),
     "truth import": ("{coco} --log {log} -o {out}.json --vehicle {car}", 3),
     "browse": ("{run} --truth {truth} --any-log -o {out}", 3),
@@ -66,6 +65,7 @@ OPENS_NO_LOG: dict[str, str] = {
     "fit ranges": "tables", "fit messages": "tables", "fit temporal": "tables",
     "history": "tables",
     "landmarks list": "a database", "landmarks match": "a picture", "train road": "pictures",
+    "fit landmarks": "pictures",
     "train mask-rcnn": "pictures", "train frames": "nothing", "truth schema": "nothing",
     "run schema": "nothing",
     "fetch": "nothing",
@@ -201,7 +201,6 @@ READS_CAMERA: dict[str, tuple[str, int]] = {
     "replay": ("{log} -o {out} --detectors support.gap_drive:build --no-cache", 3),
     "truth import": ("{coco} --log {log} -o {out}.json", 3),
     "landmarks add": ("{out}.db {log} --poses {truth}", 1),
-    "fit landmarks": ("{log} --database {db} --poses {truth}", 1),
     "fit signs": ("{drive} --label stop_sign", 1),
 }
 

@@ -128,7 +128,7 @@ def test_completion_scripts_are_printed(shell: str, capsys: pytest.CaptureFixtur
         ("crosscue truth i", {"import"}),
         ("crosscue check t.json --pic", {"--picture"}),
         ("crosscue replay drive.mcap --wor", {"--workers"}),
-        ("crosscue convert a.mcap --compression ", {"zstd", "lz4", "none"}),
+        ("crosscue simulate A --traffic ", {"left", "right"}),
         ("crosscue completion z", {"zsh"}),
         ("crosscue info dri", {"drive.mcap"}),
         ("crosscue truth dri", {"drive.mcap"}),

@@ -193,7 +193,6 @@ NEEDS_CAMERA = {
     "truth import": "{coco} --log {log} -o {out}.json --vehicle {car}",
     "fit signs": "{drive} --label stop_sign",
     "landmarks add": "{out}.db {log} --poses {truth} --vehicle {car}",
-    "fit landmarks": "{log} --database {db} --poses {truth} --vehicle {car}",
     "replay": "{log} -o {out} --vehicle {car} --detectors support.gap_drive:build",
     "detect": "{log} -o {out} --vehicle {car} --detectors support.gap_drive:build",
 }

@@ -61,10 +61,6 @@ LOOKS_AT_A_LOG: Final[dict[str, dict[str, str]]] = {
     "eval/fit/landmarks/database.py": {
         "landmarks add": "landmarks add {out}.db {log} --poses {truth} --vehicle {car}"
     },
-    "eval/fit/landmarks/fit.py": {
-        "fit landmarks": "fit landmarks {log} --database {db} --poses {truth} --vehicle {car} "
-        "--different-beyond 10 --every 1"
-    },
     "eval/vehicle/check.py": {"check": "check {log} {car} -o {out}.html"},
     "eval/recording/camera.py": {"view": "view {run} -o {out}.rrd"},
     "eval/failures/labels.py": {"export": "export {failures} -o {out}"},
@@ -77,6 +73,7 @@ HOW_OTHERS_DO: Final = {
     "detectors/images.py": "the functions themselves",
     "detectors/overlay.py": "for eval/report/frame_pictures.py",
     "detectors/training/samples.py": "files that the user names",
+    "eval/fit/landmarks/fit.py": "files that the user names",
     "eval/landmarks.py": "files that the user names",
     "eval/logs/log.py": "a call of the user for one picture, which raises",
     "eval/pipeline/visual.py": "frames with detections, thus decoded before",

@@ -21,14 +21,13 @@ from .class_fit import ClassFit
 WRITTEN_BY: Final = "crosscue fit detector"
 
 
-def with_fit(text: str, fits: Sequence[ClassFit], pictures: str, measured: str, aim: str) -> str:
+def with_fit(text: str, fits: Sequence[ClassFit], pictures: str, aim: str) -> str:
     """Return a model card's text with the fit.
 
     Args:
         text: Text of the card.
         fits: Fits of all classes; classes that were not fitted stay unchanged.
         pictures: Description of the pictures: which, how many, labelled by whom.
-        measured: Date of the measurement.
         aim: The requested aim, in words.
 
     Raises:
@@ -47,7 +46,7 @@ def with_fit(text: str, fits: Sequence[ClassFit], pictures: str, measured: str, 
         for label in fit.members:
             scores[label] = _section(fit.scores)
         if fit.held_out is not None and fit.scores.threshold is not None:
-            evidence.append(_evidence(fit, pictures, measured, aim))
+            evidence.append(_evidence(fit, pictures, aim))
     if evidence:
         rows = tomlkit.aot()
         for row in evidence:
@@ -85,7 +84,7 @@ def _section(scores: ClassScores) -> Any:
     return table
 
 
-def _evidence(fit: ClassFit, pictures: str, measured: str, aim: str) -> dict[str, object]:
+def _evidence(fit: ClassFit, pictures: str, aim: str) -> dict[str, object]:
     assert fit.held_out is not None
     assert fit.scores is not None
     held = fit.held_out
@@ -99,8 +98,6 @@ def _evidence(fit: ClassFit, pictures: str, measured: str, aim: str) -> dict[str
     }
     if held.of:
         row |= {"low": round(held.interval.low, 4), "high": round(held.interval.high, 4)}
-    if measured:
-        row["measured"] = measured
     row["note"] = (
         f"{WRITTEN_BY}: {aim}; fitted to {what} and {found}, "
         f"bound {fit.bound:.4f}; held out {held.right} of {held.of} right, recall "

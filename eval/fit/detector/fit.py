@@ -43,6 +43,8 @@ from crosscue.results import HIDDEN, Result, json_key
 from crosscue.verb import Option, keywords
 
 CONFIDENCE: Final = 0.95
+# Min IoU of a right detection with a label.
+OVERLAP: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -189,8 +191,6 @@ class DetectorFitSettings:
         class_names: Class names, one per line: for YOLO in index order, for VOC and KITTI all
             classes.
         meanings: Class that a label of the file or detector counts as; an empty one ignores it.
-        overlap: Min IoU of a correct detection with a label.
-        date: Date of the fit, to record in the card (default: that of the first picture).
         logs: Folder that the run's logs have moved to; they are recognised by content.
         limits: Limits for reading the logs.
         keep: Accept calibrations that are worse on the held-out images.
@@ -209,8 +209,6 @@ class DetectorFitSettings:
     kind: Annotated[LabelFormat | None, Option("--format")] = None
     class_names: Annotated[Path, Option(metavar="FILE")] | Sequence[str] | str = ()
     meanings: Meanings = field(default_factory=lambda: MappingProxyType({}))
-    overlap: float = 0.5
-    date: Annotated[str, Option(metavar="DATE")] = ""
     logs: Annotated[Path | str | None, Option(metavar="DIR")] = None
     limits: LimitsGiven = DEFAULT_LIMITS
     keep: bool = False
@@ -229,8 +227,6 @@ class DetectorFitSettings:
         if self.calibration not in CALIBRATIONS:
             names = ", ".join(CALIBRATIONS)
             raise UsageError(f"calibration: {self.calibration}, expected one of {names}")
-        if not 0.0 < self.overlap <= 1.0:
-            raise UsageError(f"overlap: {self.overlap}, expected above 0, at most 1")
         if len(self.test_labels) != len(self.test):
             raise UsageError(
                 f"test_labels: {len(self.test_labels)} for {len(self.test)} runs; expected one for "
@@ -305,8 +301,8 @@ def fit_detector(
         fit_class(
             name,
             whole[0].members[name],
-            fitted.judged(name, settings.overlap),
-            held.judged(name, settings.overlap),
+            fitted.judged(name),
+            held.judged(name),
             settings.precision,
             CONFIDENCE,
             settings.calibration,
@@ -332,7 +328,7 @@ def fit_detector(
         numbers = f"{len(fitted)} images fitted to, {len(held)} held out"
         pictures = f"{numbers}, of {_log_names(whole)}{_date_of(fitted.runs)}"
         aim = f"precision {settings.precision:g} with {CONFIDENCE:.0%} confidence"
-        text = with_fit(source.read_text(encoding="utf-8"), fits, pictures, settings.date, aim)
+        text = with_fit(source.read_text(encoding="utf-8"), fits, pictures, aim)
         write_text(written, text)
     left_out = sum((Counter(part.left_out) for part in whole), Counter[str]())
     is_whole = all(part.is_whole for part in whole)
@@ -388,7 +384,7 @@ class _Pictures:
     def __len__(self) -> int:
         return sum(int(one.sum()) for one in self.chosen)
 
-    def judged(self, name: str, overlap: float) -> ClassDetections:
+    def judged(self, name: str) -> ClassDetections:
         """Match the detections of one class to labels."""
         scores, right, labels = [np.empty(0)], [np.empty(0, np.bool_)], 0
         for run, chosen in zip(self.runs, self.chosen, strict=True):
@@ -400,7 +396,7 @@ class _Pictures:
                 labels += int(has.sum())
                 continue
             matched = match(
-                *run.part(chosen), run.classes.index(name), overlaps=np.array([overlap])
+                *run.part(chosen), run.classes.index(name), overlaps=np.array([OVERLAP])
             )
             judged = ~matched.is_out[0]
             scores.append(matched.scores[judged])

@@ -28,6 +28,8 @@ from crosscue.results import HIDDEN, Result, json_key
 from crosscue.verb import Option, keywords
 
 LOWEST: Final = 0.05
+# Min IoU of a right detection with a sign.
+OVERLAP: Final = 0.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,12 +112,8 @@ class SignFitSettings:
         kinds: Templates to search for: one way left, one way right, do not enter, or no entry.
         crop_top: Top fraction of the image to skip.
         crop_bottom: Bottom fraction of the image to skip.
-        enlarge: Magnification of the first pyramid level.
-        levels: Pyramid levels, each smaller by 1.25.
-        points: Keypoints per level.
         precision: Required precision.
         threshold: Measure this threshold instead of choosing one.
-        overlap: Min IoU with the true box of a true positive.
         min_height_px: Ignore true signs lower than this, in pixels.
         limits: Limits for reading drives' logs.
     """
@@ -127,12 +125,8 @@ class SignFitSettings:
     kinds: Annotated[Sequence[Kind], Option(metavar="KIND")] = AMERICAN
     crop_top: Fraction = 0.0
     crop_bottom: Fraction = 0.25
-    enlarge: float = 2.5
-    levels: int = 14
-    points: int = 4000
     precision: float = 0.95
     threshold: float | None = None
-    overlap: float = 0.4
     min_height_px: Annotated[float, Option("--min-height")] = 0.0
     limits: LimitsGiven = DEFAULT_LIMITS
 
@@ -142,10 +136,8 @@ class SignFitSettings:
         Raises:
             UsageError: A value is out of range.
         """
-        for name in ("precision", "overlap"):
-            value: float = getattr(self, name)
-            if not 0.0 < value <= 1.0:
-                raise UsageError(f"{name}: {value}, expected above 0, at most 1")
+        if not 0.0 < self.precision <= 1.0:
+            raise UsageError(f"precision: {self.precision}, expected above 0, at most 1")
         if self.test_every < 1:
             raise UsageError(f"test_every: {self.test_every}, expected 1 or more")
         if self.threshold is not None and not LOWEST <= self.threshold <= 1.0:
@@ -183,11 +175,8 @@ def fit_signs(labels: Sequence[Path | str], settings: SignFitSettings) -> SignFi
         min_score=LOWEST,
         crop_top=settings.crop_top,
         crop_bottom=settings.crop_bottom,
-        enlarge=settings.enlarge,
-        levels=settings.levels,
-        points=settings.points,
     )
-    rules = ScoringRules(settings.label, settings.overlap, settings.min_height_px)
+    rules = ScoringRules(settings.label, OVERLAP, settings.min_height_px)
     fit = slice(0, None, 1 if test else 2)
     rest = slice(0 if test else 1, None, settings.test_every * fit.step)
     work = [(Path(path), fit) for path in labels]

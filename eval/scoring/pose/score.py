@@ -7,7 +7,6 @@ the same numbers.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -54,6 +53,8 @@ NO_NEES: Final = (
     "the run's frame is its own: neither start heading nor compass; set [start] heading_rad"
 )
 ALIGNMENTS: Final[tuple[Alignment, ...]] = ("none", "origin", "yaw")
+# Distances of the relative pose error.
+RPE_M: Final = (10.0, 100.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,15 +176,12 @@ def truth_track(path: Path, run: RunFolder) -> TruthTrack:
     return TruthTrack(track.t_ns[inside], x_m, y_m)
 
 
-def measure_pose(
-    run: RunFolder, truth_path: Path, rpe_m: Sequence[float] = (10.0, 100.0)
-) -> tuple[PoseScore, ScoredPoses]:
+def measure_pose(run: RunFolder, truth_path: Path) -> tuple[PoseScore, ScoredPoses]:
     """Score a run's pose; write both tracks to its ``score`` folder.
 
     Args:
         run: A finished run.
         truth_path: ``truth.json``.
-        rpe_m: Distances for the relative error.
 
     Raises:
         RunError: The run's tables are missing or damaged.
@@ -206,7 +204,7 @@ def measure_pose(
         coverage=paired.coverage,
         distance_m=_length(paired.truth.xyz_m),
         ape={how: _ape(paired, how) for how in ALIGNMENTS},
-        rpe=_rpe(paired, rpe_m),
+        rpe=_rpe(paired),
         nees_xy=summarise_nees(nees_xy, 2),
         nees_xyh=summarise_nees(values, 3),
         major_axis_m=float(table["major_axis_m"][-1].as_py()),
@@ -343,10 +341,10 @@ def _ape(paired: Paired, how: Alignment) -> PoseErrorSummary:
     )
 
 
-def _rpe(paired: Paired, sizes_m: Sequence[float]) -> dict[str, PoseErrorSummary]:
+def _rpe(paired: Paired) -> dict[str, PoseErrorSummary]:
     found: dict[str, PoseErrorSummary] = {}
     way_m = _length(paired.estimate.xyz_m)
-    for size_m in sizes_m:
+    for size_m in RPE_M:
         if size_m >= way_m:
             continue
         errors = rpe(paired.truth, paired.estimate, size_m)

@@ -1,4 +1,4 @@
-"""Fit of the landmark threshold: required rates, intervals, pairs from tables and drives."""
+"""Fit of the landmark threshold: required rates, intervals, pairs from tables."""
 
 import json
 from pathlib import Path
@@ -6,12 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from crosscue.datasets.truth.truth import Truth, save
-from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.eval import cli
 from crosscue.eval.fit.landmarks.threshold import Rate, ScoredPairs, fit_threshold
 from crosscue.replay.vehicle.vehicle import load
-from support.data import shared
 from support.landmark_files import encoded, seen_from, wall
 
 
@@ -70,45 +67,3 @@ def test_threshold_fitted_to_a_table_of_pairs_is_written(
     assert "# mine" in car.read_text()
     assert cli.run(command) == 0
     assert "28 held-out pairs cannot show a rate of 0.001" in capsys.readouterr().out
-
-
-def test_threshold_is_fitted_to_a_recorded_drive_with_poses(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """KITTI, 51 frames: even frames are landmarks, odd frames the drive; far is over 25 m."""
-    folder = shared("sequences", "kitti_seq2_right_turn_98deg")
-    pose = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
-    heading = np.arctan2(-pose[:, 0, 2], pose[:, 2, 2])
-    t_ns = np.arange(51, dtype=np.int64) * 100_000_000
-    write_tum(tmp_path / "pose.tum", planar(t_ns, pose[:, 2, 3], -pose[:, 0, 3], heading))
-    truth = Truth(version=1, start_ns=0, end_ns=10**10, pose="pose.tum", pose_point="camera")
-    save(truth, tmp_path)
-    for name, first in (("even", 0), ("odd", 1)):
-        (tmp_path / name).mkdir()
-        for i in range(first, 51, 2):
-            picture = (folder / "image_l" / f"{i:06d}.png").read_bytes()
-            (tmp_path / name / f"{i:06d}.png").write_bytes(picture)
-        times = "\n".join(f"{t * 1e-9:.3f}" for t in t_ns[first::2])
-        (tmp_path / name / "timestamps.txt").write_text(times + "\n")
-    poses = ["--poses", str(tmp_path / "truth.json")]
-    database = str(tmp_path / "even.sqlite")
-    add = ["landmarks", "add", database, str(tmp_path / "even"), *poses, "--every", "1"]
-    assert cli.run(add) == 0
-    fit = ["fit", "landmarks", str(tmp_path / "odd"), "--database", database, *poses]
-    near = [
-        "--every",
-        "0.5",
-        "--same-within",
-        "3",
-        "--different-beyond",
-        "25",
-        "--false-match-rate",
-        "0.05",
-    ]
-    capsys.readouterr()
-    assert cli.run([*fit, *near, "--json"]) == 0
-
-    fitted = json.loads(capsys.readouterr().out)
-    found = fitted["held_out_found"]
-    assert found["hits"] == found["of"] > 20
-    assert 4 < fitted["min_score"] < 100
