@@ -1,1 +1,1 @@
-"""Readers of CAN logs in text form: candump, ASC, TRC and BUSMASTER."""
+"""Readers of CAN logs in text form: candump, ASC and TRC."""

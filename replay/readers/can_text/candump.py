@@ -2,8 +2,7 @@
 
 It also reads CAN FD (``123##1DEADBEEF``), remote (``123#R4``) and error frames, a trailing
 direction ``R`` or ``T``, the raw DLC suffix ``_9``, and candump's screen format with times
-(`` (1436509052.249713)  can0  123   [4]  DE AD BE EF``). BUSMASTER logs, which have the same
-suffix, are passed to their reader.
+(`` (1436509052.249713)  can0  123   [4]  DE AD BE EF``).
 
 The format has no checksum, no count and no length in its lines. A last line without a line end is
 therefore dropped, and so is a line followed by one with an invalid start: both may be truncated.
@@ -22,7 +21,6 @@ from crosscue.replay.errors import LogFormatError
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import IS_FD_LENGTH
 
-from .busmaster import BUSMASTER_HEAD, Busmaster
 from .dialect import (
     BAD_IDENTIFIER,
     BAD_LENGTH,
@@ -80,15 +78,12 @@ _DATED: Final = re.compile(rb"\s*\(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d+\)\s+[^\s#
 
 
 def open_candump(path: Path, limits: Limits) -> Log:
-    """Open a candump log, or a BUSMASTER log.
+    """Open a candump log.
 
     Raises:
-        LogFormatError: The file is neither, or is candump's screen output without usable times.
+        LogFormatError: The file is candump's screen output without usable times.
     """
-    head = head_of(path)
-    if head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(BUSMASTER_HEAD):
-        return TextCanLog(path, limits, lambda: Busmaster(head))
-    _refuse_without_times(path, head)
+    _refuse_without_times(path, head_of(path))
     return TextCanLog(path, limits, Candump)
 
 

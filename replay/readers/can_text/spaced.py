@@ -1,4 +1,4 @@
-"""Frames whose bytes are separated by blanks, as in ASC, TRC and BUSMASTER logs."""
+"""Frames whose bytes are separated by blanks, as in ASC and TRC logs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -268,17 +268,6 @@ def test_lines_are_complete_for_any_chunk_size(tmp_path: Path, size: int) -> Non
     assert got == [*lines, b"last"]
 
 
-@pytest.mark.slow
-def test_busmaster_log_has_same_frames_as_candump_log() -> None:
-    busmaster, ledger = read_back(shared("can", "savvycan", "BusMasterLog.log"))
-    candump_, _ = read_back(shared("can", "savvycan", "candump.log"))
-
-    assert ledger.is_whole
-    assert [(f.arbitration_id, f.payload) for f in busmaster["can/0"]] == [
-        (f.arbitration_id, f.payload) for f in candump_["vcan0"]
-    ]
-
-
 @pytest.mark.parametrize("name", ["issue_1256.asc", "logfile.asc"])
 def test_real_asc_logs_match_python_can(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     path = shared("can", "python_can", name)
