@@ -6,7 +6,9 @@ The dissertation scores one approach per run, but a drive has many. The life of 
   belief is therefore never old at the next intersection.
 * It closes when the intersection's end is behind the rear axle (the measured end, or the start plus
   a typical length), when the car has turned at the intersection, or when the evidence is stale.
-  Without any range, evidence becomes stale sooner, and the approach ends after ``longest_m``.
+  Without any range, evidence becomes stale sooner, and the approach ends after ``longest_m``. Where
+  the frames tell whether a road to a side begins ahead, it is passed once none does any more, the
+  car moves, and nothing else is in view that can start an approach.
 * It restarts if its first range shows that it opened too far away to belong to that intersection.
 * If it closes before presence is established, it was noise: it counts as neutral, not as a
   detection.
@@ -14,9 +16,10 @@ The dissertation scores one approach per run, but a drive has many. The life of 
 Only signs with a range and cues with ``can_start`` keep evidence fresh, because road straight
 ahead is seen everywhere. Staleness depends on distance, not on time, so the approach of a car that
 waits at the stop line remains open. While it stands, a static cue is evidence only until it was
-seen there once: a light may come into view, but looking on tells nothing more. Only the published
-belief (``source``) counts every frame. Without odometry, the distance is estimated
-with ``RangeFilter.unseen_mps``, which also widens the ranges; a range that is too wide is dropped.
+seen there once, unless it is worth more: a light may come into view, but looking on tells nothing
+more. Only the published belief (``source``) counts every frame. Without odometry, the distance is
+estimated with ``RangeFilter.unseen_mps``, which also widens the ranges; a range that is too wide is
+dropped.
 Only the published belief lets this distance end an approach whose evidence is still in view.
 """
 
@@ -136,6 +139,7 @@ class _Open:
     since_evidence_m: float = 0.0
     since_dissent_m: float = math.inf
     turned_rad: float = 0.0
+    saw_road: bool = False
 
 
 class Approaches:
@@ -162,8 +166,8 @@ class Approaches:
         self._since_static_m = math.inf
         self._static = frozenset(cue.name for cue in graph.cues if not cue.moves)
         self._is_published = fusion.kind in ("source", None)
-        # Static cues that count no more until the car moves on.
-        self._seen_here: set[str] = set()
+        # Static cues that count no more until the car moves on, unless they are worth more.
+        self._seen_here: dict[str, float] = {}
 
     def __call__(self, evidence: FrameEvidence, past: PastCues = no_past_cues) -> Step:
         """Process the next evidence; it is ignored if it is not later than the previous one."""
@@ -177,7 +181,7 @@ class Approaches:
             self._advance(self._open, evidence, moved.way_m)
         moved, looked_for = self._with_standing(moved), evidence.counts
         if moved.is_standing:
-            moving = self._without_static(evidence.counts, moved)
+            moving = self._without_static(evidence.counts, moved, evidence.weights)
             evidence = replace(evidence, counts=moving, signs=(), posteriors=())
         step = self._judged(evidence, past, moved)
         return replace(step, counts={**looked_for, **step.counts})
@@ -191,15 +195,20 @@ class Approaches:
             self._seen_here.clear()
         return moved._replace(is_standing=is_standing)
 
-    def _without_static(self, counts: Mapping[str, int], moved: _Moved) -> Mapping[str, int]:
+    def _without_static(
+        self, counts: Mapping[str, int], moved: _Moved, weights: Mapping[str, float]
+    ) -> Mapping[str, int]:
         """Counts that are evidence: while the car stands, of moving objects and of what is new.
 
         The filter over a drive judges static cues by steps of distance only.
         """
         if not moved.is_standing:
             return counts
-        known = self._seen_here if self._over_drive is None else self._static
-        return {cue: count for cue, count in counts.items() if cue not in self._static & known}
+        known = self._static
+        if self._over_drive is None:
+            seen = self._seen_here.items()
+            known = known & {cue for cue, weight in seen if weights.get(cue, 1.0) <= weight}
+        return {cue: count for cue, count in counts.items() if cue not in known}
 
     def _judged(self, evidence: FrameEvidence, past: PastCues, moved: _Moved) -> Step:
         """Update the belief with what counts as evidence."""
@@ -207,10 +216,12 @@ class Approaches:
         self._since_range_m += moved.way_m
         signs = self._plausible(evidence.signs)
         ranged = {**signs, **{o.reference: (o.range_m, o.var_m2) for o in evidence.posteriors}}
-        confirmed = self._confirmed(evidence.counts, evidence.is_new_picture)
+        confirmed = self._confirmed(evidence.counts, evidence)
         can_open = any(confirmed.counts.get(cue, 0) > 0 for cue in self._first)
         if self._open is not None and _is_about_another(self._open, ranged, self._fusion.longest_m):
             self._close("another ahead")
+        if self._open is not None and self._has_passed_roads(self._open, evidence, moved):
+            self._close("passed")
         if self._open is None and (ranged or (can_open and self._rest_m <= 0.0)):
             self._begin()
         if self._open is None:
@@ -220,7 +231,16 @@ class Approaches:
             return Step(evidence.t_ns, None, evidence.counts, not_believed=confirmed.silent)
         if ranged or can_open:
             self._open.since_evidence_m = 0.0
+        self._open.saw_road |= evidence.is_road_ahead is True
         return self._step(self._open, evidence, confirmed, signs, past, moved)
+
+    def _has_passed_roads(self, current: _Open, evidence: FrameEvidence, moved: _Moved) -> bool:
+        """Whether roads were seen and none is ahead any more, nor anything that starts another."""
+        in_view = any(evidence.counts.get(cue, 0) > 0 for cue in self._first)
+        is_over = current.saw_road and evidence.is_road_ahead is False
+        return is_over and not (
+            in_view or evidence.signs or evidence.posteriors or moved.is_standing
+        )
 
     def restart(self) -> None:
         """Restart after a gap in time, because the belief is about another place."""
@@ -240,13 +260,16 @@ class Approaches:
         if self._open is not None:
             self._close("the drive ended")
 
-    def _confirmed(self, counts: Mapping[str, int], is_new_picture: bool) -> Confirmed:
+    def _confirmed(self, counts: Mapping[str, int], evidence: FrameEvidence) -> Confirmed:
         """Counts that can be used: all, or the confirmed ones with persistence."""
         if self._persistence is None:
             confirmed = Confirmed(counts, {})
         else:
-            confirmed = self._persistence(counts, is_new_picture=is_new_picture)
-        self._seen_here.update(cue for cue, count in confirmed.counts.items() if count > 0)
+            confirmed = self._persistence(counts, is_new_picture=evidence.is_new_picture)
+        for cue, count in confirmed.counts.items():
+            if count > 0:
+                weight = evidence.weights.get(cue, 1.0)
+                self._seen_here[cue] = max(weight, self._seen_here.get(cue, 0.0))
         return confirmed
 
     def _count_silent(self, silent: Mapping[str, str]) -> None:
@@ -363,8 +386,8 @@ class Approaches:
         more = past(best, reference)
         counts = {**evidence.counts, **more}
         if more:
-            usable = self._without_static(more, moved)
-            also = self._confirmed(usable, evidence.is_new_picture)
+            usable = self._without_static(more, moved, evidence.weights)
+            also = self._confirmed(usable, evidence)
             confirmed = Confirmed(
                 {**confirmed.counts, **also.counts}, {**confirmed.silent, **also.silent}
             )
@@ -420,6 +443,7 @@ class Approaches:
             advanced_var_m2=moved.advanced_var_m2,
             ranges=ranges,
             is_standing=moved.is_standing,
+            weights=evidence.weights,
         )
 
     def _to_start(

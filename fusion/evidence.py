@@ -58,6 +58,9 @@ class FrameEvidence:
         assumed_m: Part of the distance that was assumed across a gap in time. It does not make
             evidence stale, because there was no observation on it.
         posteriors: Ranges by all observations so far, which the belief follows over distance.
+        weights: Number of messages that a positive cue is worth, by cue; 1 unless stated.
+        is_road_ahead: True if a road to a side is seen, False if none begins ahead; None where
+            unknown.
     """
 
     t_ns: int
@@ -70,6 +73,8 @@ class FrameEvidence:
     turned_rad: float | None = None
     assumed_m: float = 0.0
     posteriors: tuple[RangePosterior, ...] = ()
+    weights: Mapping[str, float] = field(default_factory=dict)
+    is_road_ahead: bool | None = None
 
 
 # Counts cues that depend on the intersection's position, given the best range.

@@ -13,6 +13,8 @@ first-order autoregression with correlation ``rho = exp(-distance / fade)``, a f
 (1 - rho) / (1 + rho) independent ones (``effective_sample_fraction``); for moving objects, time
 replaces distance. A frame at the position of the previous one therefore adds nothing, and a cue
 that remains over a whole approach counts a few times. Dissent is discounted in the same way.
+A cue can say how many messages it is worth; a correlated frame then counts by what it is worth more
+than all earlier ones.
 
 A cue with ``at_most`` cannot give more than this probability, however long it is seen, until
 another cue of the approach supports a feature, too: a light may be a pedestrian crossing's, and no
@@ -76,9 +78,10 @@ class Persistence:
 
 @dataclass(slots=True)
 class _Sent:
-    """Position of one cue's last message, in units of its fade."""
+    """Position of one cue's last message, in units of its fade, and its greatest weight."""
 
     positive_at: float = -math.inf
+    heaviest: float = 0.0
     dissent_at: float = -math.inf
     held_back: float = 0.0
     given: float = 0.0
@@ -126,7 +129,7 @@ class PersistentMessageModel:
                 if count > 0:
                     self.silent[line.cue.name] = why
                 continue
-            self._add_messages(line, count > 0, situation.may_dissent, out)
+            self._add_messages(line, count > 0, situation, out)
         for line in self._lines:
             # What a cue held back is sent once another cue of the approach has spoken.
             if line.sent.held_back and self._speaking - {line.cue.name}:
@@ -136,14 +139,17 @@ class PersistentMessageModel:
         return out
 
     def _add_messages(
-        self, line: _Line, is_positive: bool, may_dissent: bool, out: list[float]
+        self, line: _Line, is_positive: bool, situation: Situation, out: list[float]
     ) -> None:
         fade = line.cue.fade
         at = self._time_s / fade.time_s if fade.time_s else self._way_m / (fade.way_m or math.inf)
         if is_positive:
-            worth = effective_sample_fraction(at - line.sent.positive_at)
+            weight = situation.weights.get(line.cue.name, 1.0)
+            new = effective_sample_fraction(at - line.sent.positive_at)
+            worth = new * weight + (1.0 - new) * max(weight - line.sent.heaviest, 0.0)
             line.sent.positive_at = at
-        elif may_dissent:
+            line.sent.heaviest = max(weight, line.sent.heaviest)
+        elif situation.may_dissent:
             worth = effective_sample_fraction(at - line.sent.dissent_at)
             line.sent.dissent_at = at
         else:

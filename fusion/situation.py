@@ -24,6 +24,7 @@ class Situation:
         advanced_var_m2: Variance of ``advanced_m``.
         ranges: Ranges to the intersection's start measured in this frame, with their variances.
         is_standing: True if the car stands; ``counts`` then lacks static cues already seen there.
+        weights: Number of messages that a positive cue is worth, by cue; 1 unless stated.
     """
 
     counts: Mapping[str, int]
@@ -39,3 +40,4 @@ class Situation:
     advanced_var_m2: float = 0.0
     ranges: tuple[tuple[float, float], ...] = ()
     is_standing: bool = False
+    weights: Mapping[str, float] = field(default_factory=dict)

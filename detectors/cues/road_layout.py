@@ -60,8 +60,13 @@ class LogOdds(NamedTuple):
 
 @dataclass(slots=True)
 class RoadLayout:
-    """Roads over the frames of a drive."""
+    """Roads over the frames of a drive.
 
+    Attributes:
+        mean: Mean log odds after the newest frame; None until it is one of enough frames.
+    """
+
+    mean: LogOdds | None = None
     _mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(4))
     _first_ns: int | None = None
     _last_ns: int = 0
@@ -87,14 +92,14 @@ class RoadLayout:
         self._mean = self._mean + gain * (found - self._mean)
         if t_ns - self._first_ns < MEAN_S * 1e9:
             return Legs(math.nan, math.nan, math.nan)
-        mean = LogOdds(*self._mean)
+        self.mean = mean = LogOdds(*self._mean)
         goes_on = mean.straight > STRAIGHT and mean.intersection > INTERSECTION
         is_seen = (mean.left > SIDE, goes_on, mean.right > SIDE)
         return Legs(*(1.0 if one else math.nan for one in is_seen))
 
     def restart(self) -> None:
         """Forget all frames."""
-        self._first_ns = None
+        self._first_ns = self.mean = None
 
 
 def log_odds(road: RoadMask, boxes_px: Floats) -> LogOdds:

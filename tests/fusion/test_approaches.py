@@ -13,6 +13,7 @@ from crosscue.fusion.factor_graph import graph_of, log_odds, probability
 from crosscue.fusion.intersection_range import RangeBelief, Reference
 from crosscue.fusion.situation import Situation
 from crosscue.replay.vehicle.fusion import Fusion, RangeFilter
+from crosscue.replay.vehicle.vehicle import Vehicle
 from support.fusion import NONE_SEEN, SECOND_NS, drive, light, sign
 
 FRAME_NS = SECOND_NS // 10
@@ -575,3 +576,52 @@ def test_wait_of_unknown_length_at_a_light_in_view_is_one_approach() -> None:
         loop = Approaches(graph_of(fusion), fusion, RangeFilter())
         numbers = {loop(one).approach for one in evidence}
         assert numbers - {None} == {1}
+
+
+def by_shape(
+    i: int, is_ahead: bool | None, travelled_m: float | None = None, **counts: int
+) -> FrameEvidence:
+    """A frame of a camera without calibration, which tells whether a road begins ahead."""
+    return replace(
+        FrameEvidence(i * FRAME_NS, travelled_m, 0.0, (), counts), is_road_ahead=is_ahead
+    )
+
+
+STREET = [by_shape(i, True, road_left=1) for i in range(5)]
+
+
+def test_road_that_is_no_longer_ahead_is_passed_and_evidence_then_is_of_the_next() -> None:
+    """Without motion, too: the time in which the evidence gets stale may be that to the next."""
+    loop = approaches(Vehicle(version=1).fusion)
+    gone = [by_shape(5, None), *(by_shape(i, False) for i in range(6, 15))]
+    following = [by_shape(i, True, road_right=1) for i in range(15, 20)]
+
+    steps = run_steps([*STREET, *gone, *following], loop)
+
+    assert [one.approach for one in steps] == [1] * 6 + [None] * 9 + [2] * 5
+    assert steps[5].probabilities["left"] > 0.9
+    assert steps[-1].probabilities["left"] == 0.5
+    assert steps[-1].probabilities["right"] > 0.9
+    assert loop.counts["approaches closed: passed"] == 1
+
+
+@pytest.mark.parametrize(
+    "gone",
+    [
+        pytest.param([by_shape(i, None) for i in range(5, 12)], id="undecided"),
+        pytest.param(
+            [by_shape(i, False, traffic_light=1) for i in range(5, 12)], id="light in view"
+        ),
+        pytest.param([by_shape(i, False, 0.0) for i in range(5, 12)], id="standing"),
+    ],
+)
+def test_approach_goes_on_while_its_end_is_not_seen(gone: list[FrameEvidence]) -> None:
+    steps = run_steps([*STREET, *gone], approaches(Vehicle(version=1).fusion))
+    assert {one.approach for one in steps} == {1}
+
+
+def test_light_before_which_no_road_was_seen_is_not_passed_for_want_of_roads() -> None:
+    light_only = [by_shape(i, False, traffic_light=1) for i in range(5)]
+    dark = [by_shape(i, False, traffic_light=0) for i in range(5, 12)]
+    steps = run_steps([*light_only, *dark], approaches(Vehicle(version=1).fusion))
+    assert {one.approach for one in steps[2:]} == {1}

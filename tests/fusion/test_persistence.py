@@ -321,3 +321,42 @@ def test_real_light_is_believed_but_certain_only_with_a_road_or_traffic() -> Non
     assert steps[59].established
     assert steps[-1].probabilities["intersection"] > 0.99
     assert signs[-1].probabilities["intersection"] > 0.99
+
+
+def shape_of(seen: Mapping[int, float], frames: int, travelled_m: float | None) -> list[Step]:
+    """Belief with a road to the left in some frames, by its log odds; the others show none."""
+    fusion = Vehicle(version=1).fusion
+    message = log_odds(fusion.cues["road_left"].precision)
+    evidence = [
+        replace(
+            FrameEvidence(i * STEP_NS, travelled_m, 0.0, (), {"road_left": 1} if i in seen else {}),
+            weights={"road_left": seen[i] / message} if i in seen else {},
+        )
+        for i in range(frames)
+    ]
+    return fusion_steps(evidence, fusion)
+
+
+@pytest.mark.parametrize("odds", [2.0, 2.5, 6.0])
+def test_cue_says_as_much_as_it_is_worth(odds: float) -> None:
+    """One message of 0.9 would never exceed 0.9, however sure the network is."""
+    for step in shape_of({3: odds}, 5, None)[3:]:
+        for feature in ("left", "intersection"):
+            assert step.probabilities[feature] == pytest.approx(1.0 / (1.0 + math.exp(-odds)))
+        assert step.probabilities["right"] == 0.5
+
+
+def test_views_over_time_add_up_without_motion_and_none_while_standing() -> None:
+    moving, standing = (shape_of(dict.fromkeys(range(20), 2.1), 20, way_m) for way_m in (None, 0.0))
+    left = [step.probabilities["left"] for step in moving]
+    assert left[0] < 0.9 < left[2] < left[-1]
+    assert left == sorted(left)
+    assert [step.probabilities["left"] for step in standing] == pytest.approx([left[0]] * 20)
+
+
+def test_surer_look_from_the_same_place_counts_up_to_what_it_says() -> None:
+    """A car stops, and a lorry drives out of the view: the street behind it is seen better."""
+    seen = [2.1, 3.0, 4.0, 2.5, 4.0, 3.9, 4.0]
+    steps = shape_of(dict(enumerate(seen)), len(seen), 0.0)
+    believed = [log_odds(step.probabilities["left"]) for step in steps]
+    assert believed == pytest.approx([2.1, 3.0, 4.0, 4.0, 4.0, 4.0, 4.0])

@@ -57,8 +57,9 @@ KINDS: Final = {
 }
 LIGHT: Final = {**dict.fromkeys(STATIC, 0), "traffic_light": 1}
 
-# What one frame shows: counts, a sign's range, a range from motion, and whether it is new.
-Look = tuple[Mapping[str, int], SignRange | None, RangePosterior | None, bool]
+# What one frame shows: counts, a sign's range, a range from motion, whether it is new, and the
+# weights of its cues.
+Look = tuple[Mapping[str, int], SignRange | None, RangePosterior | None, bool, Mapping[str, float]]
 
 RANGES_M: Final = st.floats(-5.0, 160.0)
 REFERENCES: Final = st.sampled_from([*Reference])
@@ -66,6 +67,7 @@ LOOKS_OF_RANGES: Final = (
     st.none() | st.builds(SignRange, REFERENCES, RANGES_M, st.floats(0.1, 50.0)),
     st.none() | st.builds(RangePosterior, REFERENCES, RANGES_M, st.floats(0.1, 50.0), RANGES_M),
     st.booleans(),
+    st.dictionaries(st.just("road_left"), st.floats(0.9, 4.0)),
 )
 LOOKS: Final = st.tuples(
     st.dictionaries(st.sampled_from(STATIC), st.integers(0, 2)), *LOOKS_OF_RANGES
@@ -76,11 +78,11 @@ MOVES: Final = st.tuples(LOOKS, st.floats(-1.0, 6.0) | st.floats(0.0, 0.09), st.
 def evidence(
     look: Look, moved_m: float = 0.0, var_m2: float = 0.0, turned_rad: float = 0.0
 ) -> FrameEvidence:
-    counts, sign, posterior, is_new = look
+    counts, sign, posterior, is_new, weights = look
     signs = () if sign is None else (sign,)
     posteriors = () if posterior is None else (posterior,)
     return FrameEvidence(
-        0, moved_m, var_m2, signs, counts, {}, is_new, turned_rad, posteriors=posteriors
+        0, moved_m, var_m2, signs, counts, {}, is_new, turned_rad, 0.0, posteriors, weights
     )
 
 
@@ -97,9 +99,9 @@ def believed(frames: Sequence[FrameEvidence], fusion: Fusion) -> list[Step]:
     times=st.integers(10, 100),
 )
 @example(
-    moves=[((LIGHT, None, None, True), 2.0, 0.0)] * 6,
+    moves=[((LIGHT, None, None, True, {}), 2.0, 0.0)] * 6,
     at=3,
-    pause=[(dict.fromkeys(STATIC, 0), None, None, True)],
+    pause=[(dict.fromkeys(STATIC, 0), None, None, True, {})],
     times=600,
 )
 def test_length_of_a_pause_changes_nothing(
@@ -126,7 +128,7 @@ def test_length_of_a_pause_changes_nothing(
 def test_pause_in_which_nothing_new_is_seen_changes_nothing(
     kind: str, moves: list[float], pause: list[Look], times: int
 ) -> None:
-    drive = [evidence((LIGHT, None, None, True), moved_m) for moved_m in [*moves, 1.0, 1.0]]
+    drive = [evidence((LIGHT, None, None, True, {}), moved_m) for moved_m in [*moves, 1.0, 1.0]]
     standing = [evidence(look, 0.0, 1e-3, 0.01) for look in pause] * times
 
     without = believed(drive, KINDS[kind])[len(moves) :]
@@ -151,7 +153,7 @@ def test_light_is_believed_as_long_as_a_car_stands_before_it(kind: str) -> None:
     dark = {**LIGHT, "traffic_light": 0}
     for late in (0, 1, 20):
         looks = [*[dark] * late, *[LIGHT] * 100]
-        steps = believed([evidence((look, None, None, True)) for look in looks], KINDS[kind])
+        steps = believed([evidence((look, None, None, True, {})) for look in looks], KINDS[kind])
 
         if kind in ("temporal", "combined") and late:
             continue  # Its filter judges static cues by distance only.
@@ -164,9 +166,10 @@ def test_light_is_believed_as_long_as_a_car_stands_before_it(kind: str) -> None:
 
 def left_while_standing(seen: Sequence[int], kind: str = "temporal") -> list[float]:
     """Return the belief in left, at two frames per second, after a light opened an approach."""
-    light = [evidence((LIGHT, None, None, True), 2.0)] * 3
+    light = [evidence((LIGHT, None, None, True, {}), 2.0)] * 3
     cars = [
-        evidence(({**NONE_SEEN, "cross_traffic_left": count}, None, None, True)) for count in seen
+        evidence(({**NONE_SEEN, "cross_traffic_left": count}, None, None, True, {}))
+        for count in seen
     ]
     loop = Approaches(graph_of(KINDS[kind]), KINDS[kind], RangeFilter())
     steps = [loop(replace(one, t_ns=i * 5 * FRAME_NS)) for i, one in enumerate([*light, *cars])]
@@ -187,7 +190,7 @@ def test_cross_traffic_is_judged_again_after_the_next_step_of_distance() -> None
     loop = Approaches(graph_of(KINDS["temporal"]), KINDS["temporal"], RangeFilter())
     seen = [(0, 2.0), (1, 0.0), (0, 2.0), (1, 0.0), (1, 0.0)]
     frames = [
-        evidence(({**LIGHT, "cross_traffic_left": count}, None, None, True), moved_m)
+        evidence(({**LIGHT, "cross_traffic_left": count}, None, None, True, {}), moved_m)
         for count, moved_m in seen
     ]
     steps = [loop(replace(one, t_ns=i * 5 * FRAME_NS)) for i, one in enumerate(frames)]
@@ -200,7 +203,7 @@ def test_cross_traffic_is_judged_again_after_the_next_step_of_distance() -> None
 
 def test_creeping_car_believes_what_comes_into_view_and_then_counts_each_tenth_of_a_metre() -> None:
     """Three of five frames confirm a cue, also of a car that moves 3 cm between them."""
-    steps = believed([evidence((LIGHT, None, None, True), 0.03)] * 9, KINDS["persistent"])
+    steps = believed([evidence((LIGHT, None, None, True, {}), 0.03)] * 9, KINDS["persistent"])
 
     assert [bool(one.not_believed) for one in steps] == [i in (0, 1) for i in range(9)]
     assert [one.probabilities.get("intersection") for one in steps[2:]] == pytest.approx([0.95] * 7)

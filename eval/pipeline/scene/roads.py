@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.observed import NOT_SEEN, FrameDetections, RoadFractions
 from crosscue.detectors.cues.road_area import NEAREST_M, RoadArea, RoadPlan, reach_of
-from crosscue.detectors.cues.road_layout import RoadLayout
+from crosscue.detectors.cues.road_layout import SIDE, LogOdds, RoadLayout
 from crosscue.detectors.cues.road_openings import RoadOpenings, Seen
 from crosscue.eval.pipeline.visual import MOVING, TABLE, moving_boxes
 from crosscue.eval.runs.tables.parquet import TableFolder
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
+from crosscue.fusion.factor_graph import log_odds
 from crosscue.fusion.intersection_range import Reference
+from crosscue.replay.vehicle.fusion import OPENING_PRECISION
 from crosscue.replay.vehicle.vehicle import Vehicle
 
 # Distance between an opening and a range from lights or signs that can belong together.
@@ -44,6 +46,7 @@ class Roads:
     seen: Seen | None = None
     by_shape: int = 0
     _layout: RoadLayout = field(default_factory=RoadLayout)
+    _shape: LogOdds | None = None
     _openings: RoadOpenings = field(init=False)
     _pitch_rad: float = field(init=False)
 
@@ -54,7 +57,7 @@ class Roads:
 
     def __call__(self, frame: FrameDetections, evidence: FrameEvidence) -> RoadFractions | None:
         """Process the next frame; return 1 for roads seen, 0 for missing ones, NaN for unseen."""
-        self.seen = None
+        self.seen = self._shape = None
         if not isinstance(frame.road, RoadMask):
             return frame.road
         camera = self.vehicle.camera
@@ -63,6 +66,7 @@ class Roads:
         if reach_m <= 0.0:
             self.by_shape += 1
             legs = self._layout(frame.t_ns, frame.road, moving_boxes(frame.objects, labels, HIDES))
+            self._shape = self._layout.mean
             return RoadFractions(*legs)
         if evidence.travelled_m is None:
             self.restart()
@@ -98,6 +102,23 @@ class Roads:
             for away_m in (TOGETHER_M + 2.0 * math.sqrt(one.var_m2 + seen.sd_m**2),)
         )
 
+    def with_shape(self, evidence: FrameEvidence) -> FrameEvidence:
+        """Add how sure the mask's shape is of each road, and whether one begins ahead."""
+        mean = self._shape
+        if mean is None:
+            return evidence
+        odds = {
+            "road_left": mean.left,
+            "road_straight": min(mean.straight, mean.intersection),
+            "road_right": mean.right,
+        }
+        is_ahead = True if max(mean.left, mean.right) > SIDE else None
+        return replace(
+            evidence,
+            weights={cue: one / log_odds(OPENING_PRECISION) for cue, one in odds.items()},
+            is_road_ahead=False if mean.intersection < 0.0 else is_ahead,
+        )
+
     def plan(self) -> RoadPlan | None:
         """Return the plan view after the newest frame."""
         return None if self.area is None else self.area.plan()
@@ -108,7 +129,7 @@ class Roads:
 
     def restart(self) -> None:
         """Forget the road."""
-        self.area, self.seen = None, None
+        self.area = self.seen = self._shape = None
         self._openings.restart()
         self._layout.restart()
 

@@ -208,7 +208,7 @@ class Scene:
 
     def range(self, step: SceneStep, cues: FrameCues) -> FrameEvidence:
         """Return the evidence of a frame: its motion, its cues, and ranges to the intersection."""
-        without, counts = self._without, cues.counts
+        without, counts, evidence = self._without, cues.counts, step.evidence
         signs = tuple(
             sign for sign in self._signs(cues.objects) if _MEASURES[sign.reference] not in without
         )
@@ -217,13 +217,14 @@ class Scene:
             # From an assumed size alone, without any motion, a range would be a guess.
             posteriors = ()
         if self._roads is not None and not without >= ROADS:
+            evidence = self._roads.with_shape(evidence)
             if not posteriors:
                 posteriors = self._roads.ranges()
             elif not self._roads.fits(posteriors):
                 # A side street before the intersection that is ranged.
                 counts = {cue: count for cue, count in counts.items() if cue not in ROADS}
         return replace(
-            step.evidence,
+            evidence,
             counts=counts,
             signs=signs,
             posteriors=posteriors,

@@ -1,12 +1,17 @@
 """Roads of the scene: what openings say to the belief and to the ranges."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+import crosscue
 from crosscue.detectors import rle
-from crosscue.detectors.base import RoadMask
+from crosscue.detectors.base import Frame, RoadMask, View
 from crosscue.detectors.cues.observed import NOT_SEEN, FrameDetections, RoadFractions
 from crosscue.detectors.cues.road_openings import Legs, Seen
 from crosscue.eval.pipeline.scene.roads import BY_SHAPE, Roads
@@ -14,7 +19,7 @@ from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.camera import Camera
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle, parse
-from support.road_masks import RIGHT, ROAD, seen_from
+from support.road_masks import LEFT, RIGHT, ROAD, seen_from
 
 CAMERA = Camera(focal_px=700.0, z_m=1.6)
 SIZE_PX = (640, 360)
@@ -81,6 +86,10 @@ def test_without_a_focal_length_the_mask_alone_shows_roads_and_gives_no_range() 
     assert not uncalibrated.ranges()
     assert uncalibrated.plan() is None
     assert uncalibrated.notes() == {BY_SHAPE: 10}
+    assert uncalibrated.with_shape(evidence(None)).is_road_ahead is True
+    assert uncalibrated.with_shape(evidence(None)).weights["road_right"] > 1.0
+    uncalibrated.restart()
+    assert uncalibrated.with_shape(evidence(None)) == evidence(None)
 
 
 def test_an_opening_supports_the_intersection_unless_the_method_or_the_file_says_otherwise() -> (
@@ -101,3 +110,36 @@ def test_an_opening_supports_the_intersection_unless_the_method_or_the_file_says
 def test_settings_of_a_run_are_the_same_when_read_again() -> None:
     vehicle = Vehicle(version=1)
     assert Vehicle.model_validate(vehicle.model_dump()) == vehicle
+
+
+class Streets:
+    """A detector to which every picture shows the next of these roads, seen without calibration."""
+
+    view, identity, labels = View(is_grey=True), "streets", ()
+    areas = (*[[ROAD, RIGHT]] * 15, *[[ROAD]] * 5, *[[ROAD, LEFT]] * 16)
+
+    def __call__(self, frames: Sequence[Frame], /) -> list[RoadMask]:
+        """Return the mask of the picture whose grey value is its number."""
+        return [
+            replace(seen_from(self.areas[number], 0.8, 1.4, 0.45), t_ns=frame.t_ns)
+            for frame in frames
+            for number in (round(float(frame.pixels.mean()) / 5.0),)
+        ]
+
+
+def test_streets_that_a_car_passes_without_known_motion_are_believed_apart(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    log.mkdir()
+    for i in range(len(Streets.areas)):
+        cv2.imwrite(str(log / f"{i:02}.png"), np.full(SIZE_PX[::-1], 5 * i, np.uint8))
+    (log / "timestamps.txt").write_text("rate_hz: 10\n")
+    (tmp_path / "car.toml").write_text("version = 1\n")
+
+    run = crosscue.replay_drive(log, tmp_path / "run", tmp_path / "car.toml", [Streets])
+
+    rows = run["belief"].to_pylist()
+    last = {row["approach"]: row for row in rows}
+    assert [(row["right"] > 0.9, row["left"] > 0.9) for row in last.values()] == [
+        (True, False),
+        (False, True),
+    ]
