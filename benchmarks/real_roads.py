@@ -11,9 +11,11 @@ the pictures that ``cut`` takes (first, last, step); null is uncertain and not s
 
 A leg counts by the highest belief within the annotated frames: above 0.9 it is believed, and wrong
 where there is none. At its prior it is not seen; below, a missing leg is right. Anything else is
-undecided. Below, each cue and leg has a line with the numbers of drives and places it stands on,
-apart for drives of development (``*``). Times, frames and distances are those of the
-annotations; ranges are scored only where a track gives the true distance.
+undecided. Beside it stand the messages: the legs that are there, and those that are not, that a
+road cue shows in any of the frames. Below, each cue and leg has a line with the numbers of drives
+and places it stands on, apart for drives of development (``*``), and so have the messages, by the
+openings of calibrated cameras and by the mask's shape for others. Times, frames and distances are
+those of the annotations; ranges are scored only where a track gives the true distance.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -196,10 +198,22 @@ DRIVES: Final[dict[str, Drive]] = {
 
 @dataclass(slots=True)
 class Score:
-    """Counts of one drive."""
+    """Counts of one drive.
+
+    Attributes:
+        cues: Frames of each cue: right, missed and false.
+        legs: What is believed of each leg.
+        messages: Whether each leg is there, and whether a road cue shows it.
+        first: Where the intersection is first believed.
+        pieces: Believed approaches to annotated intersections.
+        false_intersections: Believed approaches to none.
+        ranges: Numbers of ranges inside their interval, and of all.
+        minutes: Duration.
+    """
 
     cues: dict[str, Counter[str]] = field(default_factory=dict)
     legs: dict[str, str] = field(default_factory=dict)
+    messages: dict[str, tuple[bool, bool]] = field(default_factory=dict)
     first: str = "-"
     pieces: int = 0
     false_intersections: int = 0
@@ -301,7 +315,13 @@ def scored(run: Run, drive: Drive) -> Score:
     claimed: set[int] = set()
     for number, approach in enumerate(approaches, 1):
         rows = [r for r in beliefs if approach.first <= frame_of[r["t_ns"]] <= approach.last]
-        _legs(score, approach, rows, f"{number} " if len(approaches) > 1 else "")
+        prefix = f"{number} " if len(approaches) > 1 else ""
+        _legs(score, approach, rows, prefix)
+        within = times[approach.first : approach.last + 1].tolist()
+        for leg in FEATURES:
+            if (truth := approach.features.get(leg)) is not None:
+                is_shown = any(found.get((t_ns, f"road_{leg}")) for t_ns in within)
+                score.messages[prefix + leg] = truth, is_shown
         ours = {
             number
             for number, frames in believed.items()
@@ -386,6 +406,34 @@ def evidence(scores: Mapping[str, Score], drives: Mapping[str, Drive] = DRIVES) 
                 f"{name:24} {len({folder for folder, _ in found}):6} {len(found):6} "
                 f"{numbers or '-'}"
             )
+    for rule, is_calibrated in (("openings", True), ("shape", False)):
+        for is_development in (True, False):
+            shown = {
+                name: scores[name].messages
+                for (folder, _), name in reversed(stretches.items())
+                if scores[name].messages
+                and drives[name].is_development is is_development
+                and bool(drives[name].camera) is is_calibrated
+            }
+            by_drive = [f"{name} {_shown(legs)}" for name, legs in shown.items()]
+            every = {(name, leg): one for name, legs in shown.items() for leg, one in legs.items()}
+            name = f"{rule}{'*' if is_development else ''}"
+            yield (
+                f"{name:24} {len({drives[one].folder for one in shown}):6} {len(shown):6} "
+                f"{_shown(every)} ({', '.join(by_drive) or '-'})"
+            )
+
+
+def _shown(legs: Mapping[Any, tuple[bool, bool]]) -> str:
+    """How many legs that are there a message shows, and how many that are not."""
+    is_shown = {
+        truth: [one for is_there, one in legs.values() if is_there is truth]
+        for truth in (True, False)
+    }
+    return ", ".join(
+        f"{sum(some)} of {len(some)} {'true' if truth else 'absent'}"
+        for truth, some in is_shown.items()
+    )
 
 
 _LEG_WORDS: Final = {
@@ -404,6 +452,7 @@ def main(arguments: Sequence[str]) -> None:
         fetch_weights(model, DATA / "weights" / folder)
     print(
         f"{'drive':24} {'lights':>9} {'stop signs':>10} (right/missed/false) {'legs':52} "
+        f"{'messages':>26} "
         f"{'first':>9} {'pieces':>6} {'false':>6} {'in 95 %':>8}"
     )
     scores = {}
@@ -421,7 +470,8 @@ def main(arguments: Sequence[str]) -> None:
         inside, total = score.ranges
         print(
             f"{name + ('*' if drive.is_development else ''):24} {lights:>9} {stops:>10} "
-            f"{'':20} {legs:52} {score.first:>9} {score.pieces:6} {score.false_intersections:6} "
+            f"{'':20} {legs:52} {_shown(score.messages):>26} "
+            f"{score.first:>9} {score.pieces:6} {score.false_intersections:6} "
             f"{f'{inside}/{total}' if total else '-':>8}",
             flush=True,
         )
