@@ -7,8 +7,9 @@ The dissertation scores one approach per run, but a drive has many. The life of 
 * It closes when the intersection's end is behind the rear axle (the measured end, or the start plus
   a typical length), when the car has turned at the intersection, or when the evidence is stale.
   Without any range, evidence becomes stale sooner, and the approach ends after ``longest_m``. Where
-  the frames tell whether a road to a side begins ahead, it is passed once none does any more, the
-  car moves, and nothing else is in view that can start an approach.
+  the frames tell which roads begin ahead, it is passed once none of those seen does any more, and
+  the next one opens if another comes up after one of them is gone; not while the car stands, nor
+  while a light or sign is in view.
 * It restarts if its first range shows that it opened too far away to belong to that intersection.
 * If it closes before presence is established, it was noise: it counts as neutral, not as a
   detection.
@@ -139,7 +140,7 @@ class _Open:
     since_evidence_m: float = 0.0
     since_dissent_m: float = math.inf
     turned_rad: float = 0.0
-    saw_road: bool = False
+    roads: frozenset[str] = frozenset()
 
 
 class Approaches:
@@ -220,8 +221,10 @@ class Approaches:
         can_open = any(confirmed.counts.get(cue, 0) > 0 for cue in self._first)
         if self._open is not None and _is_about_another(self._open, ranged, self._fusion.longest_m):
             self._close("another ahead")
-        if self._open is not None and self._has_passed_roads(self._open, evidence, moved):
-            self._close("passed")
+        if self._open is not None:
+            why = self._passed_roads(self._open, evidence, moved)
+            if why is not None:
+                self._close(why)
         if self._open is None and (ranged or (can_open and self._rest_m <= 0.0)):
             self._begin()
         if self._open is None:
@@ -231,16 +234,19 @@ class Approaches:
             return Step(evidence.t_ns, None, evidence.counts, not_believed=confirmed.silent)
         if ranged or can_open:
             self._open.since_evidence_m = 0.0
-        self._open.saw_road |= evidence.is_road_ahead is True
+        self._open.roads |= {cue for cue, is_ahead in evidence.roads_ahead.items() if is_ahead}
         return self._step(self._open, evidence, confirmed, signs, past, moved)
 
-    def _has_passed_roads(self, current: _Open, evidence: FrameEvidence, moved: _Moved) -> bool:
-        """Whether roads were seen and none is ahead any more, nor anything that starts another."""
-        in_view = any(evidence.counts.get(cue, 0) > 0 for cue in self._first)
-        is_over = current.saw_road and evidence.is_road_ahead is False
-        return is_over and not (
-            in_view or evidence.signs or evidence.posteriors or moved.is_standing
-        )
+    def _passed_roads(self, current: _Open, evidence: FrameEvidence, moved: _Moved) -> str | None:
+        """Reason why an approach is over whose roads were seen, by the roads ahead now."""
+        ahead = evidence.roads_ahead
+        gone = [ahead.get(cue) is False for cue in current.roads]
+        others = any(evidence.counts.get(cue, 0) > 0 for cue in self._first if cue not in ahead)
+        if not any(gone) or others or evidence.signs or evidence.posteriors or moved.is_standing:
+            return None
+        if any(is_ahead and cue not in current.roads for cue, is_ahead in ahead.items()):
+            return "another ahead"
+        return "passed" if all(gone) else None
 
     def restart(self) -> None:
         """Restart after a gap in time, because the belief is about another place."""

@@ -59,8 +59,8 @@ class FrameEvidence:
             evidence stale, because there was no observation on it.
         posteriors: Ranges by all observations so far, which the belief follows over distance.
         weights: Number of messages that a positive cue is worth, by cue; 1 unless stated.
-        is_road_ahead: True if a road to a side is seen, False if none begins ahead; None where
-            unknown.
+        roads_ahead: By cue, True for a road that is seen, False for one that does not begin ahead,
+            or not any more; without those that are unknown.
     """
 
     t_ns: int
@@ -74,7 +74,7 @@ class FrameEvidence:
     assumed_m: float = 0.0
     posteriors: tuple[RangePosterior, ...] = ()
     weights: Mapping[str, float] = field(default_factory=dict)
-    is_road_ahead: bool | None = None
+    roads_ahead: Mapping[str, bool] = field(default_factory=dict)
 
 
 # Counts cues that depend on the intersection's position, given the best range.

@@ -92,7 +92,7 @@ class RoadLayout:
         self._mean = self._mean + gain * (found - self._mean)
         if t_ns - self._first_ns < MEAN_S * 1e9:
             return Legs(math.nan, math.nan, math.nan)
-        self.mean = mean = LogOdds(*self._mean)
+        self.mean = mean = LogOdds(*self._mean.tolist())
         goes_on = mean.straight > STRAIGHT and mean.intersection > INTERSECTION
         is_seen = (mean.left > SIDE, goes_on, mean.right > SIDE)
         return Legs(*(1.0 if one else math.nan for one in is_seen))

@@ -579,22 +579,26 @@ def test_wait_of_unknown_length_at_a_light_in_view_is_one_approach() -> None:
 
 
 def by_shape(
-    i: int, is_ahead: bool | None, travelled_m: float | None = None, **counts: int
+    i: int, travelled_m: float | None = None, light: int = 0, **odds: float
 ) -> FrameEvidence:
-    """A frame of a camera without calibration, which tells whether a road begins ahead."""
+    """A frame of a camera without calibration: log odds that a road to a side begins ahead."""
+    counts = {f"road_{side}": 1 for side, one in odds.items() if one > 2.0}
     return replace(
-        FrameEvidence(i * FRAME_NS, travelled_m, 0.0, (), counts), is_road_ahead=is_ahead
+        FrameEvidence(i * FRAME_NS, travelled_m, 0.0, (), {**counts, "traffic_light": light}),
+        roads_ahead={
+            f"road_{side}": one > 0.0 for side, one in odds.items() if not 0.0 < one < 2.0
+        },
     )
 
 
-STREET = [by_shape(i, True, road_left=1) for i in range(5)]
+STREET = [by_shape(i, left=3.0, right=-1.0) for i in range(5)]
 
 
 def test_road_that_is_no_longer_ahead_is_passed_and_evidence_then_is_of_the_next() -> None:
     """Without motion, too: the time in which the evidence gets stale may be that to the next."""
     loop = approaches(Vehicle(version=1).fusion)
-    gone = [by_shape(5, None), *(by_shape(i, False) for i in range(6, 15))]
-    following = [by_shape(i, True, road_right=1) for i in range(15, 20)]
+    gone = [by_shape(5, left=1.0), *(by_shape(i, left=-1.0, right=-1.0) for i in range(6, 15))]
+    following = [by_shape(i, left=-1.0, right=3.0) for i in range(15, 20)]
 
     steps = run_steps([*STREET, *gone, *following], loop)
 
@@ -605,14 +609,34 @@ def test_road_that_is_no_longer_ahead_is_passed_and_evidence_then_is_of_the_next
     assert loop.counts["approaches closed: passed"] == 1
 
 
+@pytest.mark.parametrize(("left", "numbers"), [(3.0, {1}), (1.0, {1}), (-1.0, {1, 2})])
+def test_road_that_comes_up_belongs_to_the_next_once_another_one_is_passed(
+    left: float, numbers: set[int]
+) -> None:
+    """The second street begins within the network's reach behind the first, so none is free."""
+    following = [by_shape(i, left=left, right=3.0) for i in range(5, 10)]
+    steps = run_steps([*STREET, *following], approaches(Vehicle(version=1).fusion))
+    assert {one.approach for one in steps} == numbers
+    assert steps[-1].probabilities["right"] > 0.9
+    assert (steps[-1].probabilities["left"] > 0.9) is (len(numbers) == 1)
+
+
+def test_roads_seen_together_are_one_intersection_whichever_is_passed_first() -> None:
+    both = [by_shape(i, left=3.0, right=3.0) for i in range(5, 10)]
+    one_only = [by_shape(i, left=-1.0, right=3.0) for i in range(10, 15)]
+    steps = run_steps([*STREET, *both, *one_only], approaches(Vehicle(version=1).fusion))
+    assert {one.approach for one in steps} == {1}
+
+
+GONE = range(5, 12)
+
+
 @pytest.mark.parametrize(
     "gone",
     [
-        pytest.param([by_shape(i, None) for i in range(5, 12)], id="undecided"),
-        pytest.param(
-            [by_shape(i, False, traffic_light=1) for i in range(5, 12)], id="light in view"
-        ),
-        pytest.param([by_shape(i, False, 0.0) for i in range(5, 12)], id="standing"),
+        pytest.param([by_shape(i, left=1.0) for i in GONE], id="undecided"),
+        pytest.param([by_shape(i, light=1, left=-1.0) for i in GONE], id="light in view"),
+        pytest.param([by_shape(i, 0.0, left=-1.0) for i in GONE], id="standing"),
     ],
 )
 def test_approach_goes_on_while_its_end_is_not_seen(gone: list[FrameEvidence]) -> None:
@@ -621,7 +645,6 @@ def test_approach_goes_on_while_its_end_is_not_seen(gone: list[FrameEvidence]) -
 
 
 def test_light_before_which_no_road_was_seen_is_not_passed_for_want_of_roads() -> None:
-    light_only = [by_shape(i, False, traffic_light=1) for i in range(5)]
-    dark = [by_shape(i, False, traffic_light=0) for i in range(5, 12)]
-    steps = run_steps([*light_only, *dark], approaches(Vehicle(version=1).fusion))
+    frames = [by_shape(i, light=int(i < 5), left=-1.0, right=-1.0) for i in range(12)]
+    steps = run_steps(frames, approaches(Vehicle(version=1).fusion))
     assert {one.approach for one in steps[2:]} == {1}

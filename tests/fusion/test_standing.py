@@ -82,7 +82,16 @@ def evidence(
     signs = () if sign is None else (sign,)
     posteriors = () if posterior is None else (posterior,)
     return FrameEvidence(
-        0, moved_m, var_m2, signs, counts, {}, is_new, turned_rad, 0.0, posteriors, weights
+        0,
+        moved_m,
+        var_m2,
+        signs,
+        counts,
+        is_new_picture=is_new,
+        turned_rad=turned_rad,
+        posteriors=posteriors,
+        weights=weights,
+        roads_ahead={cue: weight > 2.0 for cue, weight in weights.items()},
     )
 
 

@@ -103,20 +103,16 @@ class Roads:
         )
 
     def with_shape(self, evidence: FrameEvidence) -> FrameEvidence:
-        """Add how sure the mask's shape is of each road, and whether one begins ahead."""
+        """Add how sure the mask's shape is of each road, and which ones begin ahead."""
         mean = self._shape
         if mean is None:
             return evidence
-        odds = {
-            "road_left": mean.left,
-            "road_straight": min(mean.straight, mean.intersection),
-            "road_right": mean.right,
-        }
-        is_ahead = True if max(mean.left, mean.right) > SIDE else None
+        sides = {"road_left": mean.left, "road_right": mean.right}
+        odds = {**sides, "road_straight": min(mean.straight, mean.intersection)}
         return replace(
             evidence,
             weights={cue: one / log_odds(OPENING_PRECISION) for cue, one in odds.items()},
-            is_road_ahead=False if mean.intersection < 0.0 else is_ahead,
+            roads_ahead={cue: one > SIDE for cue, one in sides.items() if not 0.0 <= one <= SIDE},
         )
 
     def plan(self) -> RoadPlan | None:

@@ -86,7 +86,10 @@ def test_without_a_focal_length_the_mask_alone_shows_roads_and_gives_no_range() 
     assert not uncalibrated.ranges()
     assert uncalibrated.plan() is None
     assert uncalibrated.notes() == {BY_SHAPE: 10}
-    assert uncalibrated.with_shape(evidence(None)).is_road_ahead is True
+    assert uncalibrated.with_shape(evidence(None)).roads_ahead == {
+        "road_left": False,
+        "road_right": True,
+    }
     assert uncalibrated.with_shape(evidence(None)).weights["road_right"] > 1.0
     uncalibrated.restart()
     assert uncalibrated.with_shape(evidence(None)) == evidence(None)
