@@ -3,7 +3,6 @@
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from random import Random
 
 import pytest
 from hypothesis import given, settings
@@ -85,41 +84,6 @@ def test_marginals_equal_enumeration_of_all_assignments(
 
     assert probabilities_after(graph, frames) == pytest.approx(
         enumerated(graph, frames), rel=1e-9, abs=1e-12
-    )
-
-
-@FEW_EXAMPLES
-@given(graphs_with_counts())
-def test_marginals_equal_gtsam_discrete_factor_graph(
-    case: tuple[FactorGraph, list[dict[str, int]]],
-) -> None:
-    gtsam = pytest.importorskip("gtsam", reason="this check needs the optional package gtsam")
-    graph, frames = case
-    keys = {name: (gtsam.symbol("f", i), 2) for i, name in enumerate(graph.feature_names)}
-    theirs = gtsam.DiscreteFactorGraph()
-    for feature in graph.features:
-        theirs.add(keys[feature.name], [1.0 - feature.prior, feature.prior])
-    for cue, edge, times in sent_messages(graph, frames):
-        yes = cue.precision if edge.is_direct else 1.0 - cue.precision
-        for _ in range(times):
-            theirs.add(keys[edge.feature], [1.0 - yes, yes])
-    marginals = gtsam.DiscreteMarginals(theirs)
-    expected = {name: marginals.marginalProbabilities(key)[1] for name, key in keys.items()}
-
-    assert probabilities_after(graph, frames) == pytest.approx(expected, rel=1e-9, abs=1e-12)
-
-
-@FEW_EXAMPLES
-@given(graphs_with_counts(), st.randoms(use_true_random=False))
-def test_order_of_frames_does_not_matter(
-    case: tuple[FactorGraph, list[dict[str, int]]], random: Random
-) -> None:
-    graph, frames = case
-    mixed = list(frames)
-    random.shuffle(mixed)
-
-    assert probabilities_after(graph, mixed) == pytest.approx(
-        probabilities_after(graph, frames), rel=1e-9
     )
 
 

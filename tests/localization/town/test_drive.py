@@ -15,7 +15,6 @@ from pydantic import ValidationError
 
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import wrap_all
-from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.town import settings as drive_settings
 from crosscue.localization.town.drive import (
     EVENT_FIELDS,
@@ -44,7 +43,6 @@ from crosscue.localization.town.streets import (
 from crosscue.replay.columns import Floats
 from crosscue.replay.compiled import compile_function, fingerprint
 from support.arc_consistency import nees_along_the_arc
-from support.beliefs import driven, with_heading
 
 FIELD = {name: i for i, name in enumerate(DriveResult._fields)}
 TOWN = City(largest_km2=3.0)
@@ -163,20 +161,6 @@ def test_nees_of_drives_is_in_its_band(settings: TownDrive) -> None:
     low, high = mean_band(3, 400)
 
     assert low < rows[:, FIELD["nees"]].mean() < high
-
-
-@pytest.mark.parametrize("compass_deg", [20.0, 30.0])
-def test_lateral_variance_on_a_straight_drive_follows_the_range_law(compass_deg: float) -> None:
-    """The lateral variance is r * ds * D, regardless of the heading's process noise."""
-    interval_m, way_m = 2.0, 4000.0
-    r = math.radians(compass_deg / 2.0) ** 2
-    for slip in (1e-4, 1e-3):
-        belief = PoseBelief(0, np.zeros(4), np.diag([1e-6, 1e-6, 0.01, 0.1]))
-        for _ in range(round(way_m / interval_m)):
-            belief = driven(belief, interval_m, 0.0, (slip**2, slip**2, 0.2))
-            belief = with_heading(belief, 0.0, r)
-
-        assert belief.cov[1, 1] == pytest.approx(r * interval_m * way_m, rel=0.15)
 
 
 @pytest.mark.parametrize(
