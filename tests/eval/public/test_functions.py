@@ -8,36 +8,8 @@ import pytest
 import crosscue
 from crosscue.datasets.simulated.drive import dbc_path
 from crosscue.replay.errors import EmptyResultError
-from crosscue.replay.progress import Progress, watching
 from crosscue.replay.vehicle.vehicle import parse
-from support.gap_drive import Clock, write_drive
 from support.pandaset_drive import pandaset_drive
-
-
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write a drive of four seconds with ``car.toml`` and ``truth.json`` next to it."""
-    return write_drive(tmp_path_factory.mktemp("drive"), Clock(), seconds=4)
-
-
-def test_seal_check_finds_changed_log(drive: Path, tmp_path: Path) -> None:
-    logs = [tmp_path / name for name in ("a.mcap", "b.mcap")]
-    for log in logs:
-        log.write_bytes(drive.read_bytes())
-
-    sealed = crosscue.seal(*logs)
-    assert [one["is_new"] for one in sealed.as_dict()["logs"]] == [True, True]
-    again = crosscue.seal(*logs)
-    assert [one["is_new"] for one in again.as_dict()["logs"]] == [False, False]
-    content = bytearray(drive.read_bytes())
-    content[100] ^= 1
-    logs[1].write_bytes(content)
-    checked = crosscue.check(*(f"{log}.seal" for log in logs))
-
-    assert [one.exit_status for one in checked] == [0, 3]
-    assert repr(checked[1].result) == (
-        f"{logs[1]}: b.mcap: bytes 0 to {min(1 << 20, len(content))} differ from the seal"
-    )
 
 
 def test_vehicle_draft_has_published_intrinsics_and_commented_sections(tmp_path: Path) -> None:
@@ -77,34 +49,6 @@ def test_vehicle_draft_uses_intrinsics_of_calibration_message(tmp_path: Path) ->
 
     assert drafted.focal_px == pytest.approx(known.focal_px)
     assert drafted.center_px == pytest.approx(known.center_px)
-
-
-def test_runs_are_scored_together_and_failed_run_is_reported(drive: Path, tmp_path: Path) -> None:
-    run = crosscue.replay_drive(drive, tmp_path / "run", drive.parent / "car.toml")
-    gates = tmp_path / "gates.toml"
-    gates.write_text(
-        'version = 1\n[[gate]]\nmetric = "cues.stop_sign.precision"\nmin = 1.1\n', "utf-8"
-    )
-    seen: list[object] = []
-
-    with watching(seen.append):
-        found = crosscue.score_runs(
-            [run, tmp_path / "gone"],
-            drive.parent / "truth.json",
-            tmp_path / "pooled",
-            gates=gates,
-            has_figures=False,
-        )
-
-    (part,) = [one for one in seen if not isinstance(one, Progress)]
-    assert "gone: " in str(part)
-    assert str(part).endswith("; this run is left out")
-    assert [path.name for path in found.failed] == ["gone"]
-    assert found.has_failed_gate
-    assert not found.is_whole
-    assert repr(found).startswith("failed     1 of 2 runs, left out\n")
-    assert "FAILED     cues.stop_sign.precision" in repr(found)
-    assert (tmp_path / "pooled" / "junit.xml").exists()
 
 
 def test_vehicle_draft_keeps_specified_mounting(tmp_path: Path) -> None:
