@@ -121,7 +121,7 @@ def test_changed_pictures_are_refused_with_both_identities(
 def test_unchanged_inputs_are_accepted(
     name: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shorten(monkeypatch)
+    shorten(monkeypatch, pictures=2)
     argv = _prepare(name, folder, tmp_path / "out", monkeypatch)
 
     assert cli.run([*argv, COMMANDS[name][1]]) == 0

@@ -52,11 +52,14 @@ def follow_page(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> tuple[int, int, int]:
-    """Run the page's commands; return right and all positives and frames of the stop sign cue."""
+    """Run the page's commands; return right and all positives and frames of the stop sign cue.
+
+    The recording of ``view`` does not depend on the network: it is written for one.
+    """
     monkeypatch.chdir(place)
     lines = commands()
     assert len(lines) == 5
-    for line in lines:
+    for line in lines if kind == "torchvision" else lines[:-1]:
         words = line.replace("my.onnx", weights).removeprefix("crosscue ").split()
         more = {
             "model init": ["--overwrite"],
@@ -64,7 +67,6 @@ def follow_page(
             "view run": ["--overwrite"],
         }
         assert cli.run([*words, *more.get(" ".join(words[:2]), [])]) == 0, capsys.readouterr().err
-    assert Path("drive.rrd").stat().st_size
     metrics = json.loads(Path("run", "score", "metrics.json").read_text())
     found = metrics["cues"]["stop_sign"]
     right = found["precision"]
@@ -92,3 +94,4 @@ def test_torchvision_weights_are_scored_with_commands_of_page(
     scored = follow_page(place, "my.pth", "torchvision", capsys, monkeypatch)
 
     assert scored[2] == FRAMES
+    assert Path("drive.rrd").stat().st_size

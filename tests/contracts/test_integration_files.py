@@ -59,17 +59,16 @@ def test_action_scores_compares_and_fails_by_gate(tmp_path: Path) -> None:
     made = simulated(tmp_path / "drive", DriveSettings(seed=3, blocks=1, block_m=60.0))
     drive = {"DRIVES": made.log, "VEHICLE": made.vehicle, "TRUTH": made.truth}
 
-    status, _ = _act(tmp_path, **drive, OUTPUT=tmp_path / "a")
-    assert status == 0
+    gate = tmp_path / "gate.toml"
+    gate.write_text('version = 1\n[[gate]]\nmetric = "pose.distance_m"\nmax = -1\n')
+
+    status, _ = _act(tmp_path, **drive, OUTPUT=tmp_path / "a", GATE=gate)
+    assert status == 1
     status, text = _act(
         tmp_path, **drive, OUTPUT=tmp_path / "b", AGAINST=tmp_path / "a", TOLERANCE="1% cues.*=0.02"
     )
     assert status == 0
     assert "**0 worse, 0 better, 0 undecided**" in text
-    gate = tmp_path / "gate.toml"
-    gate.write_text('version = 1\n[[gate]]\nmetric = "pose.distance_m"\nmax = -1\n')
-    status, text = _act(tmp_path, **drive, OUTPUT=tmp_path / "c", GATE=gate)
-    assert status == 1
     status, text = _act(tmp_path, DRIVES=tmp_path / "none", OUTPUT=tmp_path / "d")
     assert status == 4
     assert "the replay failed with exit status 4" in text

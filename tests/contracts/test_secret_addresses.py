@@ -204,7 +204,6 @@ def test_batch_keeps_no_secret(
     replay = ["replay", f"@{drive_list}", *car, "-o", "runs", "--no-cache", "--workers", "2"]
 
     assert crosscue(replay) == 3
-    assert crosscue(replay) == 3
     assert crosscue([*replay, "--json"]) == 3
     for line in ("status runs", "merge runs -o merged", "tag runs a=b", "history runs"):
         crosscue(line.split())

@@ -1,5 +1,6 @@
 """Boxes: suppression, choice of proposals, pooling and drawn labels."""
 
+import copy
 from collections import OrderedDict
 
 import numpy as np
@@ -37,6 +38,7 @@ def test_suppression_keeps_the_best_of_overlapping_boxes() -> None:
 
 
 SIZE_PX = (96, 128)
+RPN = build_network(plan_of()).eval().rpn
 
 
 @given(
@@ -55,7 +57,7 @@ def test_selected_boxes_and_their_order_match_torchvision(
     halves = rng.exponential(spread_px / 2.0, (total, 2)) * (rng.random((total, 1)) > 0.1)
     boxes = torch.from_numpy(np.hstack([middles - halves, middles + halves]).astype(np.float32))
     logits = torch.from_numpy(rng.normal(0.0, 2.0, total).astype(np.float32))
-    rpn = build_network(plan_of()).eval().rpn
+    rpn = copy.deepcopy(RPN)
     rpn._pre_nms_top_n["testing"], rpn._post_nms_top_n["testing"] = 1000, max_count
     rpn.score_thresh = floor
 

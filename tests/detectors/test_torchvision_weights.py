@@ -3,6 +3,7 @@
 import argparse
 import io
 import os
+import shutil
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -248,6 +249,14 @@ def test_damaged_weights_are_refused_on_one_line(
     assert message in refusal((1, 2), "model", "init", tmp_path / name)
 
 
+@pytest.fixture(scope="module")
+def hollow_card(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The card of weights that are all zero."""
+    path = tmp_path_factory.mktemp("hollow") / "my.pth"
+    torch.save(hollow("ssdlite320_mobilenet_v3_large", 4), path)
+    return crosscue.draft_card(path, class_names=NAMES).path
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -268,11 +277,11 @@ def test_damaged_weights_are_refused_on_one_line(
     ],
 )
 def test_card_that_contradicts_its_weights_is_refused(
-    tmp_path: Path, old: str, new: str, message: str
+    tmp_path: Path, hollow_card: Path, old: str, new: str, message: str
 ) -> None:
-    torch.save(hollow("ssdlite320_mobilenet_v3_large", 4), tmp_path / "my.pth")
-    card = crosscue.draft_card(tmp_path / "my.pth", class_names=NAMES).path
-    text = card.read_text(encoding="utf-8")
+    shutil.copy(hollow_card.with_suffix(".pth"), tmp_path)
+    card = tmp_path / hollow_card.name
+    text = hollow_card.read_text(encoding="utf-8")
     assert old in text
     card.write_text(text.replace(old, new), encoding="utf-8")
 

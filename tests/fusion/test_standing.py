@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Final
 
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from crosscue.fusion.approaches import Approaches, Step
@@ -101,6 +101,7 @@ def believed(frames: Sequence[FrameEvidence], fusion: Fusion) -> list[Step]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=40)
 @given(
     moves=st.lists(MOVES, min_size=2, max_size=12),
     at=st.integers(1, 12),
@@ -129,6 +130,7 @@ def test_length_of_a_pause_changes_nothing(
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=40)
 @given(
     moves=st.lists(st.floats(0.2, 6.0), min_size=5, max_size=12),
     pause=st.lists(st.tuples(st.just(LIGHT), *LOOKS_OF_RANGES), min_size=1, max_size=4),

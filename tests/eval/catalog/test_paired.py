@@ -92,7 +92,7 @@ def test_recommended_number_of_places_has_stated_power() -> None:
         values = 0.5 + shift + rng.normal(0.0, 0.1, drives)
         return [DriveMetric(str(i), path, "mean", 10.0 * v, 10) for i, v in enumerate(values)]
 
-    opened = [compare_drives(parts(12, 0.0), parts(12, 0.06))[0] for _ in range(200)]
+    opened = [compare_drives(parts(12, 0.0), parts(12, 0.06))[0] for _ in range(TIMES // 2)]
     more = [paired._more_places(one.could_see, 0.06, 12) or 0 for one in opened]
     recommended = 12 + int(np.median(more))
     detected = [
@@ -116,7 +116,7 @@ def test_detectable_difference_is_found_in_four_of_five_comparisons(
             values(rng, places, metrics, 0.0), values(rng, places, metrics, loss)
         )[0]
 
-    stated = [compared(0.0).could_see for _ in range(TIMES)]
+    stated = [compared(0.0).could_see for _ in range(TIMES // 2)]
     found = np.mean([compared(loss).verdict == "worse" for loss in stated])
 
     assert found == pytest.approx(0.8, abs=0.1)

@@ -11,6 +11,7 @@ from crosscue.datasets.scenes.drive import write_scene
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval.cli import run
+from support.scenes import shorten
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +35,9 @@ residual_sd_m = 6.0
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated drive with small pictures, and a run over it."""
     folder = tmp_path_factory.mktemp("drive")
-    write_scene(folder, SceneSettings("A", camera=SceneCamera(width_px=192, height_px=108)))
+    with pytest.MonkeyPatch.context() as patch:
+        shorten(patch, pictures=90)
+        write_scene(folder, SceneSettings("A", camera=SceneCamera(width_px=192, height_px=108)))
     text = (folder / "vehicle.toml").read_text()
     text = text[: text.index("[camera]")] if "[ranges" in text else text
     (folder / "vehicle.toml").write_text(text + DETECTORS.format(objects=folder / "objects.json"))

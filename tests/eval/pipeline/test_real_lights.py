@@ -66,9 +66,9 @@ def test_dark_lights_of_a_queue_are_found_though_one_box_of_78_frames_is_sure(
 @pytest.mark.slow
 @pytest.mark.usefixtures("network")
 def test_road_without_lights_and_signs_has_none(tmp_path: Path) -> None:
-    pictures = sorted(shared("sequences", "kitti_t_junction", "image_0").glob("*.jpg"))
+    pictures = sorted(shared("sequences", "kitti_t_junction", "image_0").glob("*.jpg"))[::2]
 
-    drive = replayed(tmp_path, pictures, 9.64)
+    drive = replayed(tmp_path, pictures, 4.82)
 
     assert positive(drive, "traffic_light") == positive(drive, "stop_sign") == 0
 

@@ -191,7 +191,7 @@ def _assert_equal(one: dict[str, list[object]], other: dict[str, list[object]]) 
 
 
 @pytest.mark.slow
-@settings(max_examples=4, phases=[Phase.explicit, Phase.reuse, Phase.generate])
+@settings(max_examples=2, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(
     cut=st.integers(40, 95),
     by_ms=st.one_of(st.integers(-4_000_000, -350), st.integers(1_100, 4_000_000)),
