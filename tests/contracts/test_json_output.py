@@ -69,7 +69,7 @@ MADE: Final[dict[str, tuple[str, int]]] = {
     "truth": ("KITTI -o its_truth", 0),
     "truth import": ("road/coco.json --log LOG -o imported.json", 0),
     "simulate": ("A -o simulated --width 64 --fps 10", 0),
-    "study landmarks": ("-o marks --settings STUDY --drives 1", 0),
+    "study landmarks": ("-o marks --drives 1", 0),
     "train frames": ("L400 -o frames --per-layout 1 --width 64", 0),
     "train road": (
         "--data road -o road.safetensors --steps 1 --batch 1 --width 128 --device cpu",
@@ -81,12 +81,6 @@ MADE: Final[dict[str, tuple[str, int]]] = {
         0,
     ),
 }
-STUDY: Final = """version = 1
-kind = "landmarks"
-densities_per_km2 = [1.0]
-detection_rates = [0.6]
-points = []
-"""
 # A single thing in the plural: "1 drives". Verbs and units that end with s are none.
 ONE_OF_MANY: Final = re.compile(
     r"(?<![\w.,+-])(?<!of )1 (?!(?:is|has|was|as|ms|ns|us|s|means|differs)\b)[a-z]+s\b"
@@ -151,9 +145,7 @@ def test_json_of_creating_commands_is_one_strict_document(
     _write_road(tmp_path / "road")
     write_crossing(tmp_path / "streets.osm")
     (tmp_path / "net.onnx").write_bytes(bright_box_model())
-    (tmp_path / "study.toml").write_text(STUDY)
     places = {
-        "STUDY": "study.toml",
         "LOG": str(log),
         "COMPASS": str(compass.log),
         "ITS_CAR": str(compass.vehicle),
