@@ -21,14 +21,14 @@ import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
 from crosscue.detectors.boxes import box_ious
-from crosscue.detectors.ranging.standard_sizes import VEHICLES
-from crosscue.detectors.ranging.vehicle_range import (
+from crosscue.detectors.ranging.detection_range import (
     GroundCamera,
     OneRange,
     ground_range,
     size_range,
     vehicle_range,
 )
+from crosscue.detectors.ranging.standard_sizes import VEHICLES
 from crosscue.eval.runs.folder import open_run
 from crosscue.replay.columns import Floats
 

@@ -28,10 +28,50 @@ from crosscue.replay.decode.ros.walk import Bools, Cursor, FieldPositions, Place
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 
-from .copy_ranges import copy_ranges
 from .definitions import as_ros2, differs_in_ros2, text_of
 from .outgoing import Outgoing, Ros2Type
 from .template import ENCAPSULATION
+
+# Max number of different lengths for copies length by length; with more, copies are single.
+FEW_LENGTHS: Final = 32
+# Mean size in bytes from which single copies are as fast.
+LARGE: Final = 4096
+
+
+def copy_ranges(
+    target: NDArray[np.uint8],
+    target_start: NDArray[np.int64],
+    source: NDArray[np.uint8],
+    source_start: NDArray[np.int64],
+    length: NDArray[np.int64],
+) -> None:
+    """Copy N ranges of bytes; ranges of one length are copied together if there are few lengths."""
+    if not len(length):
+        return
+    mean = int(length.sum()) // len(length)
+    are_equal = bool((length == length[0]).all())
+    lengths = length[:1] if are_equal or mean >= LARGE else np.unique(length)
+    if mean >= LARGE or len(lengths) > FEW_LENGTHS:
+        to, of = target.data, source.data
+        rows = zip(target_start.tolist(), source_start.tolist(), length.tolist(), strict=True)
+        for put, take, size in rows:
+            to[put : put + size] = of[take : take + size]
+        return
+    for size in lengths.tolist():
+        if size == 0:
+            continue
+        rows_ = slice(None) if len(lengths) == 1 else length == size
+        to_view, of_view = _windows(target, size), _windows(source, size)
+        to_view[target_start[rows_]] = of_view[source_start[rows_]]
+
+
+def _windows(buffer: NDArray[np.uint8], width: int) -> NDArray[np.void]:
+    """Return a view of a buffer with an item of ``width`` bytes at every position."""
+    view: NDArray[np.void] = np.ndarray(
+        (len(buffer) - width + 1,), f"V{width}", buffer.data, strides=(1,)
+    )
+    return view
+
 
 HEAD: Final = len(ENCAPSULATION)
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.replay.base import EVERYTHING, Log, Selection, name_of, report_missing
 from crosscue.replay.clocks.findings import (
@@ -21,16 +22,48 @@ from crosscue.replay.clocks.findings import (
     instant_text,
 )
 from crosscue.replay.clocks.reports import ClockReport, ClockWatch
-from crosscue.replay.columns import Block, CanFrames, Messages, Topic
+from crosscue.replay.columns import Block, CanFrames, Images, Messages, Topic
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Detail, Ledger, TopicAccount
-from crosscue.replay.logs.copies import copies
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.seal.log import sealed_sentence
 from crosscue.replay.vehicle.roles import Role, role_of
 
 if TYPE_CHECKING:
     from crosscue.replay.decode import Decoder
+
+
+def copies(block: Block) -> int:
+    """Return the number of rows that are exact copies of the row before.
+
+    The stamp is that of the sensor where it is set; a recorder may store a copy a moment later.
+    """
+    same = np.diff(block.log_ns) == 0
+    if block.header_ns is not None:
+        is_set = block.header_ns[1:] > 0
+        same = np.where(is_set, np.diff(block.header_ns) == 0, same)
+    if not same.any():
+        return 0
+    rows = block.rows
+    if isinstance(rows, Messages | Images):
+        messages = rows.bytes_ if isinstance(rows, Images) else rows
+        same &= np.diff(messages.stop - messages.start) == 0
+        at = np.flatnonzero(same).tolist()
+        return sum(messages.payload(i) == messages.payload(i + 1) for i in at)
+    columns = _can(rows) if isinstance(rows, CanFrames) else rows.columns.values()
+    for column in columns:
+        equal = (column[1:] == column[:-1]) | ((column[1:] != column[1:]) & _nan(column[:-1]))
+        same &= equal.reshape(len(same), -1).all(axis=1)
+    return int(same.sum())
+
+
+def _can(rows: CanFrames) -> Iterator[NDArray[np.generic]]:
+    yield from (rows.arbitration_id, rows.is_extended, rows.kind, rows.length, rows.data)
+
+
+def _nan(column: NDArray[np.generic]) -> NDArray[np.bool_]:
+    return np.asarray(column != column, np.bool_)
+
 
 CAN_IDS_SHOWN: Final = 10
 _CAN_IDS_COUNTED: Final = 100_000

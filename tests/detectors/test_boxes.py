@@ -16,8 +16,7 @@ from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.boxes import box_ious, non_maximum_suppression
 from crosscue.detectors.label_images import CLASSES, LabelledObject, label_image, objects
 from crosscue.detectors.networks.mask_rcnn.network import build_network
-from crosscue.detectors.networks.mask_rcnn.nms import likeliest_apart
-from crosscue.detectors.networks.mask_rcnn.roi_align import Pooler
+from crosscue.detectors.networks.mask_rcnn.parts import Pooler, likeliest_apart
 from support.mask_rcnn import plan_of
 
 

@@ -24,13 +24,13 @@ from crosscue.detectors.networks.mask_rcnn.cpu import MIN_PIXELS, Halved, Winogr
 from crosscue.detectors.networks.mask_rcnn.detector import (
     MaskRcnnDetector,
     MaskRcnnSettings,
+    ScreenedParts,
     detector_of,
     laid_in,
     place_picture,
 )
 from crosscue.detectors.networks.mask_rcnn.network import build_network
 from crosscue.detectors.networks.mask_rcnn.parts import TorchParts, as_input
-from crosscue.detectors.networks.mask_rcnn.screening import ScreenedParts
 from support.mask_rcnn import CPU, noise_frame, plan_of, random_checkpoint
 
 BACKENDS = ("torch", "openvino")

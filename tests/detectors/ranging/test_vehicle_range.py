@@ -8,19 +8,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from crosscue.detectors.ranging.detection_range import detection_range
-from crosscue.detectors.ranging.ground_plane import GroundPlane, turned
-from crosscue.detectors.ranging.standard_sizes import VEHICLES, SizePrior
-from crosscue.detectors.ranging.vehicle_range import (
+from crosscue.detectors.ranging.detection_range import (
     CAMERA_HEIGHT_SD,
     EDGE_FRACTION,
     EDGE_PX,
     OVERHANG_M,
     GroundCamera,
+    detection_range,
     ground_range,
     size_range,
     vehicle_range,
 )
+from crosscue.detectors.ranging.ground_plane import GroundPlane, turned
+from crosscue.detectors.ranging.standard_sizes import VEHICLES, SizePrior
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle, parse
 
 CAMERA = GroundCamera(focal_px=1500.0, height_m=1.5)

@@ -16,8 +16,7 @@ from crosscue.eval.quality.spec import read_spec, spec_faults, write_spec
 from crosscue.eval.quality.verdict import LogCheck
 from crosscue.replay.columns import Block, CanFrames, Messages, Table
 from crosscue.replay.errors import UnknownFormatError, UsageError
-from crosscue.replay.logs.copies import copies
-from crosscue.replay.logs.log_summary import LogSummary, summarise_log
+from crosscue.replay.logs.log_summary import LogSummary, copies, summarise_log
 from crosscue.replay.losses import losses_heard
 from support.kitti_odometry_drive import kitti_odometry_drive
 from support.quality_logs import Drive, Streams, log_of, streams_of

@@ -26,8 +26,7 @@ from crosscue.detectors.images import Encoded
 from crosscue.eval.recording import save_rrd
 from crosscue.eval.recording.anchored import motion_px
 from crosscue.eval.recording.camera import shown
-from crosscue.eval.recording.labels import label_places, labelled
-from crosscue.eval.recording.marks import Overlays
+from crosscue.eval.recording.marks import Overlays, label_places, labelled
 from crosscue.eval.recording.notes import inert
 from crosscue.eval.recording.plan import log_landmarks
 from crosscue.eval.runs.folder import RunFolder

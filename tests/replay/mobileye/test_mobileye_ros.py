@@ -13,8 +13,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.layout import layout
-from crosscue.replay.mobileye.ros.reader import RosMobileye
-from crosscue.replay.mobileye.ros.sign import VOTES_WANTED
+from crosscue.replay.mobileye.ros.reader import VOTES_WANTED, RosMobileye
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from support.mobileye_frames import (
     MS,

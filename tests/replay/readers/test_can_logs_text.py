@@ -17,7 +17,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.can_text.dialect import NOT_UNDERSTOOD
 from crosscue.replay.readers.can_text.lines import Lines, Tail, read_lines
-from crosscue.replay.readers.can_text.message_numbers import GO_BACK, MISFIT, MISSING
+from crosscue.replay.readers.can_text.trc import GO_BACK, MISFIT, MISSING
 from crosscue.replay.readers.text_log import MAX_LINE, Row, TextLog
 from support.can_files import Sent, assert_equal_to_python_can, random_frames, read_back, trc
 from support.data import shared
