@@ -1,18 +1,16 @@
-"""Read and write the formats of labelling tools: COCO, CVAT, YOLO, FiftyOne and Label Studio.
+"""Read and write the formats of labelling tools: COCO, CVAT, YOLO and FiftyOne.
 
 YOLO is that of Ultralytics: ``data.yaml``, ``labels/NAME.txt``, ``images``. Subsets in separate
 folders (``labels/train``), as exported by FiftyOne and CVAT, can also be read, and so can Darknet's
-``obj_train_data``, CVAT's "YOLO 1.1". Label Studio has ``tasks.json`` with predictions, and
-the labelling interface to paste into a project.
+``obj_train_data``, CVAT's "YOLO 1.1".
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, TypeAlias
-from xml.sax.saxutils import quoteattr
 
 from crosscue.datasets.truth.annotations import (
     Annotation,
@@ -151,115 +149,6 @@ def _fiftyone_thing(row: Any, classes: list[Any], size: tuple[int, int], where: 
         ) from None
 
 
-TASKS_FILE = "tasks.json"
-CONFIG = "interface.xml"
-LOCAL = "/data/local-files/?d="
-UNLABELLED = "tasks without an annotation"
-
-
-def write_label_studio(folder: Path, labels: Annotations) -> Path:
-    """Write tasks with boxes as predictions, and the labelling interface to paste into a project.
-
-    Raises:
-        OutputError: A file cannot be written.
-    """
-    tasks = []
-    for picture in labels.pictures:
-        wide, high = picture.size_px
-        results = []
-        for number, (thing, (x0, y0, x1, y1)) in enumerate(picture.boxes()):
-            value = {
-                "x": 100.0 * x0 / wide,
-                "y": 100.0 * y0 / high,
-                "width": 100.0 * (x1 - x0) / wide,
-                "height": 100.0 * (y1 - y0) / high,
-                "rotation": 0,
-                "rectanglelabels": [thing.label],
-            }
-            row = {
-                "id": f"{picture.t_ns}-{number}",
-                "from_name": "label",
-                "to_name": "image",
-                "type": "rectanglelabels",
-                "original_width": wide,
-                "original_height": high,
-                "image_rotation": 0,
-                "value": value,
-            }
-            results.append(row if thing.score is None else row | {"score": thing.score})
-        size = {"width": wide, "height": high, "t_ns": picture.t_ns}
-        data = {"image": f"{LOCAL}images/{picture.name}", **size}
-        predictions = [{"model_version": "crosscue", "result": results}]
-        tasks.append({"data": data, "predictions": predictions})
-    write_text(folder / TASKS_FILE, strict_json(tasks) + "\n")
-    names = "".join(f"<Label value={quoteattr(name)}/>" for name in labels.labels)
-    boxes = f'<RectangleLabels name="label" toName="image">{names}</RectangleLabels>'
-    write_text(folder / CONFIG, f'<View><Image name="image" value="$image"/>\n{boxes}\n</View>\n')
-    return folder / TASKS_FILE
-
-
-def read_label_studio(path: Path) -> Annotations:
-    """Read a JSON export of Label Studio; unconfirmed predictions are not labels.
-
-    Raises:
-        AnnotationError: The file cannot be read.
-    """
-    file = path / TASKS_FILE if path.is_dir() else path
-    tasks = _tree(file)
-    if not isinstance(tasks, list) or not all(isinstance(task, dict) for task in tasks):
-        raise AnnotationError(f"{file}: expected a list of tasks, as Label Studio exports JSON")
-    pictures: list[Picture] = []
-    ignored: dict[str, int] = {}
-    for number, task in enumerate(tasks):
-        picture = _studio_picture(task, f"{file}: task {task.get('id', number)}", ignored)
-        if picture is not None:
-            pictures.append(picture)
-    used = dict.fromkeys(thing.label for one in pictures for thing in one.things)
-    return Annotations(str(file), tuple(sorted(used)), tuple(pictures), ignored)
-
-
-def _studio_picture(task: Mapping[str, Any], where: str, ignored: dict[str, int]) -> Picture | None:
-    done = task.get("annotations")
-    kept = [
-        one
-        for one in (done if isinstance(done, list) else [])
-        if isinstance(one, dict) and not one.get("was_cancelled")
-    ]
-    if not kept:
-        ignored[UNLABELLED] = ignored.get(UNLABELLED, 0) + 1
-        return None
-    try:
-        data, results = task["data"], kept[-1]["result"]
-        name = str(data["image"]).replace("\\", "/").rpartition("/")[2].rpartition("=")[2]
-        t_ns = data.get("t_ns")
-        sizes = [(row["original_width"], row["original_height"]) for row in _rectangles(results)]
-        size = sizes[0] if sizes else (data.get("width", 0), data.get("height", 0))
-        wide, high = int(size[0]), int(size[1])
-        things = tuple(_studio_thing(row, (wide, high), where) for row in _rectangles(results))
-    except (KeyError, TypeError, ValueError, IndexError):
-        raise AnnotationError(
-            f"{where}: expected data.image and rectangles with original_width, x, y, width, height"
-        ) from None
-    for row in results:
-        if row not in list(_rectangles(results)):
-            kind = str(row.get("type", "something"))
-            ignored[kind] = ignored.get(kind, 0) + 1
-    return Picture(name, (wide, high), int(t_ns) if t_ns is not None else None, None, things)
-
-
-def _rectangles(results: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    for row in results:
-        if row.get("type") == "rectanglelabels" and not row["value"].get("rotation"):
-            yield row
-
-
-def _studio_thing(row: Mapping[str, Any], size: tuple[int, int], where: str) -> Annotation:
-    value = row["value"]
-    x, y, w, h = (float(value[name]) / 100.0 for name in ("x", "y", "width", "height"))
-    box = _in_pixels(x, y, x + w, y + h, size)
-    return Annotation(str(value["rectanglelabels"][0]), box, place=where)
-
-
 MAX_BYTES: Final = 512 << 20
 
 
@@ -280,15 +169,12 @@ class LabelFormat:
     title: str
 
 
-ToolFormat: TypeAlias = Literal["coco", "cvat", "yolo", "fiftyone", "labelstudio"]
+ToolFormat: TypeAlias = Literal["coco", "cvat", "yolo", "fiftyone"]
 LABEL_FORMATS: Final[dict[ToolFormat, LabelFormat]] = {
     "coco": LabelFormat(write_coco, lambda path, _: read_coco(path), "images", "COCO"),
     "cvat": LabelFormat(write_cvat, lambda path, _: read_cvat(path), "images", "CVAT 1.1"),
     "yolo": LabelFormat(write_yolo, read_yolo, "images", "YOLO"),
     "fiftyone": LabelFormat(write_fiftyone, read_fiftyone, "data", "FiftyOne"),
-    "labelstudio": LabelFormat(
-        write_label_studio, lambda path, _: read_label_studio(path), "images", "Label Studio"
-    ),
 }
 
 
@@ -325,10 +211,6 @@ def _recognised(path: Path) -> ToolFormat:
     if suffix in (".xml", ".yaml"):
         return "cvat" if suffix == ".xml" else "yolo"
     if suffix != ".json":
-        raise UsageError(
-            f"{path}: expected COCO, FiftyOne or Label Studio (.json), CVAT (.xml), or a folder"
-        )
+        raise UsageError(f"{path}: expected COCO or FiftyOne (.json), CVAT (.xml), or a folder")
     tree = _tree(path)
-    if isinstance(tree, list):
-        return "labelstudio"
     return "fiftyone" if isinstance(tree, dict) and "labels" in tree else "coco"

@@ -144,8 +144,8 @@ def import_truth(
 ) -> ImportedTruth | ImportedLabels:
     """Import annotations of labelling tools as truth.
 
-    Supported formats are COCO, FiftyOne and Label Studio (.json), CVAT for images or video, XML 1.1
-    (.xml), and folders of YOLO and FiftyOne. Pictures are matched to frames by t_ns, by file name,
+    Supported formats are COCO and FiftyOne (.json), CVAT for images or video, XML 1.1 (.xml), and
+    folders of YOLO and FiftyOne. Pictures are matched to frames by t_ns, by file name,
     or by frame number. With --export, they are matched by the export, which may contain many
     drives: the truth file of each is written below the output folder, and coco.json there contains
     all pictures, for training.

@@ -1,10 +1,9 @@
 """Formats of labelling tools preserve boxes, labels and times when written and read."""
 
-import json
 import os
 import tracemalloc
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pytest
 
@@ -30,16 +29,6 @@ def labels() -> Annotations:
     return Annotations("worst.parquet", names, pictures)
 
 
-def confirm_predictions(path: Path) -> Path:
-    """Turn predictions into annotations, as Label Studio does once a person confirms them."""
-    tree = json.loads(path.read_text())
-    if isinstance(tree, list):
-        for task in tree:
-            task["annotations"] = [{"result": task["predictions"][0]["result"]}]
-        path.write_text(json.dumps(tree))
-    return path
-
-
 def times(read: Annotations) -> dict[int, Picture]:
     found = {}
     for one in read.pictures:
@@ -56,7 +45,6 @@ def test_written_labels_are_read_back_unchanged(
 ) -> None:
     wrote = labels()
     path = LABEL_FORMATS[name].write(tmp_path, wrote)
-    path = confirm_predictions(path) if path.suffix == ".json" else path
 
     sizes = {Path(one.name).stem: one.size_px for one in wrote.pictures}
     read = read_tool_labels(path, sizes, name if is_named else None)
@@ -85,29 +73,6 @@ def test_damaged_labels_are_refused_with_file_name(
     with pytest.raises(CrosscueError, match=r"^[^\n]*$") as caught:
         read_tool_labels(path, {"*": SIZE}, name)
     assert str(tmp_path) in str(caught.value)
-
-
-def test_unconfirmed_predictions_are_not_read_as_labels(tmp_path: Path) -> None:
-    path = LABEL_FORMATS["labelstudio"].write(tmp_path, labels())
-
-    read = read_tool_labels(path, {})
-    assert not read.pictures
-    assert read.ignored == {"tasks without an annotation": 2}
-
-
-def test_last_annotation_not_cancelled_is_read(tmp_path: Path) -> None:
-    path = LABEL_FORMATS["labelstudio"].write(tmp_path, labels())
-    tasks: list[dict[str, Any]] = json.loads(path.read_text())
-    result = tasks[0]["predictions"][0]["result"]
-    tasks[0]["annotations"] = [
-        {"result": []},
-        {"result": result[:1]},
-        {"result": result, "was_cancelled": True},
-    ]
-    path.write_text(json.dumps(tasks[:1]))
-
-    (picture,) = read_tool_labels(path, {}).pictures
-    assert [thing.label for thing in picture.things] == ["stop sign"]
 
 
 @pytest.mark.parametrize(

@@ -211,10 +211,7 @@ def test_product_parses_json_toml_and_yaml_only_in_tree_text() -> None:
 
 
 ENDLESS = Path("/dev/zero")
-LABELS = [
-    partial(read_tool_labels, sizes={}, kind=kind)
-    for kind in ("coco", "cvat", "fiftyone", "labelstudio")
-]
+LABELS = [partial(read_tool_labels, sizes={}, kind=kind) for kind in ("coco", "cvat", "fiftyone")]
 
 
 @given(content=st.binary(max_size=40), max_count=st.integers(0, 40))
