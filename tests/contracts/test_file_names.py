@@ -25,13 +25,10 @@ from crosscue.replay.files.tree_text import spelled, unspelled
 from support.gap_drive import VEHICLE, Clock, write_drive
 
 HOSTILE: Final[dict[str, bytes]] = {
-    "not UTF-8, with line ends": b"\xff\xfe caf\xe9\n\ntwo",
-    "quotes and backslashes": b'it\'s "quoted" a\\b\\\\c\\',
-    "looks spelled or formatted": b"\\xff\\\\x41\\n 100%25 %s",
-    "blanks and emoji": "  two  blanks \U0001f697\u200d\U0001f525 ".encode(),
-    "composed and decomposed": "".join(
-        unicodedata.normalize(form, "café") for form in ("NFC", "NFD")
-    ).encode(),
+    "not UTF-8, with line ends and backslashes": b"\xff\xfe caf\xe9\n\ntwo a\\b\\\\c\\",
+    "looks spelled or formatted, with quotes": b'it\'s "quoted" \\xff\\\\x41\\n 100%25 %s',
+    "blanks, emoji, composed and decomposed": "  two  blanks \U0001f697\u200d\U0001f525 ".encode()
+    + "".join(unicodedata.normalize(form, "café") for form in ("NFC", "NFD")).encode(),
     "markup and control": b"$\\frac$ <img src=x>&amp; \x1b[31m\x7f\xc2\x85\xe2\x80\xa8",
 }
 

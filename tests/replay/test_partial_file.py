@@ -120,7 +120,7 @@ def test_run_after_kill_leaves_no_partial_files(
     tmp_path: Path, command: Callable[[Path], list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Forked processes inherit the patch.
-    scenes.shorten(monkeypatch)
+    scenes.shorten(monkeypatch, pictures=5)
     argv = command(tmp_path)
     out = tmp_path / "out"
     count = len(faults.operations(out, faults.CHANGES, argv))

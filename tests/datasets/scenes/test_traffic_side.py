@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -21,6 +22,7 @@ from crosscue.replay.vehicle.vehicle import parse
 OWN: Final[dict[Side, float]] = {"right": -1.0, "left": 1.0}
 
 
+@cache
 def things(layout: Layout) -> tuple[SceneObject, ...]:
     return build_world(layout, conditions_of(layout, 1), is_painted=False).things
 

@@ -19,7 +19,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write two short drives and one whose log is not a recording."""
     folder = tmp_path_factory.mktemp("drives")
     for name, seed in (("monday", 1), ("tuesday", 2)):
-        write_drive(folder / name, DriveSettings(seed=seed))
+        write_drive(folder / name, DriveSettings(seed=seed, blocks=2))
     shutil.copytree(folder / "monday", folder / "broken")
     (folder / "broken" / "drive.mcap").write_bytes(b"junk")
     return folder

@@ -16,7 +16,7 @@ from crosscue.eval.runs.manifest import MergedManifest
 @pytest.fixture
 def drives(tmp_path: Path) -> Path:
     for name, seed in (("monday", 1), ("tuesday", 2)):
-        write_drive(tmp_path / "drives" / name, DriveSettings(seed=seed))
+        write_drive(tmp_path / "drives" / name, DriveSettings(seed=seed, blocks=2))
     return tmp_path / "drives"
 
 

@@ -64,7 +64,7 @@ def _pair(
         return Path(runs["a"][0]), Path(runs["b"][0])
     for name, paths in runs.items():
         to = ["-o", str(tmp_path / f"scores-{name}")] if drives > 1 else []
-        assert cli.run(["score", *paths, *to, "-q"]) == 0
+        assert cli.run(["score", *paths, *to, "-q", "--without-figures"]) == 0
     if drives == 1:
         return Path(runs["a"][0]), Path(runs["b"][0])
     return tmp_path / "scores-a", tmp_path / "scores-b"

@@ -28,7 +28,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Some short drives, one of which is not a recording."""
     folder = tmp_path_factory.mktemp("place") / "drives"
     for i in range(DRIVES):
-        write_drive(folder / f"D-{i}", DriveSettings(seed=i, block_m=40.0))
+        write_drive(folder / f"D-{i}", DriveSettings(seed=i, blocks=2, block_m=40.0))
     (folder / "D-3" / "drive.mcap").write_bytes(b"junk")
     return folder
 

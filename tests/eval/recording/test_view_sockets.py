@@ -60,7 +60,7 @@ def _are_free(ports: tuple[int, ...]) -> bool:
 @pytest.mark.slow
 @pytest.mark.skipif(not _are_free(PORTS), reason="another viewer is open on this machine")
 def test_web_viewer_listens_on_loopback_only_and_ends_with_the_command(tmp_path: Path) -> None:
-    drive = write_drive(tmp_path / "drive", DriveSettings(seed=1))
+    drive = write_drive(tmp_path / "drive", DriveSettings(seed=1, blocks=2))
     run = tmp_path / "run"
     replay = ["replay", str(drive.log), "--vehicle", str(drive.vehicle), "-o", str(run), "-q"]
     assert cli.run(replay) == 0

@@ -21,6 +21,7 @@ from crosscue.eval.runs.tables.columns import (
     arrow_schema,
 )
 from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS
+from support.scenes import shorten
 
 TABLES = [*INDEXED.items(), *OF_RUN.items(), *OF_SCORE.items(), *QUERIED.items()]
 
@@ -58,7 +59,9 @@ class Whole(crosscue.BoxDetector):
 def tables(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pa.Schema]:
     """Schemas of all tables of a scored run of a simulated scene."""
     folder = tmp_path_factory.mktemp("run")
-    files = crosscue.simulate_approach(folder / "scene", width_px=320)
+    with pytest.MonkeyPatch.context() as patch:
+        shorten(patch, pictures=40)
+        files = crosscue.simulate_approach(folder / "scene", width_px=320)
     run = crosscue.replay_drive(files.log, folder / "run", detectors=[Whole])
     crosscue.score_run(run, files.truth, has_figures=False)
     found = (folder / "run").rglob("*.parquet")
