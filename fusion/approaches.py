@@ -405,30 +405,38 @@ class Approaches:
         ranged = {**signs, **{o.reference: (o.range_m, o.var_m2) for o in evidence.posteriors}}
         taken = {row.reference for row in ranges if row.measured_m is not None}
         ranged = {reference: one for reference, one in ranged.items() if reference in taken}
-        messages = current.model(
-            replace(
-                self._situation(evidence, confirmed.counts, moved, self._to_start(ranged)),
-                is_established=current.belief.is_established,
-                is_near=is_near,
-                may_dissent=may_dissent,
-                range_m=None if best is None else best.mean_m,
-            )
+        situation = replace(
+            self._situation(evidence, confirmed.counts, moved, self._to_start(ranged)),
+            is_established=current.belief.is_established,
+            is_near=is_near,
+            may_dissent=may_dissent,
+            range_m=None if best is None else best.mean_m,
         )
+        self._believe(current, situation)
         silent = confirmed.silent
         if isinstance(current.model, PersistentMessageModel):
             silent = {**silent, **current.model.silent}
         self._count_silent(silent)
-        was_established = current.belief.is_established
-        belief = multiply(current.belief, messages)
-        withdrawn = None if self._over_drive is None else self._fusion.withdrawn
-        belief = establish(belief, self._graph, self._fusion.established, withdrawn)
-        current.belief = belief
-        if belief.is_established and not was_established:
+        belief = current.belief
+        if belief.is_established and not situation.is_established:
             self.counts["approaches established"] += 1
         now = probabilities(belief, self._graph)
         return Step(
             evidence.t_ns, current.number, counts, ranges, now, belief.is_established, silent
         )
+
+    def _believe(self, current: _Open, situation: Situation) -> None:
+        """Update the belief; what waited for an intersection counts in its first frame, too."""
+        model = current.model
+        withdrawn = None if self._over_drive is None else self._fusion.withdrawn
+        belief = multiply(current.belief, model(situation))
+        belief = establish(belief, self._graph, self._fusion.established, withdrawn)
+        current.belief = belief
+        is_first = belief.is_established and not situation.is_established
+        if is_first and isinstance(model, PersistentMessageModel):
+            waiting = {cue: situation.counts[cue] for cue in model.silent}
+            again = replace(situation, counts=waiting, is_established=True)
+            self._believe(current, replace(again, moved_m=0.0, passed_s=0.0))
 
     def _situation(
         self,

@@ -360,3 +360,24 @@ def test_surer_look_from_the_same_place_counts_up_to_what_it_says() -> None:
     steps = shape_of(dict(enumerate(seen)), len(seen), 0.0)
     believed = [log_odds(step.probabilities["left"]) for step in steps]
     assert believed == pytest.approx([2.1, 3.0, 4.0, 4.0, 4.0, 4.0, 4.0])
+
+
+def test_what_establishes_the_intersection_comes_first_within_a_frame() -> None:
+    """A camera of one picture a second sees the road ahead and the side street once, together."""
+    fusion = Vehicle(version=1).fusion
+    counts = {"road_left": 1, "road_straight": 1}
+    sure = {"road_left": 1.5, "road_straight": 1.5}
+    both, ahead_only, unsure = (
+        fusion_steps([replace(FrameEvidence(0, None, 0.0, (), counts), weights=weights)], fusion)
+        for counts, weights in (
+            (counts, sure),
+            ({"road_straight": 1}, sure),
+            (counts, sure | {"road_left": 0.9}),
+        )
+    )
+    message = log_odds(fusion.cues["road_straight"].precision)
+    assert log_odds(both[0].probabilities["straight"]) == pytest.approx(1.5 * message)
+    assert not both[0].not_believed
+    assert ahead_only[0].approach is None
+    assert unsure[0].probabilities["straight"] == 0.5
+    assert unsure[0].not_believed == {"road_straight": "no intersection established"}
