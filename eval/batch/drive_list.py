@@ -20,10 +20,9 @@ from __future__ import annotations
 
 import glob
 import hashlib
-import os
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -49,11 +48,6 @@ SAYS_NOTHING: Final = frozenset(
     {"bag", "camera", "can", "can0", "can1", "data", "drive", "images", "log", "logs", "record",
      "recording", "rosbag", "rosbag2", "video"}
 )  # fmt: skip
-
-AUTO: Final = "auto"
-SLURM: Final = "SLURM_ARRAY_TASK_"
-# Variables that torchrun, MPI launchers for PyTorch and many schedulers set; ranks start at 0.
-RANKS: Final = ("RANK", "WORLD_SIZE")
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,14 +116,14 @@ def drives_of(
     Args:
         arguments: At least one.
         each: Every argument is a drive, or a folder of drives.
-        shard: The shard to return, in a form that ``read_shard`` accepts; None for all drives.
+        shard: The shard to return, such as ``2/4``; None for all drives.
 
     Raises:
         UsageError: Nothing matches, a list cannot be read, a drive is named twice, or a folder
             may be one drive or several.
         LogError: A location does not exist or cannot be read.
     """
-    part = None if shard is None else read_shard(shard, os.environ)
+    part = None if shard is None else read_shard(shard)
     found = _all_of(arguments, each=each)
     return found if part is None else found.part(part)
 
@@ -370,67 +364,14 @@ class Shard:
         return f"{self.number}/{self.count}"
 
 
-def read_shard(text: str, environment: Mapping[str, str]) -> Shard:
-    """Parse ``2/4``, or read a scheduler's variables for ``auto``.
-
-    Args:
-        text: Value of ``--shard``.
-        environment: Environment variables by name.
+def read_shard(text: str) -> Shard:
+    """Parse ``2/4``.
 
     Raises:
-        UsageError: The text has neither form, the variables are missing or belong to two
-            schedulers, or array tasks are not numbered in equal steps.
+        UsageError: The text has another form.
     """
-    if text == AUTO:
-        return _of_scheduler(environment)
     found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", text)
     shard = Shard(*map(int, found.groups())) if found else Shard(0, 0)
     if not 1 <= shard.number <= shard.count:
-        raise UsageError(f"--shard {text}: expected i/n with i from 1 to n, such as 2/4, or {AUTO}")
+        raise UsageError(f"--shard {text}: expected i/n with i from 1 to n, such as 2/4")
     return shard
-
-
-def _of_scheduler(environment: Mapping[str, str]) -> Shard:
-    is_array = f"{SLURM}ID" in environment
-    is_ranked = all(name in environment for name in RANKS)
-    if is_array and is_ranked:
-        raise UsageError(
-            f"--shard {AUTO}: both {SLURM}ID and {RANKS[0]} are set; use --shard i/n instead"
-        )
-    if is_array:
-        return _of_array(environment)
-    if not is_ranked:
-        raise UsageError(
-            f"--shard {AUTO}: neither {SLURM}ID nor {' and '.join(RANKS)} is set; run it as a task "
-            "of a scheduler, or use --shard i/n"
-        )
-    rank, size = (_number(environment, name) for name in RANKS)
-    return _checked(rank + 1, size, f"{RANKS[0]}={rank}, {RANKS[1]}={size}")
-
-
-def _of_array(environment: Mapping[str, str]) -> Shard:
-    """Return the shard of a SLURM array task, for any first number and step."""
-    here, count = (_number(environment, SLURM + name) for name in ("ID", "COUNT"))
-    first = _number(environment, f"{SLURM}MIN", 0)
-    step = max(_number(environment, f"{SLURM}STEP", 1), 1)
-    last = _number(environment, f"{SLURM}MAX", first + (count - 1) * step)
-    values = f"{SLURM}ID={here}, MIN={first}, MAX={last}, STEP={step}, COUNT={count}"
-    # A list such as --array=1,3,7 does not determine the index of a task.
-    if last - first != (count - 1) * step or (here - first) % step:
-        raise UsageError(
-            f"--shard {AUTO}: {values}: expected array tasks in equal steps, such as --array=1-8"
-        )
-    return _checked((here - first) // step + 1, count, values)
-
-
-def _number(environment: Mapping[str, str], name: str, default: int | None = None) -> int:
-    text = environment.get(name, "" if default is None else str(default))
-    if not re.fullmatch(r"[0-9]{1,9}", text):
-        raise UsageError(f"--shard {AUTO}: {name}={text!r}: expected a whole number")
-    return int(text)
-
-
-def _checked(number: int, count: int, values: str) -> Shard:
-    if not 1 <= number <= count:
-        raise UsageError(f"--shard {AUTO}: {values}: outside its own range; use --shard i/n")
-    return Shard(number, count)

@@ -171,9 +171,7 @@ def find_drives(*logs: Path | str, each: bool = False, shard: str | None = None)
     Args:
         logs: Paths or URLs.
         each: Treat each path as a separate drive, or as a folder of drives.
-        shard: ``2/4`` selects the second of four parts, divided by a hash of each drive's identity;
-            ``auto`` selects the part that the scheduler's variables define,
-            ``SLURM_ARRAY_TASK_ID`` and ``_COUNT``, or ``RANK`` and ``WORLD_SIZE``.
+        shard: ``2/4`` selects the second of four parts, divided by a hash of each drive's identity.
 
     Returns:
         ``drives``, each with its logs and the vehicle file and truth next to them; and ``is_many``.
@@ -269,14 +267,13 @@ def replay(
     Examples:
         crosscue replay drive.mcap --vehicle car.toml -o runs/drive
         crosscue replay 'drives/*/drive.mcap' --vehicle car.toml -o runs --workers 8
-        crosscue replay drives -o runs --shard auto
+        crosscue replay drives -o runs --shard 2/4
 
     Args:
         logs: Recordings of one drive, or drives; paths or URLs.
         output: Run folder; for many drives, the folder of their run folders.
         each: Treat each LOG as a separate drive.
-        shard: Process only part I of N of the drives, divided by a hash of each drive's identity;
-            auto reads SLURM_ARRAY_TASK_ID and _COUNT, or RANK and WORLD_SIZE.
+        shard: Process only part I of N of the drives, divided by a hash of each drive's identity.
         settings: How to replay.
     """
     check_inputs(settings)
