@@ -26,13 +26,13 @@ import cv2
 import lz4.frame
 import numpy as np
 import zstandard
+from isal.isal_zlib import crc32
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, Writer
 from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 
 import crosscue
-from crosscue.replay.files.checksum import crc32
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS
 from crosscue.replay.readers.mcap.bytes import ByteFile
@@ -316,7 +316,7 @@ def memory(megabytes: int) -> None:
 PEAK = """
 import sys
 from pathlib import Path
-from crosscue.replay.files.checksum import crc32
+from isal.isal_zlib import crc32
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 import crosscue.replay.readers.mcap.reader

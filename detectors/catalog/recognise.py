@@ -121,8 +121,6 @@ def read_interface(path: Path) -> Interface:
 
 
 def _of_onnx(content: bytes, path: Path) -> Interface:
-    if find_spec("onnx") is None:
-        raise UsageError(f"{path}: needs the package onnx: pip install onnx")
     import onnx
 
     model: Any = onnx.load_model_from_string(content)

@@ -1,7 +1,7 @@
-"""Load neural networks from bytes into an installed back end.
+"""Load neural networks from bytes into a back end.
 
-ONNX runs in ONNX Runtime if that is installed, otherwise in OpenCV. OpenVINO IR runs in OpenVINO,
-TFLite in LiteRT. Weights are bytes of a verified hash and never refer to another file.
+ONNX runs in ONNX Runtime or OpenVINO, OpenVINO IR in OpenVINO, TFLite in LiteRT. Weights are bytes
+of a verified hash and never refer to another file.
 """
 
 from __future__ import annotations
@@ -31,29 +31,14 @@ from .weights import Weights
 Size = tuple[int, int]
 
 
-def _read(content: bytes) -> tuple[Any, list[Any]]:
-    """Return the model, and its inputs that are not weights."""
+def free_size(content: bytes) -> bytes:
+    """Return an ONNX file whose input accepts pictures of any size."""
     import onnx
 
     model: Any = onnx.load_model_from_string(content)
     weights = {tensor.name for tensor in model.graph.initializer}
-    return model, [one for one in model.graph.input if one.name not in weights]
-
-
-def input_shape(content: bytes) -> tuple[int | None, ...]:
-    """Shape of the first input of an ONNX file; None for variable sizes.
-
-    OpenCV runs a network on other sizes, too, and returns meaningless numbers.
-    """
-    given = _read(content)[1][0]
-    return tuple(side.dim_value or None for side in given.type.tensor_type.shape.dim)
-
-
-def free_size(content: bytes) -> bytes:
-    """Return an ONNX file whose input accepts pictures of any size."""
-    model, given = _read(content)
-    for value in given:
-        for dimension in value.type.tensor_type.shape.dim[1:]:
+    for value in model.graph.input:
+        for dimension in () if value.name in weights else value.type.tensor_type.shape.dim[1:]:
             if dimension.dim_value != 3:
                 dimension.ClearField("value")
     for value in model.graph.output:
@@ -115,7 +100,7 @@ def load_network(
 
     Args:
         weights: Verified weights.
-        backend: ``onnxruntime``, ``opencv``, ``openvino``, ``litert``; None for the preferred one.
+        backend: ``onnxruntime``, ``openvino``, ``litert``; None for the preferred one.
         threads: Maximum number of threads, where the back end supports a limit.
         size_px: Width and height of the input instead of those that the file declares, for
             networks that allow it.
@@ -136,11 +121,11 @@ def load_network(
         )
     if backend is not None and backend not in able:
         raise VehicleError(f"{weights.name}: {backend} does not run it; one of: {', '.join(able)}")
-    name = backend or next((n for n in able if not _missing(n, size_px)), able[0])
-    missing = _missing(name, size_px)
-    if missing:
+    name = backend or able[0]
+    module, project = _EXTRAS.get(name, (name, name))
+    if find_spec(module) is None:
         raise VehicleError(
-            f"{weights.name}: runs in {name}, but {missing} is not installed: pip install {missing}"
+            f"{weights.name}: runs in {name}, but {project} is not installed: pip install {project}"
         )
     try:
         return _LOADERS[name](weights, threads, size_px)
@@ -156,14 +141,6 @@ def missing_operation(error: Exception) -> str | None:
     found = _LACKING.search(str(error))
     name = found and (found[1] or found[2] or found[4] or "Flex, of TensorFlow itself,")
     return found and f"the operation {name} is unknown; export it without that"
-
-
-def _missing(name: str, size_px: Size | None) -> str:
-    """Return the project that a back end lacks; empty for none."""
-    needs = [_PACKAGE[name]]
-    if (name, size_px is None) in (("onnxruntime", False), ("opencv", True)):
-        needs.append(("onnx", "onnx"))
-    return next((project for module, project in needs if find_spec(module) is None), "")
 
 
 def _in_onnxruntime(weights: Weights, threads: int, size_px: Size | None) -> Network:
@@ -196,29 +173,6 @@ def _in_onnxruntime(weights: Weights, threads: int, size_px: Size | None) -> Net
 def _ort_providers(ort: Any) -> list[str]:
     wanted = ("CUDAExecutionProvider", "CPUExecutionProvider")
     return [name for name in wanted if name in ort.get_available_providers()]
-
-
-def _in_opencv(weights: Weights, threads: int, size_px: Size | None) -> Network:
-    import cv2
-
-    net = cv2.dnn.readNetFromONNX(np.frombuffer(weights.content, np.uint8))
-    names = list(net.getUnconnectedOutLayersNames())
-    wanted = None if size_px is not None else input_shape(weights.content)
-
-    def call(batch: Array) -> Mapping[str, Array]:
-        if wanted is not None and not _fits(batch.shape, wanted):
-            raise ValueError(f"got {batch.shape}, the network's own input is {wanted}")
-        net.setInput(np.asarray(batch))
-        outputs = net.forward(names)
-        return {name: np.asarray(out) for name, out in zip(names, outputs, strict=True)}
-
-    return _Function(f"opencv {cv2.__version__}", call)
-
-
-def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
-    return len(shape) == len(wanted) and all(
-        want is None or size == want for size, want in zip(shape, wanted, strict=True)
-    )
 
 
 def _in_openvino(weights: Weights, threads: int, size_px: Size | None) -> Network:
@@ -311,20 +265,14 @@ def output_name(output: Any, index: int) -> str:
 
 # Back ends by suffix of the weights, the preferred one first.
 BACKENDS: Final[Mapping[str, tuple[str, ...]]] = {
-    ".onnx": ("onnxruntime", "opencv", "openvino"),
+    ".onnx": ("onnxruntime", "openvino"),
     ".xml": ("openvino",),
     ".tflite": ("litert",),
 }
-# Module of each back end, and the project that installs it.
-_PACKAGE: Final = {
-    "onnxruntime": ("onnxruntime", "onnxruntime"),
-    "opencv": ("cv2", "opencv-python-headless"),
-    "openvino": ("openvino", "openvino"),
-    "litert": ("ai_edge_litert", "ai-edge-litert"),
-}
+# Module of a back end with another name, and the project that installs it.
+_EXTRAS: Final = {"litert": ("ai_edge_litert", "ai-edge-litert")}
 _LOADERS: Final[Mapping[str, Callable[[Weights, int, Size | None], Network]]] = {
     "onnxruntime": _in_onnxruntime,
-    "opencv": _in_opencv,
     "openvino": _in_openvino,
     "litert": _in_litert,
 }

@@ -35,7 +35,7 @@ class ModelSettings(Settings):
 
     card: str
     """File name of the card."""
-    backend: Literal["onnxruntime", "opencv", "openvino", "litert"] | None = None
+    backend: Literal["onnxruntime", "openvino", "litert"] | None = None
     threads: int = 1
     score: Proportion | None = None
     """Minimum score of a detection; the card's by default."""

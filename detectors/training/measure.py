@@ -26,7 +26,6 @@ from crosscue.detectors.networks.mask_rcnn.detector import MaskRcnnSettings, cal
 from crosscue.detectors.networks.mask_rcnn.network import NetworkPlan
 from crosscue.detectors.rle import area_px, encode_mask
 from crosscue.replay.columns import Floats
-from crosscue.replay.errors import UsageError
 
 from .annotations import LabelledPicture, LabelledSet, TrainingObject, mask_of
 from .operating_point import (
@@ -69,17 +68,10 @@ def average_precisions(
     ``box car small``, and likewise ``mask``. A value is None if the truth has no such object, or if
     no mask was detected or annotated. For masks, objects without a mask are left out, and so are
     detections of their class whose boxes overlap theirs by 0.5.
-
-    Raises:
-        UsageError: pycocotools is not installed.
     """
-    try:
-        from pycocotools.coco import COCO
-        from pycocotools.cocoeval import COCOeval
-    except ImportError:
-        raise UsageError(
-            "average precision needs pycocotools, which is not installed: pip install pycocotools"
-        ) from None
+    from pycocotools.coco import COCO
+    from pycocotools.cocoeval import COCOeval
+
     has_masks = labelled.masks and all(one.masks[0] for one in found if len(one))
     scores: dict[str, float | None] = {}
     with contextlib.redirect_stdout(io.StringIO()):

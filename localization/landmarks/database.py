@@ -370,7 +370,7 @@ class LandmarkWriter:
         if there != kind:
             raise UsageError(
                 f"{self._path}: holds features of matcher {there!r}, not {kind!r}; "
-                f"use --matcher {there} or another database"
+                f"set landmarks.matcher = {there!r} in the vehicle file, or choose another database"
             )
 
     def _abandon(self) -> None:

@@ -439,12 +439,7 @@ def _ranged(url: LogAddress, system: _System, address: str, store: Store) -> Ran
 def opened_store(url: str) -> tuple[LogAddress, _System, str]:
     """Return an address, its store, and the address in the store, which may hold secrets."""
     url = LogAddress(url)
-    try:
-        url_to_fs = import_module("fsspec.core").url_to_fs
-    except ImportError:
-        raise LogError(
-            f"{url}: reading from object stores needs fsspec; pip install fsspec"
-        ) from None
+    url_to_fs = import_module("fsspec.core").url_to_fs
     system, address = guarded(url, lambda: url_to_fs(url.with_secrets()))
     return url, cast("_System", system), str(address)
 

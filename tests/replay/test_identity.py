@@ -1,18 +1,11 @@
 """Identity of logs, checksums and versions."""
 
-import importlib
 import shutil
 import subprocess
-import sys
-import zlib
 from pathlib import Path
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from crosscue.replay.files import checksum
 from crosscue.replay.files.identity import SHARE_BYTES, log_identity
 from crosscue.replay.versions import commit
 
@@ -92,25 +85,6 @@ def test_folder_identity_covers_all_files_except_our_own(tmp_path: Path) -> None
         change()
         changed.append(log_identity(folder).digest)
     assert len({before.digest, *changed}) == 5
-
-
-@given(st.binary(max_size=9000), st.binary(max_size=300))
-def test_crc32_equals_zlib_in_one_or_two_pieces(first: bytes, second: bytes) -> None:
-    expected = zlib.crc32(first + second)
-    assert checksum.crc32(first + second) == expected
-    assert checksum.crc32(memoryview(second), checksum.crc32(first)) == expected
-    assert checksum.crc32(np.frombuffer(first, np.uint8)) == zlib.crc32(first)
-
-
-def test_zlib_is_used_without_isal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "isal.isal_zlib", None)
-    try:
-        importlib.reload(checksum)
-        assert checksum._crc32 is zlib.crc32
-        assert checksum.crc32(b"123456789") == 0xCBF43926
-    finally:
-        monkeypatch.undo()
-        importlib.reload(checksum)
 
 
 def _git(folder: Path, *words: str) -> str:

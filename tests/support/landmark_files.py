@@ -82,5 +82,5 @@ class ShadeMatcher:
 
 
 def shade(camera: CameraGeometry) -> ShadeMatcher:
-    """Build the matcher, for ``--matcher support.landmark_files:shade``."""
+    """Build the matcher, for ``landmarks.matcher = "support.landmark_files:shade"``."""
     return ShadeMatcher()

@@ -8,9 +8,9 @@ from threading import Event, Lock
 from typing import Final
 
 import numpy as np
+from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
-from crosscue.replay.files.checksum import crc32
 from crosscue.replay.remote.ranges import RangedFile
 from crosscue.replay.seal.touched import Touched
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from isal.isal_zlib import crc32
 
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.checksum import crc32
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.chunks.chunk_table import ChunkTable, parse_chunk_indexes, run_of
 from crosscue.replay.readers.mcap.chunks.inflate import inflate_chunk, inflate_prefix

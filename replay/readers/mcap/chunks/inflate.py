@@ -7,9 +7,9 @@ from threading import local
 from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
+from isal.isal_zlib import crc32
 
 from crosscue.replay.columns import Bytes
-from crosscue.replay.files.checksum import crc32
 from crosscue.replay.readers.mcap.records import BrokenRecordError, ChunkHead
 
 if TYPE_CHECKING:
