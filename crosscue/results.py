@@ -107,20 +107,21 @@ class Result:
 
     def brief(self) -> str:
         """Return the text of the command without ``--verbose``: at most ``max_lines`` lines."""
-        lines, last = _split(self.lines()), _split(self.closing())
+        lines, last = printed(self.lines()), printed(self.closing())
         kept = self.max_lines - len(last) - 1
         if 0 < kept < len(lines) - 1:
             lines[kept:] = [f"... and {len(lines) - kept} lines more: add -v"]
         return "\n".join([*lines, *last])
 
     def __repr__(self) -> str:
-        return "\n".join([*_split(self.lines()), *_split(self.closing())])
+        return "\n".join([*printed(self.lines()), *printed(self.closing())])
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(repr(self))}</pre>"
 
 
-def _split(texts: Iterator[str]) -> list[str]:
+def printed(texts: Iterator[str]) -> list[str]:
+    """Return the lines of texts, with control characters escaped."""
     return [visible(line) for text in texts for line in text.split("\n")]
 
 

@@ -22,10 +22,10 @@ from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 # Not from crosscue.replay.base, which needs numpy: the list of commands is printed without it.
-from crosscue.replay.errors import CrosscueError, one_line, without_secrets
+from crosscue.replay.errors import CrosscueError, OutputError, one_line, without_secrets
 from crosscue.replay.losses import losses_heard
 from crosscue.replay.remote.address import is_remote
 from crosscue.replay.safe_text import visible
@@ -241,7 +241,7 @@ def run(argv: Sequence[str]) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     with losses_heard() as losses:
-        status = _guarded(call, args, parser)
+        status = _guarded(call, args, parser, losses)
     for loss in losses:
         print(visible(f"crosscue: dropped: {loss}"), file=sys.stderr)
     return 3 if losses and not status else status
@@ -267,14 +267,17 @@ def parser_of(name: str) -> tuple[Call, argparse.ArgumentParser]:
     return call, parser
 
 
-def _guarded(call: Call, args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
+def _guarded(
+    call: Call, args: argparse.Namespace, parser: argparse.ArgumentParser, losses: list[str]
+) -> int:
     from crosscue.eval.command_line import with_options
     from crosscue.eval.terminal import print_found, watched
 
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
         with watched(args):
-            status = print_found(call(args), args)
+            found = _with_page(call, args, losses)
+            status = print_found(found, args)
         sys.stdout.flush()
         return status
     except CrosscueError as error:
@@ -309,6 +312,18 @@ def _guarded(call: Call, args: argparse.Namespace, parser: argparse.ArgumentPars
         return _complain(RuntimeError(text), 1, args)
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def _with_page(call: Call, args: argparse.Namespace, losses: list[str]) -> Any:
+    """Call a verb, and write the page of its result if it was asked for."""
+    page = getattr(args, "page_of_result", None)
+    if page is None:
+        return call(args)
+    if page.exists() and not getattr(args, args.name_of_overwrite):
+        raise OutputError(f"{page}: exists; give another name or --overwrite")
+    found: Any = call(args)
+    found.write_page(page, losses)
+    return found
 
 
 class _TerminatedError(BaseException):

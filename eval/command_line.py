@@ -152,6 +152,13 @@ def fill(parser: argparse.ArgumentParser, verb: Callable[..., Any]) -> Call:
         for name, what in formats.items():
             shown.add_argument(f"--{name}", action="store_true", help=what)
         shown.add_argument("--json", action="store_true", help="print the result as JSON")
+    if hasattr(returned, "write_page"):
+        text = "page to write: the result, its charts, what was dropped, the section to paste"
+        parser.add_argument("--page", type=Path, metavar="FILE", dest="page_of_result", help=text)
+        overwrite = parser._option_string_actions.get("--overwrite") or parser.add_argument(
+            "--overwrite", action="store_true", help="replace an existing page"
+        )
+        parser.set_defaults(name_of_overwrite=overwrite.dest)
     return call
 
 

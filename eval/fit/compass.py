@@ -4,40 +4,50 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 
 from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.eval.pipeline.pose import compass_settings
-from crosscue.localization.compass import course_at
+from crosscue.localization.angles import wrap_all
+from crosscue.localization.compass import CompassSettings, course_at, heading, level_field
 from crosscue.localization.fit.compass import CompassFit
 from crosscue.localization.fit.compass import fit_compass as fit_readings
 from crosscue.replay.base import Log, Selection
+from crosscue.replay.columns import Floats
 from crosscue.replay.errors import EmptyResultError, VehicleError
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
-from crosscue.results import HIDDEN, Result
+from crosscue.results import HIDDEN
 from crosscue.verb import Option
 
 from .log_signals import read_signals, signal_plan
-from .vehicle_output import check_output, with_section, write_fit
+from .vehicle_output import Fitted, check_output, with_section, write_fit
+
+if TYPE_CHECKING:
+    from crosscue.eval.report.chart import Chart
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedCompass(Result):
+class FittedCompass(Fitted):
     """Fitted mounting, hard and soft iron of a compass.
 
     Attributes:
         fitted: Fitted values, their uncertainty, and the parameters that are not observable.
-        path: Vehicle file that was written; None without one.
+        given: The compass before the fit.
+        field_t: Readings that it was fitted to, shape (N, 3).
+        course_rad: Course by GNSS at their times, NaN where it is unknown; None without GNSS.
     """
 
     fitted: CompassFit = field(metadata=HIDDEN)
-    path: Path | None = field(metadata=HIDDEN)
+    given: CompassSettings = field(metadata=HIDDEN)
+    field_t: Floats = field(metadata=HIDDEN)
+    course_rad: Floats | None = field(metadata=HIDDEN)
 
+    title: ClassVar = "Compass"
     also: ClassVar = {
         "compass": "section",
         "observable": "fitted.observable",
@@ -57,12 +67,17 @@ class FittedCompass(Result):
         return compass_section(self.fitted)
 
     @property
+    def toml(self) -> str:
+        """The section as text."""
+        return with_section("", "compass", self.section)
+
+    @property
     def not_observable(self) -> dict[str, str]:
         """Reason why a parameter keeps its value, by parameter."""
         return dict(self.fitted.not_observable)
 
-    def lines(self) -> Iterator[str]:
-        """Yield the quality of the fit, and the section."""
+    def report(self) -> Iterator[str]:
+        """Yield the quality of the fit."""
         fitted = self.fitted
         yield (
             f"readings    {fitted.readings_used} of {fitted.readings} used; headings cover "
@@ -70,10 +85,35 @@ class FittedCompass(Result):
         )
         yield f"fitted      {', '.join(fitted.observable) or 'nothing'}"
         yield from (f"not fitted  {name}: {reason}" for name, reason in fitted.not_observable)
-        yield from (*_residual(fitted), "", "[compass]")
-        yield from (f"{key} = {value}" for key, value in self.section.items())
-        if self.path is not None:
-            yield f"written to {self.path}"
+        yield from _residual(fitted)
+
+    def charts(self) -> Iterator[Chart]:
+        """Yield the horizontal field, and the heading against the course."""
+        from crosscue.eval.report.chart import Chart, Series
+
+        both = ("values before", self.given), ("fitted", self.fitted.settings)
+        yield Chart(
+            "Horizontal field of all readings: a circle around the origin without iron",
+            "forward (µT)",
+            "left (µT)",
+            [
+                Series.of(name, 1e6 * level_field(self.field_t, one), is_line=False)
+                for name, one in both
+            ],
+            is_map=True,
+        )
+        if self.course_rad is not None:
+            course_deg = np.degrees(self.course_rad)
+            apart = [wrap_all(heading(self.field_t, one) - self.course_rad) for _, one in both]
+            yield Chart(
+                "Heading less the GNSS course",
+                "course, counter-clockwise from east (deg)",
+                "difference (deg)",
+                [
+                    Series(name, course_deg, np.degrees(one), is_line=False)
+                    for (name, _), one in zip(both, apart, strict=True)
+                ],
+            )
 
 
 def _residual(fitted: CompassFit) -> list[str]:
@@ -117,14 +157,12 @@ def fit_compass(
     check_output(vehicle, output, overwrite=overwrite)
     settings = vehicle_given(vehicle)
     with opened(log) as drive:
-        fitted = fit_log_compass(drive.logs, settings, drive.selection)
-    path = write_fit(
-        vehicle, output, lambda text: with_section(text, "compass", compass_section(fitted))
-    )
-    return FittedCompass(fitted, path)
+        found = fit_log_compass(drive.logs, settings, drive.selection)
+    path = write_fit(vehicle, output, lambda text: with_section(text, "compass", found.section))
+    return replace(found, path=path)
 
 
-def fit_log_compass(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> CompassFit:
+def fit_log_compass(logs: Sequence[Log], vehicle: Vehicle, selection: Selection) -> FittedCompass:
     """Fit hard iron, soft iron and mounting, where the drive determines them.
 
     Raises:
@@ -146,7 +184,9 @@ def fit_log_compass(logs: Sequence[Log], vehicle: Vehicle, selection: Selection)
     ground = found.get(Signal.COURSE)
     if ground is not None:
         reference = course_at(readings.t_ns, ground.t_ns, ground.values[:, 0], ground.values[:, 1])
-    return fit_readings(readings.t_ns, readings.values, reference, compass_settings(vehicle))
+    given = compass_settings(vehicle)
+    fitted = fit_readings(readings.t_ns, readings.values, reference, given)
+    return FittedCompass(fitted, given, readings.values, reference)
 
 
 def compass_section(fitted: CompassFit) -> dict[str, object]:

@@ -7,25 +7,29 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from crosscue.eval.fit.annotated_runs import annotated_approaches, read_annotated
-from crosscue.eval.fit.vehicle_output import FittedSection, new_file, section_text
+from crosscue.eval.fit.vehicle_output import Fitted, new_file, section_text
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.scoring.intervals import Interval, between, mean_by_cluster, wilson
 from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
 from crosscue.fusion.fit.message_fit import fit_messages as fit_approaches
+from crosscue.replay.columns import Floats
 from crosscue.replay.errors import EmptyResultError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.results import HIDDEN
 from crosscue.verb import Option
 
+if TYPE_CHECKING:
+    from crosscue.eval.report.chart import Chart
+
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedMessages(FittedSection):
+class FittedMessages(Fitted):
     """Learned reliability of each cue.
 
     Attributes:
@@ -38,6 +42,7 @@ class FittedMessages(FittedSection):
     used: Counter[str]
     runs: int = field(metadata=HIDDEN)
 
+    title: ClassVar = "Reliability of each cue"
     also: ClassVar = {
         "approaches": "fitted.approaches",
         "calibrated": "calibrated",
@@ -46,7 +51,7 @@ class FittedMessages(FittedSection):
     }
 
     @property
-    def section(self) -> str:
+    def toml(self) -> str:
         """The vehicle file's section ``[fusion.calibrated]``, with counts as comments."""
         return section_of(self.fitted)
 
@@ -88,6 +93,29 @@ class FittedMessages(FittedSection):
         """Yield the rates, scales and exponents."""
         yield _report_text(self.fitted, self.used, self.runs)
 
+    def charts(self) -> Iterator[Chart]:
+        """Yield what was counted and what was learned, for each cue and feature."""
+        from crosscue.eval.report.chart import Chart, Series
+
+        both = [one for one in self.fitted.rates if one.there.places and one.missing.places]
+        counted = [[_rates_of(side).rate for side in (one.missing, one.there)] for one in both]
+        learned = [(one.rates.if_not, one.rates.if_there) for one in both if one.rates is not None]
+        yield Chart(
+            "Fraction of frames with the cue, for each cue and feature, near and far: the further "
+            "above the line, the more the cue tells",
+            "fraction without the feature",
+            "fraction with the feature",
+            (
+                Series("a cue that tells nothing", (0.0, 1.0), (0.0, 1.0)),
+                Series.of("counted", _points(counted), is_line=False),
+                Series.of("learned", _points(learned), is_line=False),
+            ),
+        )
+
+
+def _points(pairs: Sequence[Sequence[float]]) -> Floats:
+    return np.array(pairs, np.float64).reshape(-1, 2)
+
 
 def _report_text(fitted: MessageFit, used: Counter[str], runs: int) -> str:
     lines = [f"{runs} runs, {fitted.approaches} annotated approaches"]
@@ -99,7 +127,7 @@ def _report_text(fitted: MessageFit, used: Counter[str], runs: int) -> str:
     lines += ["", "frames become independent over"]
     lines += [_fade_text(one) for one in fitted.fades]
     scales = ", ".join(f"{name} {value:.2f}" for name, value in fitted.calibrated.exponents.items())
-    lines += ["", f"exponents: {scales or 'none: no feature was both present and absent'}", ""]
+    lines += ["", f"exponents: {scales or 'none: no feature was both present and absent'}"]
     return "\n".join(lines)
 
 
@@ -247,4 +275,4 @@ def fit_messages(
         )
     if path is not None:
         write_text(path, section_of(fitted))
-    return FittedMessages(path, fitted, used, len(runs))
+    return FittedMessages(fitted, used, len(runs), path=path)

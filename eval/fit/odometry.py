@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 import numpy as np
 import tomlkit
@@ -28,12 +28,15 @@ from crosscue.replay.files.tree_text import toml_document
 from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.vehicle.pose import OdometryFitted
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
-from crosscue.results import HIDDEN, Result
+from crosscue.results import HIDDEN
 from crosscue.verb import Option
 
 from .log_signals import read_signals, signal_plan, turn_samples, wheel_speeds
 from .reference import ReferencePositions, of_gnss, of_truth
-from .vehicle_output import check_output, write_fit
+from .vehicle_output import Fitted, check_output, write_fit
+
+if TYPE_CHECKING:
+    from crosscue.eval.report.chart import Chart
 
 SHARED: Final = (
     "wheel_scale",
@@ -77,6 +80,8 @@ class SourceFit:
         fit: Fit to the first half.
         before: Errors with the original values.
         after: Errors with the fitted values.
+        drive: The drive that was fitted to.
+        given: The car with the original values.
         camera_yaw_rad: Yaw of the reference's body relative to the vehicle, to the left; None if
             the reference has no heading.
         camera_yaw_sd_rad: Standard deviation of the yaw; correlation of differences is taken into
@@ -86,6 +91,8 @@ class SourceFit:
     fit: OdometryFit
     before: OdometryErrors
     after: OdometryErrors
+    drive: KnownDrive
+    given: Car
     camera_yaw_rad: float | None = None
     camera_yaw_sd_rad: float = math.nan
 
@@ -122,17 +129,16 @@ class DriveFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedOdometry(Result):
+class FittedOdometry(Fitted):
     """Odometry fitted to the first half of a drive and tested on the second.
 
     Attributes:
         fitted: Fit for each source of the turn rate, with errors before and after on both halves.
-        path: Vehicle file that was written; None without one.
     """
 
     fitted: DriveFit = field(metadata=HIDDEN)
-    path: Path | None = field(metadata=HIDDEN)
 
+    title: ClassVar = "Odometry"
     also: ClassVar = {
         "odometry": "section",
         "camera_yaw_rad": "camera_yaw_rad",
@@ -150,6 +156,13 @@ class FittedOdometry(Result):
     def section(self) -> dict[str, object]:
         """The vehicle file's section ``[odometry]``."""
         return odometry_section(self.fitted)
+
+    @property
+    def toml(self) -> str:
+        """The sections of the vehicle file, without the record of the fit."""
+        document = toml_document(with_odometry("", self.fitted))
+        del document["odometry"]["fitted"]
+        return tomlkit.dumps(document)
 
     @property
     def camera_yaw_rad(self) -> float | None:
@@ -175,8 +188,8 @@ class FittedOdometry(Result):
             for one in self.fitted.sources
         ]
 
-    def lines(self) -> Iterator[str]:
-        """Yield the parameters and errors of each source, and the section."""
+    def report(self) -> Iterator[str]:
+        """Yield the parameters and errors of each source."""
         found = self.fitted
         middle_s, end_s = ((t - found.start_ns) * 1e-9 for t in (found.middle_ns, found.end_ns))
         yield f"positions   {found.reference}"
@@ -187,12 +200,39 @@ class FittedOdometry(Result):
         yield ""
         yield f"NEES of x, y is consistent for one drive between {low:.2f} and {high:.2f}"
         yield from (f"not fitted  {name}: {why}" for name, why in found.not_fitted.items())
-        yield from ("", "[odometry]")
-        yield from (f"{key} = {value}" for key, value in self.section.items() if key != "fitted")
-        if self.camera_yaw_rad is not None:
-            yield from ("", "[camera]", f"yaw_rad = {self.camera_yaw_rad}")
-        if self.path is not None:
-            yield f"written to {self.path}"
+
+    def charts(self) -> Iterator[Chart]:
+        """Yield the way by odometry alone, and its error, for each source of turns."""
+        from crosscue.eval.report.chart import Chart, Series
+
+        for one in self.fitted.sources:
+            known_m, t_s = one.drive.fixes.xy_m, one.drive.seconds
+            before_m, after_m = (
+                one.drive.reckon(one.fit.start, car).xy_m for car in (one.given, one.fit.car)
+            )
+            yield Chart(
+                f"Way by odometry alone, turns from {one.fit.source}",
+                "east (m)",
+                "north (m)",
+                (
+                    Series.of("values before", before_m),
+                    Series.of("fitted", after_m),
+                    Series.of("known positions", known_m, is_line=False, is_truth=True),
+                ),
+                is_map=True,
+            )
+            before, after = (np.hypot(*(xy_m - known_m).T) for xy_m in (before_m, after_m))
+            first = one.drive.fixes.t_ns < self.fitted.middle_ns
+            yield Chart(
+                f"Distance from the known positions, turns from {one.fit.source}",
+                "time (s)",
+                "distance (m)",
+                (
+                    Series("values before", t_s, before),
+                    Series("fitted, on the half fitted to", t_s[first], after[first]),
+                    Series("fitted, held out", t_s[~first], after[~first]),
+                ),
+            )
 
 
 def _source(one: SourceFit) -> list[str]:
@@ -266,7 +306,7 @@ def fit_odometry(
     with opened(log) as drive:
         found = fit_log_odometry(drive.logs, settings, drive.selection, known, keep=keep)
     path = write_fit(vehicle, output, lambda text: with_odometry(text, found))
-    return FittedOdometry(found, path)
+    return FittedOdometry(found, path=path)
 
 
 def fit_log_odometry(
@@ -366,14 +406,10 @@ def _middle_ns(drive: KnownDrive) -> int:
 def _fitted(drive: KnownDrive, given: OdometrySettings, reference: ReferencePositions) -> SourceFit:
     half = drive.until(_middle_ns(drive)) if len(drive.fixes) else drive
     fit = fit_parameters(half, given)
-    before = _errors(
-        drive, fit, fit.car._replace(settings=given, constants=NO_CONSTANTS, delay_s=0.0)
-    )
-    after = _errors(drive, fit, fit.car)
-    if reference.heading_rad is None:
-        return SourceFit(fit, before, after)
-    yaw_rad, sd_rad = _yaw(half, fit, reference)
-    return SourceFit(fit, before, after, yaw_rad, sd_rad)
+    car = fit.car._replace(settings=given, constants=NO_CONSTANTS, delay_s=0.0)
+    before, after = _errors(drive, fit, car), _errors(drive, fit, fit.car)
+    yaw = () if reference.heading_rad is None else _yaw(half, fit, reference)
+    return SourceFit(fit, before, after, drive, car, *yaw)
 
 
 def _check_held_out(fitted: SourceFit) -> None:

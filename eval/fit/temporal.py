@@ -6,12 +6,12 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 
 from crosscue.eval.fit.annotated_runs import annotated_drives, read_annotated
-from crosscue.eval.fit.vehicle_output import FittedSection, new_file, section_text
+from crosscue.eval.fit.vehicle_output import Fitted, new_file, section_text
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.scoring.scene.trade import Reached, TradePoint, reached, trade_off
 from crosscue.fusion.factor_graph import FactorGraph
@@ -25,9 +25,12 @@ from crosscue.replay.vehicle.temporal import Combined
 from crosscue.results import HIDDEN
 from crosscue.verb import Option
 
+if TYPE_CHECKING:
+    from crosscue.eval.report.chart import Chart
+
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedTemporal(FittedSection):
+class FittedTemporal(Fitted):
     """Learned Markov chains of cues along a drive.
 
     Attributes:
@@ -42,6 +45,7 @@ class FittedTemporal(FittedSection):
     threshold: TradePoint | None
     runs: int
 
+    title: ClassVar = "Belief over time"
     also: ClassVar = {
         "drives": "fitted.drives",
         "places": "fitted.places",
@@ -51,7 +55,7 @@ class FittedTemporal(FittedSection):
     }
 
     @property
-    def section(self) -> str:
+    def toml(self) -> str:
         """The vehicle file's section ``[fusion]``, with those of both beliefs."""
         return section_of(self.fitted, self.combined, self.threshold)
 
@@ -88,7 +92,20 @@ class FittedTemporal(FittedSection):
                 f"threshold {one.threshold:.4g}: {one.false_features:.2f} false features a drive, "
                 f"{100.0 * one.full.value:.0f} % fully detected, on held-out places"
             )
-        yield ""
+
+    def charts(self) -> Iterator[Chart]:
+        """Yield the log score of each exponent and lapse on held-out places."""
+        from crosscue.eval.report.chart import Chart, Series
+
+        scores = self.fitted.log_scores
+        series = []
+        for lapse in sorted({lapse for _, lapse in scores}):
+            mine = sorted(
+                (exponent, value) for (exponent, at), value in scores.items() if at == lapse
+            )
+            series.append(Series.of(f"lapse {lapse:g}", np.array(mine, np.float64)))
+        title = "Log score on held-out places; the smallest was chosen"
+        yield Chart(title, "exponent", "log score", series)
 
 
 def section_of(fit: TemporalFit, combined: Combined, threshold: TradePoint | None) -> str:
@@ -186,4 +203,4 @@ def fit_temporal(
         ) from None
     if path is not None:
         write_text(path, section_of(fitted, combined, threshold))
-    return FittedTemporal(path, fitted, combined, threshold, len(runs))
+    return FittedTemporal(fitted, combined, threshold, len(runs), path=path)

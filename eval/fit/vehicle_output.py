@@ -1,7 +1,8 @@
-"""What fits share: a result with a section of the vehicle file, and writing it.
+"""What fits share: a result with charts and a section of the vehicle file, and writing them.
 
-A fit reads its inputs, fits, and returns a ``FittedSection``. It is printed as a report and the
-section, or the section is written: to a file of its own, or into a copy of a vehicle file.
+A fit reads its inputs, fits, and returns a ``Fitted``. It is printed as a report and the section,
+or the section is written: to a file of its own, or into a copy of a vehicle file. ``--page`` writes
+all of it as a page.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import tomlkit
 
@@ -19,35 +20,71 @@ from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.tree_text import toml_document
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
-from crosscue.results import HIDDEN, Result
+from crosscue.results import HIDDEN, Result, printed
+
+if TYPE_CHECKING:
+    from crosscue.eval.report.chart import Chart
 
 # Vehicle file with only default values.
 DEFAULTS: Final = "version = 1\n"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedSection(Result):
-    """A fit whose result is a section of a vehicle file.
+class Fitted(Result):
+    """Result of a fit.
 
     Attributes:
-        path: File that the section was written to; None without one.
+        path: File that the fit was written to; None without one.
+        title: Title of its page.
+        belongs_in: File that its section belongs in.
     """
 
-    path: Path | None = field(metadata=HIDDEN)
+    path: Path | None = field(default=None, kw_only=True, metadata=HIDDEN)
+    title: ClassVar[str]
+    belongs_in: ClassVar[str] = "vehicle file"
 
     @property
     @abstractmethod
-    def section(self) -> str:
-        """The vehicle file's section, as TOML."""
+    def toml(self) -> str:
+        """The section with the fit; empty if nothing was fitted."""
 
     @abstractmethod
     def report(self) -> Iterator[str]:
         """Yield what was fitted, and how well."""
 
+    @abstractmethod
+    def charts(self) -> Iterator[Chart]:
+        """Yield charts of what was fitted to, what was held out, and the fit."""
+
     def lines(self) -> Iterator[str]:
         """Yield the report, and the section unless it was written."""
         yield from self.report()
-        yield self.section if self.path is None else f"written to {self.path}"
+        if self.path is not None:
+            yield f"written to {self.path}"
+        elif self.toml:
+            yield from ("", self.toml)
+
+    def write_page(self, path: Path | str, losses: Sequence[str] = ()) -> None:
+        """Write the report, the charts and the section as one HTML page, replacing a file.
+
+        Args:
+            path: The page.
+            losses: What was dropped when the inputs were read.
+
+        Raises:
+            OutputError: The page cannot be written.
+        """
+        from crosscue.eval.report.html import write_page
+
+        content = {
+            "title": self.title,
+            "report": "\n".join(printed(self.report())),
+            "charts": [one for one in self.charts() if not one.is_empty],
+            "section": self.toml,
+            "belongs_in": self.belongs_in,
+            "losses": losses,
+        }
+        write_page(Path(path), "fit.html.j2", content)
 
 
 def new_file(output: Path | str | None, *, overwrite: bool) -> Path | None:

@@ -17,13 +17,11 @@ from crosscue.localization.ellipse import ellipses, position_cov
 from crosscue.replay.columns import Floats, Int64s
 
 from .scene_figures import WIDTH, shade
-from .svg_plot import Panel, SvgChart, ticks
+from .svg_plot import Panel, SvgChart, equal_scales, thinned, ticks
 
 ELLIPSES: Final = 12
 HEIGHT: Final = 150.0
 MAX_MAP: Final = 420.0
-# Max number of points of a line; a page of an hour's drive stays small.
-POINTS: Final = 1500
 
 
 class Figure(NamedTuple):
@@ -126,16 +124,8 @@ def draw_map(track: Track) -> Markup:
     known = known[np.isfinite(known).all(axis=1)]
     low, high = known.min(axis=0), known.max(axis=0)
     margin = 0.06 * max(float(np.ptp(known, axis=0).max()), 10.0)
-    wide, tall = (high - low + 2.0 * margin).tolist()
-    across = WIDTH - 70.0
-    height = min(max(across * tall / wide, 120.0), MAX_MAP)
-    # The shorter side is extended, so that a metre has one length.
-    scale = max(wide / across, tall / height)
-    middle = (low + high) / 2.0
-    half = 0.5 * scale * across, 0.5 * scale * height
-    x_range = (float(middle[0] - half[0]), float(middle[0] + half[0]))
-    y_range = (float(middle[1] - half[1]), float(middle[1] + half[1]))
-    panel = Panel(56, 34, across, height, x_range, y_range)
+    x_range, y_range = zip((low - margin).tolist(), (high + margin).tolist(), strict=True)
+    panel = equal_scales(Panel(56, 34, WIDTH - 70.0, MAX_MAP, x_range, y_range))
     named = [] if track.truth_m is None else [("line truth thick", "truth")]
     drawing = SvgChart(
         WIDTH,
@@ -144,7 +134,7 @@ def draw_map(track: Track) -> Markup:
         "Estimated track" + (" and true track" if named else "") + ", east and north in metres.",
     )
     drawing.axes(panel, "x, east (m)", "y, north (m)")
-    rows = _thinned(len(track.t_ns))
+    rows = thinned(len(track.t_ns))
     breaks = broken_at(track.gaps, track.t_ns[rows])
     for points, style in ((track.truth_m, "line truth thick"), (track.estimate_m, "line found")):
         if points is not None:
@@ -170,7 +160,7 @@ def draw_ellipse(
         highest = max(highest, lost_above_m)
     panel = Panel(44, 34, WIDTH - 58, HEIGHT, _distances(travelled_m), (0.0, 1.05 * highest))
     drawing = _chart(panel, "2-sigma ellipse, full major axis (m)")
-    rows = _thinned(len(t_ns))
+    rows = thinned(len(t_ns))
     breaks = broken_at(gaps, t_ns[rows])
     _gaps(drawing, panel, gaps, t_ns, travelled_m)
     x, y = (np.insert(one[rows], breaks, np.nan) for one in (travelled_m, major_axis_m))
@@ -192,7 +182,7 @@ def _over_distance(
     panel = Panel(44, 34, WIDTH - 58, HEIGHT, _distances(poses.travelled_m), ends)
     drawing = _chart(panel, label)
     _gaps(drawing, panel, poses.gaps, poses.t_ns, poses.travelled_m)
-    rows = _thinned(len(values))
+    rows = thinned(len(values))
     x_m = poses.travelled_m[rows]
     for part in np.split(np.arange(len(rows)), broken_at(poses.gaps, poses.t_ns[rows])):
         inside = [np.clip(one[rows][part], *ends) for one in band]
@@ -224,7 +214,3 @@ def _gaps(
 
 def _distances(travelled_m: Floats) -> tuple[float, float]:
     return 0.0, max(float(np.nanmax(travelled_m)), 1.0)
-
-
-def _thinned(rows: int) -> np.typing.NDArray[np.intp]:
-    return np.unique(np.linspace(0, rows - 1, min(rows, POINTS)).astype(np.intp))

@@ -12,11 +12,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
+
+# Max number of points of a line.
+POINTS: Final = 1500
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +62,21 @@ class Panel:
     def right(self) -> float:
         """Right edge."""
         return self.left + self.width
+
+
+def equal_scales(panel: Panel) -> Panel:
+    """Return a panel of the same width, at most as high, in which a metre has one length.
+
+    The values of the shorter side are extended.
+    """
+    wide, tall = (abs(high - low) for low, high in (panel.x_range, panel.y_range))
+    height = min(max(panel.width * tall / wide, 120.0), panel.height)
+    scale = max(wide / panel.width, tall / height)
+    ranges = [
+        (0.5 * (low + high - scale * size), 0.5 * (low + high + scale * size))
+        for (low, high), size in ((panel.x_range, panel.width), (panel.y_range, height))
+    ]
+    return replace(panel, height=height, x_range=ranges[0], y_range=ranges[1])
 
 
 @dataclass(slots=True)
@@ -171,6 +190,11 @@ class SvgChart:
             self.rule(x, y - 4, x + 14, y - 4, style)
             self.text(x + 18, y, text, "tick", "start")
             x += 30 + 6.2 * len(text)
+
+
+def thinned(rows: int) -> NDArray[np.intp]:
+    """Return the rows of a line to draw, so that the page of an hour's drive stays small."""
+    return np.unique(np.linspace(0, rows - 1, min(rows, POINTS)).astype(np.intp))
 
 
 def ticks(low: float, high: float, max_count: int = 6) -> list[float]:

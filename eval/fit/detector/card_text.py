@@ -34,18 +34,14 @@ def with_fit(text: str, fits: Sequence[ClassFit], pictures: str, aim: str) -> st
         VehicleError: The result would not be a valid card.
     """
     document = toml_document(text)
-    scores = document.setdefault("scores", tomlkit.table(is_super_table=True))
+    _insert_scores(document, fits)
     evidence = [
         row
         for row in document.pop("evidence", [])
         if not str(row.get("note", "")).startswith(WRITTEN_BY)
     ]
     for fit in fits:
-        if fit.scores is None:
-            continue
-        for label in fit.members:
-            scores[label] = _section(fit.scores)
-        if fit.held_out is not None and fit.scores.threshold is not None:
+        if fit.held_out is not None and fit.scores and fit.scores.threshold is not None:
             evidence.append(_evidence(fit, pictures, aim))
     if evidence:
         rows = tomlkit.aot()
@@ -62,6 +58,20 @@ def with_fit(text: str, fits: Sequence[ClassFit], pictures: str, aim: str) -> st
     if is_calibrated != card.is_calibrated:
         _insert_first(document, "is_calibrated", is_calibrated)
     return tomlkit.dumps(document)
+
+
+def scores_text(fits: Sequence[ClassFit]) -> str:
+    """Return the card's sections with thresholds and calibrations; empty without any."""
+    document = tomlkit.document()
+    _insert_scores(document, fits)
+    return tomlkit.dumps(document)
+
+
+def _insert_scores(document: tomlkit.TOMLDocument, fits: Sequence[ClassFit]) -> None:
+    scores = document.setdefault("scores", tomlkit.table(is_super_table=True))
+    for fit in fits:
+        if fit.scores is not None:
+            scores.update({label: _section(fit.scores) for label in fit.members})
 
 
 def _insert_first(document: Any, key: str, value: bool) -> None:

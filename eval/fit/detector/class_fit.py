@@ -13,7 +13,7 @@ bound from one short drive means little for other drives.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
@@ -110,6 +110,7 @@ class ClassFit:
         held_out: Result on held-out pictures; None without a threshold and a calibration.
         notes: Reasons why something was not fitted.
         unit: What is labelled.
+        seen: The detections fitted to, and those held out.
     """
 
     name: str
@@ -121,7 +122,8 @@ class ClassFit:
     bound: float
     held_out: HeldOut | None
     notes: tuple[str, ...]
-    unit: LabelUnit = "boxes"
+    unit: LabelUnit
+    seen: tuple[ClassDetections, ClassDetections] = field(repr=False, compare=False)
 
     @property
     def counted(self) -> tuple[str, str]:
@@ -163,7 +165,10 @@ def fit_class(
     """
     n, right = len(chosen_on.scores), int(chosen_on.is_right.sum())
     unit = chosen_on.unit
-    base = ClassFit(name, members, chosen_on.labels, n, right, None, math.nan, None, (), unit)
+    base = ClassFit(
+        name, members, chosen_on.labels, n, right, None, math.nan, None, (), unit,
+        (chosen_on, held_out),
+    )  # fmt: skip
     if not chosen_on.labels + held_out.labels:
         return replace(base, notes=(NOT_LABELLED,))
     if chosen_on.labels < MIN_LABELS:

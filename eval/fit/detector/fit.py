@@ -8,7 +8,7 @@ from dataclasses import KW_ONLY, asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from crosscue.datasets.truth.box_labels import (
 from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.class_names import class_names_given
 from crosscue.detectors.catalog.places import card_path, names
-from crosscue.eval.fit.detector.card_text import check_card_place, with_fit
+from crosscue.eval.fit.detector.card_text import check_card_place, scores_text, with_fit
 from crosscue.eval.fit.detector.class_fit import (
     CALIBRATIONS,
     NOT_LABELLED,
@@ -30,6 +30,7 @@ from crosscue.eval.fit.detector.class_fit import (
     LabelUnit,
     fit_class,
 )
+from crosscue.eval.fit.vehicle_output import Fitted
 from crosscue.eval.pipeline.run import Run, open_run
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
@@ -39,16 +40,20 @@ from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.safe_text import counted, visible
 from crosscue.replay.time.dates import is_date
-from crosscue.results import HIDDEN, Result, json_key
+from crosscue.results import HIDDEN, json_key
 from crosscue.verb import Option, keywords
+
+if TYPE_CHECKING:
+    from crosscue.eval.report.chart import Chart
 
 CONFIDENCE: Final = 0.95
 # Min IoU of a right detection with a label.
 OVERLAP: Final = 0.5
+MAX_CHARTS: Final = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedDetector(Result):
+class FittedDetector(Fitted):
     """Thresholds and calibrations by class; its repr has a paragraph for each class.
 
     Attributes:
@@ -58,7 +63,6 @@ class FittedDetector(Result):
         fitted_to: Number of pictures that were fitted to.
         held_out: Number of pictures that were held out.
         left_out: Numbers of labels that were left out, by reason.
-        card: Card that was written; None without one.
         is_whole: True if nothing was dropped when the runs were made.
     """
 
@@ -68,10 +72,12 @@ class FittedDetector(Result):
     fitted_to: int = field(metadata=json_key("images_fitted_to"))
     held_out: int = field(metadata=json_key("images_held_out"))
     left_out: Mapping[str, int]
-    card: Path | None
     is_whole: bool = field(default=True, metadata=HIDDEN)
 
+    title: ClassVar = "Thresholds and calibrations of a detector"
+    belongs_in: ClassVar = "model card"
     also: ClassVar = {
+        "card": "path",
         "detector": "detector.name",
         "classes": "classes_in_json",
         "confidence": "confidence",
@@ -99,7 +105,23 @@ class FittedDetector(Result):
         """Fit of each class, as in JSON."""
         return [_class_tree(one) for one in self.classes]
 
-    def lines(self) -> Iterator[str]:
+    @property
+    def toml(self) -> str:
+        """The sections of the card."""
+        return scores_text(self.classes)
+
+    def charts(self) -> Iterator[Chart]:
+        """Yield precision and recall of the first classes that were fitted."""
+        from crosscue.eval.report.chart import precision_and_recall
+
+        for one in [one for one in self.classes if one.scores is not None][:MAX_CHARTS]:
+            parts = zip(("fitted to", "held out"), one.seen, strict=True)
+            yield precision_and_recall(
+                f"{visible(one.name)}: precision and recall above each score of the network",
+                [(name, part.scores, part.is_right, part.labels) for name, part in parts],
+            )
+
+    def report(self) -> Iterator[str]:
         """Yield the numbers of pictures, and the fit of each class."""
         yield (
             f"detector   {self.detector.name}, fitted to {counted(self.fitted_to, 'image')}, "
@@ -108,8 +130,6 @@ class FittedDetector(Result):
         yield from (f"left out   {count:,} {why}" for why, count in self.left_out.items())
         for one in self.classes:
             yield from ("", *_class_lines(one, self.precision))
-        if self.card is not None:
-            yield from ("", f"written to {self.card}")
 
 
 def _class_lines(one: ClassFit, precision: float) -> list[str]:
@@ -333,7 +353,7 @@ def fit_detector(
     left_out = sum((Counter(part.left_out) for part in whole), Counter[str]())
     is_whole = all(part.is_whole for part in whole)
     counts = len(fitted), len(held), left_out
-    return FittedDetector(row, fits, settings.precision, *counts, written, is_whole)
+    return FittedDetector(row, fits, settings.precision, *counts, is_whole, path=written)
 
 
 def _one_detector(parts: Sequence[LabelledRun]) -> DetectorRow:

@@ -6,44 +6,75 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 import numpy as np
 
 from crosscue.datasets.truth.csv_rows import csv_rows
-from crosscue.eval.fit.landmarks.threshold import LandmarkFit, Rate, ScoredPairs, fit_threshold
-from crosscue.eval.fit.vehicle_output import check_output, with_section, write_fit
+from crosscue.eval.fit.landmarks.threshold import (
+    LandmarkFit,
+    Rate,
+    ScoredPairs,
+    fit_threshold,
+    fitted_half,
+)
+from crosscue.eval.fit.vehicle_output import Fitted, check_output, with_section, write_fit
 from crosscue.eval.pipeline.landmarks import matcher_for
 from crosscue.localization.landmarks.features import Keypoints, Matcher
 from crosscue.localization.landmarks.images import grey_of, read_encoded
 from crosscue.replay.errors import AnnotationError, LogError, SchemaError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
-from crosscue.results import HIDDEN, Result
+from crosscue.results import HIDDEN
 from crosscue.verb import Option
+
+if TYPE_CHECKING:
+    from crosscue.eval.report.chart import Chart
 
 MAX_PAIRS: Final = 1_000_000
 _LABELS: Final = {"1": True, "0": False, "true": True, "false": False}
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedLandmarks(Result):
+class FittedLandmarks(Fitted):
     """A fitted match threshold and its rates.
 
     Attributes:
         fitted: The threshold, and the rates on both halves of the pictures.
         matcher: Matcher that the threshold is for.
-        path: Vehicle file that was written; None without one.
+        pairs: The pairs.
     """
 
     fitted: LandmarkFit = field(metadata=HIDDEN)
     matcher: str
-    path: Path | None = field(metadata=HIDDEN)
+    pairs: ScoredPairs = field(metadata=HIDDEN)
 
+    title: ClassVar = "Threshold of landmark matches"
     also: ClassVar = {
         name: f"fitted.{name}" for name in ("is_shown", *LandmarkFit.__dataclass_fields__)
     }
 
-    def lines(self) -> Iterator[str]:
+    @property
+    def toml(self) -> str:
+        """The vehicle file's section."""
+        return f"[landmarks]\nmin_score = {self.fitted.min_score:g}\n"
+
+    def charts(self) -> Iterator[Chart]:
+        """Yield the rates of matches above each score, on both halves."""
+        from crosscue.eval.report.chart import Chart, share_above
+
+        is_fit, pairs = fitted_half(self.pairs), self.pairs
+        yield Chart(
+            f"Fraction of pairs that match above each score; chosen: {self.fitted.min_score:g}",
+            "score",
+            "fraction",
+            [
+                share_above(f"{what}, {half}", pairs.score[which & mine])
+                for what, which in (("same place", pairs.is_same), ("others", ~pairs.is_same))
+                for half, mine in (("fitted", is_fit), ("held out", ~is_fit))
+            ],
+        )
+
+    def report(self) -> Iterator[str]:
         """Yield the threshold, and the rates on both halves."""
         fitted = self.fitted
         yield (
@@ -62,8 +93,6 @@ class FittedLandmarks(Result):
                 f"the {fitted.held_out_false.of} held-out pairs cannot show a rate of "
                 f"{fitted.wanted_rate:g}: it may be up to {fitted.held_out_false.high:.2g}"
             )
-        if self.path is not None:
-            yield f"written to {self.path}"
 
 
 def _rate(rate: Rate) -> str:
@@ -113,7 +142,7 @@ def fit_landmarks(
         output,
         lambda text: with_section(text, "landmarks", {"min_score": fitted.min_score}),
     )
-    return FittedLandmarks(fitted, matcher.kind, path)
+    return FittedLandmarks(fitted, matcher.kind, scored, path=path)
 
 
 def landmark_pairs(path: Path, matcher: Matcher) -> ScoredPairs:

@@ -88,9 +88,7 @@ def fit_threshold(pairs: ScoredPairs, wanted_rate: float, seed: int = 0) -> Land
     Raises:
         ValueError: A half has no two-place pairs.
     """
-    queries = np.unique(pairs.query)
-    chosen = np.random.default_rng(seed).permutation(queries)[: len(queries) // 2]
-    is_fit = np.isin(pairs.query, chosen)
+    is_fit = fitted_half(pairs, seed)
     for name, half in (("first", is_fit), ("second", ~is_fit)):
         if not (half & ~pairs.is_same).any():
             raise ValueError(
@@ -106,6 +104,13 @@ def fit_threshold(pairs: ScoredPairs, wanted_rate: float, seed: int = 0) -> Land
         _false(pairs, min_score, ~is_fit),
         _found(pairs, min_score, ~is_fit),
     )
+
+
+def fitted_half(pairs: ScoredPairs, seed: int = 0) -> NDArray[np.bool_]:
+    """Return the pairs that the threshold is fitted to."""
+    queries = np.unique(pairs.query)
+    chosen = np.random.default_rng(seed).permutation(queries)[: len(queries) // 2]
+    return np.isin(pairs.query, chosen)
 
 
 def _threshold(

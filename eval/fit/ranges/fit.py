@@ -1,11 +1,11 @@
-"""Fit of the curve from heights in pixels to ranges, to tables, drives or runs, and its figure."""
+"""Fit of the curve from heights in pixels to ranges, to tables, drives or runs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -20,17 +20,19 @@ from crosscue.detectors.ranging.height_to_range import (
     range_of,
     residuals,
 )
-from crosscue.eval.fit.vehicle_output import new_file
+from crosscue.eval.fit.vehicle_output import Fitted
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import AnnotationError, EmptyResultError, SchemaError, UsageError
 from crosscue.replay.files import door
 from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import json_tree
-from crosscue.replay.files.whole_file import write_whole
 from crosscue.replay.limits import MIB
-from crosscue.results import HIDDEN, Result
+from crosscue.results import HIDDEN
 from crosscue.verb import Option, keywords
+
+if TYPE_CHECKING:
+    from crosscue.eval.report.chart import Chart
 
 RangeCue: TypeAlias = Literal["stop_sign", "traffic_light"]
 PUBLISHED_SD_M: Final[dict[RangeCue, float]] = {"stop_sign": 1.7, "traffic_light": 5.9}
@@ -42,23 +44,25 @@ REFERENCES: Final[Mapping[str, str]] = {"stop_sign": "start_m", "traffic_light":
 MIN_VISIBLE: Final = 0.9
 # Max time difference between a detection and its true range.
 NEAREST_NS: Final = 20_000_000
-COLOURS = ("#1f77b4", "#ff7f0e", "#2ca02c")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedRanges(Result):
+class FittedRanges(Fitted):
     """Fitted curves from heights to ranges, with residuals by distance.
 
     Attributes:
         cue: Cue whose objects were measured.
         fits: One fit per family of curves.
         tested: Residuals of the best curve on other drives; None without such drives.
+        pairs: What was fitted to.
     """
 
     cue: RangeCue
     fits: tuple[RangeFit, ...] = field(metadata=HIDDEN)
     tested: RangeFit | None = field(metadata=HIDDEN)
+    pairs: RangePairs = field(metadata=HIDDEN)
 
+    title: ClassVar = "Range from height"
     also: ClassVar = {
         "best": "best.curve.family",
         "fits": "fits_in_json",
@@ -80,8 +84,18 @@ class FittedRanges(Result):
         """Residuals on other drives, as in JSON."""
         return None if self.tested is None else _as_json(self.tested)
 
-    def lines(self) -> Iterator[str]:
-        """Yield the residual of each family, those of the best by distance, and its section."""
+    @property
+    def toml(self) -> str:
+        """The vehicle file's section with the best curve."""
+        curve = self.best.curve
+        parameters = ", ".join(f"{p:.6g}" for p in curve.parameters)
+        return (
+            f'[ranges.{self.cue}]\nfamily = "{curve.family}"\nparameters = [{parameters}]\n'
+            f"residual_sd_m = {curve.residual_sd_m:.3f}\n"
+        )
+
+    def report(self) -> Iterator[str]:
+        """Yield the residual of each family, and those of the best by distance."""
         best, tested = self.best, self.tested
         for fit in self.fits:
             yield f"{fit.curve.family:15} residual s.d. {fit.curve.residual_sd_m:.2f} m"
@@ -92,10 +106,37 @@ class FittedRanges(Result):
             sd = tested.curve.residual_sd_m
             yield from ("", f"on other drives, {tested.pairs} pairs, r.m.s. {sd:.2f} m:")
             yield from _bins(tested.bins)
-        parameters = ", ".join(f"{p:.6g}" for p in best.curve.parameters)
-        yield from ("", f"[ranges.{self.cue}]", f'family = "{best.curve.family}"')
-        yield f"parameters = [{parameters}]"
-        yield f"residual_sd_m = {best.curve.residual_sd_m:.3f}"
+
+    def charts(self) -> Iterator[Chart]:
+        """Yield the pairs with each curve, and the residuals by distance."""
+        from crosscue.eval.report.chart import Chart, Series
+
+        height_px, range_m = self.pairs
+        grid_px = np.linspace(height_px.min(), height_px.max(), 400)
+        curves = [
+            Series(one.curve.family, grid_px, range_of(grid_px, one.curve)) for one in self.fits
+        ]
+        yield Chart(
+            "Pairs and curves",
+            f"height of the {LABELS[self.cue]} (px)",
+            "range to the rear axle (m)",
+            (Series("pairs", height_px, range_m, is_line=False), *curves),
+        )
+        parts = [("fitted to", self.best), ("other drives", self.tested)]
+        yield Chart(
+            f"Residual of {self.best.curve.family} by distance",
+            "range (m)",
+            "r.m.s. residual (m)",
+            [
+                Series(
+                    name,
+                    [0.5 * (one.from_m + one.to_m) for one in fit.bins],
+                    [one.rms_m for one in fit.bins],
+                )
+                for name, fit in parts
+                if fit is not None
+            ],
+        )
 
 
 def _pairs_text(fit: RangeFit) -> str:
@@ -132,8 +173,6 @@ class RangeFitSettings:
         min_score: Min score of a detection of the runs.
         family: Fit only this family of curves.
         bin_m: Width of the distance bins.
-        figure: Figure to write, with pairs, curves and residuals.
-        overwrite: Replace an existing figure.
     """
 
     table: Annotated[Path | str | None, Option(metavar="TABLE", is_positional=True)] = None
@@ -144,8 +183,6 @@ class RangeFitSettings:
     min_score: Annotated[float, Option(metavar="P")] = 0.9
     family: Family | None = None
     bin_m: float = 10.0
-    figure: Path | str | None = None
-    overwrite: bool = False
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -177,7 +214,7 @@ def fit_ranges(
 
     Examples:
         crosscue fit ranges stop_signs.csv --cue stop_sign
-        crosscue fit ranges --cue traffic_light --truth drives/L* --test drives/A-01 --figure a.png
+        crosscue fit ranges --cue traffic_light --truth drives/L* --test drives/A-01 --page a.html
         crosscue fit ranges --cue stop_sign --runs runs/A-01 --truth drives/A-01
 
     Args:
@@ -187,23 +224,20 @@ def fit_ranges(
     Raises:
         UsageError: Neither a table nor truth is passed, or a value is out of range.
         EmptyResultError: The drives contain no pairs.
-        OutputError: The figure exists, or cannot be written.
     """
     bin_m = settings.bin_m
-    picture = new_file(settings.figure, overwrite=settings.overwrite)
     if cue not in PUBLISHED_SD_M:
         raise UsageError(f"cue: {cue}, expected one of {', '.join(PUBLISHED_SD_M)}")
     pairs = _pairs(cue, settings)
     others = [pairs_of_truth(Path(one), cue) for one in settings.test]
     names = [name for name in FAMILIES if settings.family in (None, name)]
-    found = FittedRanges(cue, tuple(fit_range(*pairs, name, bin_m) for name in names), None)
+    fits = tuple(fit_range(*pairs, name, bin_m) for name in names)
+    found = FittedRanges(cue, fits, None, pairs)
     if others:
         tested = concatenate_pairs(others)
         if not len(tested.range_m):
             raise EmptyResultError(f"test: the drives contain no {cue}; use others")
         found = replace(found, tested=residuals(*tested, found.best.curve, bin_m))
-    if picture is not None:
-        draw_range_fits(picture, cue, pairs, list(found.fits), found.tested)
     return found
 
 
@@ -362,42 +396,3 @@ def _parquet(path: Path) -> tuple[Floats, ...]:
     with door.arrow_file(path.resolve()) as file:
         table = pq.read_table(file, columns=names, page_checksum_verification=True)
     return tuple(np.asarray(table[name].to_numpy(), np.float64) for name in names)
-
-
-def draw_range_fits(
-    path: Path, cue: str, pairs: RangePairs, fits: list[RangeFit], tested: RangeFit | None
-) -> None:
-    """Write the figure as PNG.
-
-    Args:
-        path: Path of the figure.
-        cue: The cue that was measured.
-        pairs: Pairs that the curves were fitted to.
-        fits: One fit for each family.
-        tested: The best curve with its residuals on other pairs.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    what = cue.replace("_", " ")
-    left.plot(pairs.height_px, pairs.range_m, ".", ms=2, color="#999999", label="pairs")
-    height = np.linspace(pairs.height_px.min(), pairs.height_px.max(), 400)
-    for fit, colour in zip(fits, COLOURS, strict=False):
-        label = f"{fit.curve.family}, s.d. {fit.curve.residual_sd_m:.2f} m"
-        left.plot(height, range_of(height, fit.curve), color=colour, lw=1.5, label=label)
-    left.set(xlabel=f"height of the {what} [px]", ylabel="range to the rear axle [m]")
-    left.set_ylim(0.0, 1.1 * float(pairs.range_m.max()))
-    left.legend(fontsize=8)
-    best = min(fits, key=lambda fit: fit.curve.residual_sd_m)
-    for of, label, colour in ((best, "fitted to", COLOURS[0]), (tested, "others", COLOURS[1])):
-        if of is not None:
-            middle = [(b.from_m + b.to_m) / 2 for b in of.bins]
-            right.plot(middle, [b.rms_m for b in of.bins], "o-", color=colour, label=label)
-    right.set(xlabel="range [m]", ylabel="r.m.s. residual [m]", title=best.curve.family)
-    right.set_ylim(bottom=0.0)
-    right.legend(fontsize=8)
-    write_whole(path, lambda place: figure.savefig(place, dpi=130, format="png"))

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 import numpy as np
 
@@ -19,13 +19,17 @@ from crosscue.detectors.training.operating_point import (
     threshold_at_precision,
 )
 from crosscue.eval.fit.signs.labels import ScoringRules, judged_pictures
+from crosscue.eval.fit.vehicle_output import Fitted
 from crosscue.eval.scoring.intervals import Proportion, between, fraction
 from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.safe_text import counted
-from crosscue.results import HIDDEN, Result, json_key
+from crosscue.results import HIDDEN, json_key
 from crosscue.verb import Option, keywords
+
+if TYPE_CHECKING:
+    from crosscue.eval.report.chart import Chart
 
 LOWEST: Final = 0.05
 # Min IoU of a right detection with a sign.
@@ -41,7 +45,7 @@ class SignRates:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class SignFit(Result):
+class SignFit(Fitted):
     """A threshold and the judged detections behind it.
 
     Attributes:
@@ -54,6 +58,7 @@ class SignFit(Result):
     chosen_on: Sequence[Verdicts] = field(metadata=HIDDEN)
     others: Sequence[Verdicts] = field(metadata=HIDDEN)
 
+    title: ClassVar = "Threshold of the signs"
     also: ClassVar = {"chosen_on": "chosen_rates", "other_frames": "other_rates"}
 
     @property
@@ -85,7 +90,25 @@ class SignFit(Result):
             _fraction([(one.right, one.signs) for one in counts]),
         )
 
-    def lines(self) -> Iterator[str]:
+    @property
+    def toml(self) -> str:
+        """The detector's settings in a vehicle file."""
+        if self.threshold is None:
+            return ""
+        return f"[detectors.signs.settings]\nmin_score = {self.threshold:g}\n"
+
+    def charts(self) -> Iterator[Chart]:
+        """Yield precision and recall on both halves."""
+        from crosscue.eval.report.chart import precision_and_recall
+
+        parts = ("chosen on", self.chosen_on), ("other frames", self.others)
+        judged = [(name, concatenate_verdicts([*part])) for name, part in parts]
+        yield precision_and_recall(
+            "Precision and recall above each score",
+            [(name, one.scores, one.is_right, one.signs) for name, one in judged],
+        )
+
+    def report(self) -> Iterator[str]:
         """Yield the threshold, and precision and recall on both halves."""
         if self.threshold is None:
             signs = sum(part.signs for part in self.chosen_on)
