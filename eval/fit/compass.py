@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
 from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.eval.pipeline.pose import compass_settings
+from crosscue.eval.report.chart import Chart, Series
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.compass import CompassSettings, course_at, heading, level_field
 from crosscue.localization.fit.compass import CompassFit
@@ -26,9 +27,6 @@ from crosscue.verb import Option
 
 from .log_signals import read_signals, signal_plan
 from .vehicle_output import Fitted, check_output, with_section, write_fit
-
-if TYPE_CHECKING:
-    from crosscue.eval.report.chart import Chart
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -47,7 +45,6 @@ class FittedCompass(Fitted):
     field_t: Floats = field(metadata=HIDDEN)
     course_rad: Floats | None = field(metadata=HIDDEN)
 
-    title: ClassVar = "Compass"
     also: ClassVar = {
         "compass": "section",
         "observable": "fitted.observable",
@@ -89,15 +86,13 @@ class FittedCompass(Fitted):
 
     def charts(self) -> Iterator[Chart]:
         """Yield the horizontal field, and the heading against the course."""
-        from crosscue.eval.report.chart import Chart, Series
-
         both = ("values before", self.given), ("fitted", self.fitted.settings)
         yield Chart(
             "Horizontal field of all readings: a circle around the origin without iron",
             "forward (µT)",
             "left (µT)",
             [
-                Series.of(name, 1e6 * level_field(self.field_t, one), is_line=False)
+                Series(name, *(1e6 * level_field(self.field_t, one)[:, :2]).T, is_line=False)
                 for name, one in both
             ],
             is_map=True,

@@ -7,13 +7,14 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from crosscue.eval.fit.annotated_runs import annotated_approaches, read_annotated
 from crosscue.eval.fit.vehicle_output import Fitted, new_file, section_text
 from crosscue.eval.pipeline.run import Run
+from crosscue.eval.report.chart import Chart, Series
 from crosscue.eval.scoring.intervals import Interval, between, mean_by_cluster, wilson
 from crosscue.fusion.fit.fade_fit import FadeFit
 from crosscue.fusion.fit.message_fit import MessageFit, RateFit, Side
@@ -23,9 +24,6 @@ from crosscue.replay.errors import EmptyResultError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.results import HIDDEN
 from crosscue.verb import Option
-
-if TYPE_CHECKING:
-    from crosscue.eval.report.chart import Chart
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -42,7 +40,6 @@ class FittedMessages(Fitted):
     used: Counter[str]
     runs: int = field(metadata=HIDDEN)
 
-    title: ClassVar = "Reliability of each cue"
     also: ClassVar = {
         "approaches": "fitted.approaches",
         "calibrated": "calibrated",
@@ -53,7 +50,27 @@ class FittedMessages(Fitted):
     @property
     def toml(self) -> str:
         """The vehicle file's section ``[fusion.calibrated]``, with counts as comments."""
-        return section_of(self.fitted)
+        learned = self.fitted.calibrated
+        return section_text(
+            "fusion.calibrated",
+            {
+                "rates": [one.model_dump() for one in learned.rates],
+                "exponents": learned.exponents,
+                "fades": {name: fade.model_dump() for name, fade in learned.fades.items()},
+            },
+            {
+                "rates": [
+                    f"{one.there.places} and {one.missing.places} places"
+                    for one in self.fitted.rates
+                    if one.rates is not None
+                ],
+                "fades": [
+                    f"{one.positives} positive of {one.observations} frames"
+                    for one in self.fitted.fades
+                    if one.is_learned
+                ],
+            },
+        )
 
     @property
     def calibrated(self) -> dict[str, Any]:
@@ -95,8 +112,6 @@ class FittedMessages(Fitted):
 
     def charts(self) -> Iterator[Chart]:
         """Yield what was counted and what was learned, for each cue and feature."""
-        from crosscue.eval.report.chart import Chart, Series
-
         both = [one for one in self.fitted.rates if one.there.places and one.missing.places]
         counted = [[_rates_of(side).rate for side in (one.missing, one.there)] for one in both]
         learned = [(one.rates.if_not, one.rates.if_there) for one in both if one.rates is not None]
@@ -107,8 +122,8 @@ class FittedMessages(Fitted):
             "fraction with the feature",
             (
                 Series("a cue that tells nothing", (0.0, 1.0), (0.0, 1.0)),
-                Series.of("counted", _points(counted), is_line=False),
-                Series.of("learned", _points(learned), is_line=False),
+                Series("counted", *_points(counted).T, is_line=False),
+                Series("learned", *_points(learned).T, is_line=False),
             ),
         )
 
@@ -206,31 +221,6 @@ def _rates_of(side: Side) -> _SideRate:
     )
 
 
-def section_of(fit: MessageFit) -> str:
-    """Return the vehicle file's section, with the counts behind each line as comments."""
-    learned = fit.calibrated
-    return section_text(
-        "fusion.calibrated",
-        {
-            "rates": [one.model_dump() for one in learned.rates],
-            "exponents": learned.exponents,
-            "fades": {name: fade.model_dump() for name, fade in learned.fades.items()},
-        },
-        {
-            "rates": [
-                f"{one.there.places} and {one.missing.places} places"
-                for one in fit.rates
-                if one.rates is not None
-            ],
-            "fades": [
-                f"{one.positives} positive of {one.observations} frames"
-                for one in fit.fades
-                if one.is_learned
-            ],
-        },
-    )
-
-
 def fit_messages(
     runs: Sequence[Run | Path | str],
     truth: Annotated[Sequence[Path | str], Option("--truth")],
@@ -273,6 +263,7 @@ def fit_messages(
             f"fit messages: {len(approaches)} approaches are too few to learn from, so every "
             "published message is kept; use more drives with truth"
         )
+    found = FittedMessages(fitted, used, len(runs), path=path)
     if path is not None:
-        write_text(path, section_of(fitted))
-    return FittedMessages(fitted, used, len(runs), path=path)
+        write_text(path, found.toml)
+    return found

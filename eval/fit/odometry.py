@@ -6,13 +6,14 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 import tomlkit
 
 from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.eval.pipeline.pose import odometry_settings, turn_signal_of
+from crosscue.eval.report.chart import Chart, Series
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.localization.angles import circular_mean, wrap_all
 from crosscue.localization.constants import NO_CONSTANTS, TURN_PARAMETERS
@@ -34,9 +35,6 @@ from crosscue.verb import Option
 from .log_signals import read_signals, signal_plan, turn_samples, wheel_speeds
 from .reference import ReferencePositions, of_gnss, of_truth
 from .vehicle_output import Fitted, check_output, write_fit
-
-if TYPE_CHECKING:
-    from crosscue.eval.report.chart import Chart
 
 SHARED: Final = (
     "wheel_scale",
@@ -138,7 +136,6 @@ class FittedOdometry(Fitted):
 
     fitted: DriveFit = field(metadata=HIDDEN)
 
-    title: ClassVar = "Odometry"
     also: ClassVar = {
         "odometry": "section",
         "camera_yaw_rad": "camera_yaw_rad",
@@ -203,8 +200,6 @@ class FittedOdometry(Fitted):
 
     def charts(self) -> Iterator[Chart]:
         """Yield the way by odometry alone, and its error, for each source of turns."""
-        from crosscue.eval.report.chart import Chart, Series
-
         for one in self.fitted.sources:
             known_m, t_s = one.drive.fixes.xy_m, one.drive.seconds
             before_m, after_m = (
@@ -215,9 +210,9 @@ class FittedOdometry(Fitted):
                 "east (m)",
                 "north (m)",
                 (
-                    Series.of("values before", before_m),
-                    Series.of("fitted", after_m),
-                    Series.of("known positions", known_m, is_line=False, is_truth=True),
+                    Series("values before", *before_m.T),
+                    Series("fitted", *after_m.T),
+                    Series("known positions", *known_m.T, is_line=False, is_truth=True),
                 ),
                 is_map=True,
             )

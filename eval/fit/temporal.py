@@ -6,13 +6,14 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
 from crosscue.eval.fit.annotated_runs import annotated_drives, read_annotated
 from crosscue.eval.fit.vehicle_output import Fitted, new_file, section_text
 from crosscue.eval.pipeline.run import Run
+from crosscue.eval.report.chart import Chart, Series
 from crosscue.eval.scoring.scene.trade import Reached, TradePoint, reached, trade_off
 from crosscue.fusion.factor_graph import FactorGraph
 from crosscue.fusion.fit.combined_fit import combined_beliefs, fit_combined
@@ -24,9 +25,6 @@ from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.vehicle.temporal import Combined
 from crosscue.results import HIDDEN
 from crosscue.verb import Option
-
-if TYPE_CHECKING:
-    from crosscue.eval.report.chart import Chart
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -45,7 +43,6 @@ class FittedTemporal(Fitted):
     threshold: TradePoint | None
     runs: int
 
-    title: ClassVar = "Belief over time"
     also: ClassVar = {
         "drives": "fitted.drives",
         "places": "fitted.places",
@@ -57,7 +54,19 @@ class FittedTemporal(Fitted):
     @property
     def toml(self) -> str:
         """The vehicle file's section ``[fusion]``, with those of both beliefs."""
-        return section_of(self.fitted, self.combined, self.threshold)
+        fit = self.fitted
+        text = f"# Learned from {fit.drives} drives at {fit.places} places, {fit.steps} steps.\n"
+        for name, one in (("temporal", fit.temporal), ("combined", self.combined)):
+            text += section_text(f"fusion.{name}", one.model_dump(exclude_unset=True)) + "\n"
+        text, fusion = text.rstrip("\n") + "\n", dict[str, object](kind="combined")
+        if self.threshold is None:
+            return f"{section_text('fusion', fusion)}\n{text}"
+        # Rounded up, for no more false features than wanted.
+        established = min(max(math.ceil(1e4 * self.threshold.threshold) / 1e4, 0.01), 0.9999)
+        withdrawn = min(0.5, round(0.5 * established, 4))
+        fusion |= {"established": established, "withdrawn": withdrawn}
+        wanted = f"# At most {self.threshold.wanted:g} false features a drive, on held-out places."
+        return f"{wanted}\n{section_text('fusion', fusion)}\n{text}"
 
     @property
     def temporal(self) -> dict[str, Any]:
@@ -95,33 +104,15 @@ class FittedTemporal(Fitted):
 
     def charts(self) -> Iterator[Chart]:
         """Yield the log score of each exponent and lapse on held-out places."""
-        from crosscue.eval.report.chart import Chart, Series
-
         scores = self.fitted.log_scores
         series = []
         for lapse in sorted({lapse for _, lapse in scores}):
             mine = sorted(
                 (exponent, value) for (exponent, at), value in scores.items() if at == lapse
             )
-            series.append(Series.of(f"lapse {lapse:g}", np.array(mine, np.float64)))
+            series.append(Series(f"lapse {lapse:g}", *np.array(mine, np.float64).T))
         title = "Log score on held-out places; the smallest was chosen"
         yield Chart(title, "exponent", "log score", series)
-
-
-def section_of(fit: TemporalFit, combined: Combined, threshold: TradePoint | None) -> str:
-    """Return the vehicle file's sections, with the numbers of drives and places as a comment."""
-    text = f"# Learned from {fit.drives} drives at {fit.places} places, {fit.steps} steps.\n"
-    for name, one in (("temporal", fit.temporal), ("combined", combined)):
-        text += section_text(f"fusion.{name}", one.model_dump(exclude_unset=True)) + "\n"
-    text, fusion = text.rstrip("\n") + "\n", dict[str, object](kind="combined")
-    if threshold is None:
-        return f"{section_text('fusion', fusion)}\n{text}"
-    # Rounded up, for no more false features than wanted.
-    established = min(max(math.ceil(1e4 * threshold.threshold) / 1e4, 0.01), 0.9999)
-    withdrawn = min(0.5, round(0.5 * established, 4))
-    fusion |= {"established": established, "withdrawn": withdrawn}
-    wanted = f"# At most {threshold.wanted:g} false features a drive, on held-out places."
-    return f"{wanted}\n{section_text('fusion', fusion)}\n{text}"
 
 
 def held_out_threshold(
@@ -201,6 +192,7 @@ def fit_temporal(
         raise EmptyResultError(
             f"fit temporal: {len(drives)} drives are too few to learn from: {error}; use more"
         ) from None
+    found = FittedTemporal(fitted, combined, threshold, len(runs), path=path)
     if path is not None:
-        write_text(path, section_of(fitted, combined, threshold))
-    return FittedTemporal(fitted, combined, threshold, len(runs), path=path)
+        write_text(path, found.toml)
+    return found

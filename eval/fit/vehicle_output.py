@@ -12,18 +12,17 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import tomlkit
 
+from crosscue.eval.report.chart import Chart
+from crosscue.eval.report.html import write_page
 from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files.tree_text import toml_document
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
 from crosscue.results import HIDDEN, Result, printed
-
-if TYPE_CHECKING:
-    from crosscue.eval.report.chart import Chart
 
 # Vehicle file with only default values.
 DEFAULTS: Final = "version = 1\n"
@@ -35,12 +34,10 @@ class Fitted(Result):
 
     Attributes:
         path: File that the fit was written to; None without one.
-        title: Title of its page.
         belongs_in: File that its section belongs in.
     """
 
     path: Path | None = field(default=None, kw_only=True, metadata=HIDDEN)
-    title: ClassVar[str]
     belongs_in: ClassVar[str] = "vehicle file"
 
     @property
@@ -74,10 +71,8 @@ class Fitted(Result):
         Raises:
             OutputError: The page cannot be written.
         """
-        from crosscue.eval.report.html import write_page
-
         content = {
-            "title": self.title,
+            "title": (type(self).__doc__ or "").partition(".\n")[0],
             "report": "\n".join(printed(self.report())),
             "charts": [one for one in self.charts() if not one.is_empty],
             "section": self.toml,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Final
 
 import numpy as np
@@ -36,15 +36,9 @@ class Series:
     name: str
     x: Floats | Sequence[float]
     y: Floats | Sequence[float]
+    _: KW_ONLY
     is_line: bool = True
     is_truth: bool = False
-
-    @classmethod
-    def of(
-        cls, name: str, points: Floats, *, is_line: bool = True, is_truth: bool = False
-    ) -> Series:
-        """Return the series of points of shape (N, 2)."""
-        return cls(name, points[:, 0], points[:, 1], is_line, is_truth)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ from dataclasses import KW_ONLY, asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from crosscue.eval.fit.detector.class_fit import (
 )
 from crosscue.eval.fit.vehicle_output import Fitted
 from crosscue.eval.pipeline.run import Run, open_run
+from crosscue.eval.report.chart import Chart, precision_and_recall
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
@@ -43,9 +44,6 @@ from crosscue.replay.time.dates import is_date
 from crosscue.results import HIDDEN, json_key
 from crosscue.verb import Option, keywords
 
-if TYPE_CHECKING:
-    from crosscue.eval.report.chart import Chart
-
 CONFIDENCE: Final = 0.95
 # Min IoU of a right detection with a label.
 OVERLAP: Final = 0.5
@@ -54,7 +52,7 @@ MAX_CHARTS: Final = 12
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FittedDetector(Fitted):
-    """Thresholds and calibrations by class; its repr has a paragraph for each class.
+    """Thresholds and calibrations of a detector, by class.
 
     Attributes:
         detector: The detector, as it ran.
@@ -74,7 +72,6 @@ class FittedDetector(Fitted):
     left_out: Mapping[str, int]
     is_whole: bool = field(default=True, metadata=HIDDEN)
 
-    title: ClassVar = "Thresholds and calibrations of a detector"
     belongs_in: ClassVar = "model card"
     also: ClassVar = {
         "card": "path",
@@ -112,8 +109,6 @@ class FittedDetector(Fitted):
 
     def charts(self) -> Iterator[Chart]:
         """Yield precision and recall of the first classes that were fitted."""
-        from crosscue.eval.report.chart import precision_and_recall
-
         for one in [one for one in self.classes if one.scores is not None][:MAX_CHARTS]:
             parts = zip(("fitted to", "held out"), one.seen, strict=True)
             yield precision_and_recall(

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final
+from typing import Annotated, ClassVar, Final
 
 import numpy as np
 
@@ -20,15 +20,13 @@ from crosscue.eval.fit.landmarks.threshold import (
 )
 from crosscue.eval.fit.vehicle_output import Fitted, check_output, with_section, write_fit
 from crosscue.eval.pipeline.landmarks import matcher_for
+from crosscue.eval.report.chart import Chart, share_above
 from crosscue.localization.landmarks.features import Keypoints, Matcher
 from crosscue.localization.landmarks.images import grey_of, read_encoded
 from crosscue.replay.errors import AnnotationError, LogError, SchemaError, UsageError
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN
 from crosscue.verb import Option
-
-if TYPE_CHECKING:
-    from crosscue.eval.report.chart import Chart
 
 MAX_PAIRS: Final = 1_000_000
 _LABELS: Final = {"1": True, "0": False, "true": True, "false": False}
@@ -48,7 +46,6 @@ class FittedLandmarks(Fitted):
     matcher: str
     pairs: ScoredPairs = field(metadata=HIDDEN)
 
-    title: ClassVar = "Threshold of landmark matches"
     also: ClassVar = {
         name: f"fitted.{name}" for name in ("is_shown", *LandmarkFit.__dataclass_fields__)
     }
@@ -60,8 +57,6 @@ class FittedLandmarks(Fitted):
 
     def charts(self) -> Iterator[Chart]:
         """Yield the rates of matches above each score, on both halves."""
-        from crosscue.eval.report.chart import Chart, share_above
-
         is_fit, pairs = fitted_half(self.pairs), self.pairs
         yield Chart(
             f"Fraction of pairs that match above each score; chosen: {self.fitted.min_score:g}",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
+from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from crosscue.detectors.ranging.height_to_range import (
     residuals,
 )
 from crosscue.eval.fit.vehicle_output import Fitted
+from crosscue.eval.report.chart import Chart, Series
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import AnnotationError, EmptyResultError, SchemaError, UsageError
@@ -30,9 +31,6 @@ from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
 from crosscue.results import HIDDEN
 from crosscue.verb import Option, keywords
-
-if TYPE_CHECKING:
-    from crosscue.eval.report.chart import Chart
 
 RangeCue: TypeAlias = Literal["stop_sign", "traffic_light"]
 PUBLISHED_SD_M: Final[dict[RangeCue, float]] = {"stop_sign": 1.7, "traffic_light": 5.9}
@@ -62,7 +60,6 @@ class FittedRanges(Fitted):
     tested: RangeFit | None = field(metadata=HIDDEN)
     pairs: RangePairs = field(metadata=HIDDEN)
 
-    title: ClassVar = "Range from height"
     also: ClassVar = {
         "best": "best.curve.family",
         "fits": "fits_in_json",
@@ -109,8 +106,6 @@ class FittedRanges(Fitted):
 
     def charts(self) -> Iterator[Chart]:
         """Yield the pairs with each curve, and the residuals by distance."""
-        from crosscue.eval.report.chart import Chart, Series
-
         height_px, range_m = self.pairs
         grid_px = np.linspace(height_px.min(), height_px.max(), 400)
         curves = [

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from crosscue.detectors.training.operating_point import (
 )
 from crosscue.eval.fit.signs.labels import ScoringRules, judged_pictures
 from crosscue.eval.fit.vehicle_output import Fitted
+from crosscue.eval.report.chart import Chart, precision_and_recall
 from crosscue.eval.scoring.intervals import Proportion, between, fraction
 from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
@@ -27,9 +28,6 @@ from crosscue.replay.progress import Progress, emit
 from crosscue.replay.safe_text import counted
 from crosscue.results import HIDDEN, json_key
 from crosscue.verb import Option, keywords
-
-if TYPE_CHECKING:
-    from crosscue.eval.report.chart import Chart
 
 LOWEST: Final = 0.05
 # Min IoU of a right detection with a sign.
@@ -58,7 +56,6 @@ class SignFit(Fitted):
     chosen_on: Sequence[Verdicts] = field(metadata=HIDDEN)
     others: Sequence[Verdicts] = field(metadata=HIDDEN)
 
-    title: ClassVar = "Threshold of the signs"
     also: ClassVar = {"chosen_on": "chosen_rates", "other_frames": "other_rates"}
 
     @property
@@ -99,8 +96,6 @@ class SignFit(Fitted):
 
     def charts(self) -> Iterator[Chart]:
         """Yield precision and recall on both halves."""
-        from crosscue.eval.report.chart import precision_and_recall
-
         parts = ("chosen on", self.chosen_on), ("other frames", self.others)
         judged = [(name, concatenate_verdicts([*part])) for name, part in parts]
         yield precision_and_recall(
