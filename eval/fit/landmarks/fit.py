@@ -128,8 +128,9 @@ def fit_landmarks(
         raise UsageError(f"false_match_rate: {false_match_rate:g}, expected 0 or more, below 1")
     check_output(vehicle, output, overwrite=overwrite)
     matcher = matcher_for(vehicle_given(vehicle))
+    scored = landmark_pairs(Path(pairs), matcher)
     try:
-        fitted = fit_threshold(landmark_pairs(Path(pairs), matcher), false_match_rate)
+        fitted = fit_threshold(scored, false_match_rate)
     except ValueError as error:
         raise SchemaError(f"fit landmarks: {error}; use more labelled pictures") from None
     path = write_fit(
