@@ -33,7 +33,6 @@ METAVARS: Final = {
     "precision": "P",
     "overlap": "IOU",
     "ray": "ADDRESS",
-    "figure": "PNG",
     "junit": "XML",
     "log": "LOG",
     "logs": "LOG",

@@ -166,7 +166,7 @@ READS_DBC_FILES: Final[dict[str, str]] = {
     "info": "{log} --vehicle {vehicle}",
 }
 # Options whose file is created if it is missing.
-WRITTEN: Final = {"--output", "--junit", "--cache", "--figure"}
+WRITTEN: Final = {"--output", "--junit", "--cache", "--page"}
 # Arguments that are not files.
 NO_FILES: Final = {"LAYOUT", "NAME", "SQL"}
 # Commands whose arguments accept any file, or no file.
