@@ -78,7 +78,6 @@ def run_range_study(
     output: Path | str = ...,
     *,
     workers: int | None = None,
-    ray: str | None = None,
     overwrite: bool = False,
 ) -> TownResult: ...
 @overload
@@ -90,7 +89,6 @@ def run_range_study(
     output: Path | str = "study-range",
     *,
     workers: int | None = None,
-    ray: str | None = None,
     overwrite: bool = False,
     calibrate: bool = False,
 ) -> TownResult | Calibration:
@@ -110,7 +108,6 @@ def run_range_study(
         study: Settings of the study.
         output: Folder for drives, summary, figures and page.
         workers: Number of threads (default: all cores).
-        ray: Run on a Ray cluster: its address, auto, or local.
         overwrite: Replace existing results of another study.
         calibrate: Find the compass interval that yields the published 9.3 km at 30 degrees, with
             separate seeds, instead of running the study.
@@ -121,7 +118,7 @@ def run_range_study(
     """
     if calibrate:
         return Calibration(range_study.calibrate(study.drive, workers_of(workers)))
-    return _finished(study, Path(output), workers, ray, finish_range, overwrite=overwrite)
+    return _finished(study, Path(output), workers, finish_range, overwrite=overwrite)
 
 
 def run_landmark_study(
@@ -129,7 +126,6 @@ def run_landmark_study(
     output: Path | str = "study-landmarks",
     *,
     workers: int | None = None,
-    ray: str | None = None,
     overwrite: bool = False,
 ) -> TownResult:
     """Measure the success rate of 3 strategies with landmarks.
@@ -147,26 +143,24 @@ def run_landmark_study(
         study: Settings of the study.
         output: Folder for drives, summary, figures and page.
         workers: Number of threads (default: all cores).
-        ray: Run on a Ray cluster: its address, auto, or local.
         overwrite: Replace existing results of another study.
 
     Raises:
         UsageError: A value is out of range.
         RunError: The folder contains another study's results.
     """
-    return _finished(study, Path(output), workers, ray, finish_landmarks, overwrite=overwrite)
+    return _finished(study, Path(output), workers, finish_landmarks, overwrite=overwrite)
 
 
 def _finished(
     study: RangeStudy | LandmarkStudy,
     folder: Path,
     workers: int | None,
-    ray: str | None,
     finish: Callable[[Any, Path], Written],
     *,
     overwrite: bool,
 ) -> TownResult:
-    for done in drive_study(study, folder, workers_of(workers), ray, overwrite=overwrite):
+    for done in drive_study(study, folder, workers_of(workers), overwrite=overwrite):
         emit(Progress("driving", 100.0 * done, 100.0, "percent"))
     made = finish(study, folder)
     return TownResult(folder, made.tables, made.notes, study)
@@ -176,7 +170,6 @@ def drive_study(
     study: RangeStudy | LandmarkStudy,
     folder: Path,
     workers: int,
-    ray_address: str | None = None,
     *,
     overwrite: bool = False,
 ) -> Iterator[float]:
@@ -190,7 +183,7 @@ def drive_study(
     claim(folder / SUMMARY, study.model_dump(mode="json"), "study", overwrite=overwrite)
     with locked(RunFolder(folder)):
         chunks = chunks_of(study.cases(), study.drives, study.seed)
-        for done in run(chunks, folder, workers, ray_address):
+        for done in run(chunks, folder, workers):
             yield done / len(chunks)
         assemble(chunks, folder)
 

@@ -16,11 +16,10 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from crosscue.eval.batch.ray_jobs import connect_ray
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.columns import REAL, SMALL, TEXT, Column, arrow_schema
 from crosscue.eval.runs.tables.parquet import TableSink
@@ -114,7 +113,6 @@ def run(
     chunks: Sequence[DriveBatch],
     folder: Path,
     workers: int,
-    ray_address: str | None = None,
     drive: DriveMany = drive_many,
 ) -> Iterator[int]:
     """Simulate the missing chunks, and yield the number of finished chunks.
@@ -122,14 +120,11 @@ def run(
     Args:
         chunks: Chunks from ``chunks_of``.
         folder: Folder of the study; finished chunks are in its folder ``chunks``.
-        workers: Number of threads on this machine, or of cores of a local Ray cluster.
-        ray_address: Address of a Ray cluster to run on; ``local`` starts one on this machine.
+        workers: Number of threads.
         drive: Function that simulates drives.
 
     Raises:
         WorkerError: A worker died; finished chunks are kept.
-        UsageError: Ray is requested but not installed.
-        CrosscueError: The cluster cannot be reached or started.
         OutputError: The disk is full.
     """
     kept = RunFolder(folder / CHUNKS)
@@ -139,12 +134,7 @@ def run(
     yield done
     if not missing:
         return
-    finished = (
-        _on_threads(missing, workers, drive)
-        if ray_address is None
-        else _on_ray(missing, workers, ray_address)
-    )
-    for chunk, rows in finished:
+    for chunk, rows in _on_threads(missing, workers, drive):
         with TableSink(kept, chunk.name, arrow_schema(RESULTS)) as sink:
             sink.write(dict(zip(DriveResult._fields, rows.T, strict=True)))
         done += 1
@@ -237,40 +227,3 @@ def _result(get: Callable[[], Floats]) -> Floats:
         raise WorkerError(
             f"study: a worker ran out of memory ({error}); finished chunks are kept: run again"
         ) from None
-
-
-def _on_ray(
-    chunks: Sequence[DriveBatch], workers: int, address: str
-) -> Iterator[tuple[DriveBatch, Floats]]:
-    with connect_ray(address, workers) as ray:
-        drive = ray.remote(max_retries=2)(_drive_chunk)
-        max_running = 2 * max(int(ray.cluster_resources().get("CPU", 1)), 1)
-        waiting = deque(chunks)
-        running: dict[Any, DriveBatch] = {}
-        while waiting or running:
-            while waiting and len(running) < max_running:
-                chunk = waiting.popleft()
-                running[drive.remote(chunk)] = chunk
-            ready, _ = ray.wait(list(running), num_returns=1)
-            for reference in ready:
-                yield running.pop(reference), _from_ray(ray, reference)
-
-
-def _drive_chunk(chunk: DriveBatch) -> Floats:
-    return drive_many(chunk.settings, chunk.seeds())
-
-
-def _from_ray(ray: Any, reference: Any) -> Floats:
-    try:
-        rows: Floats = ray.get(reference)
-    except ray.exceptions.RayTaskError as error:
-        cause = error.cause
-        if isinstance(cause, ValueError):
-            raise UsageError(f"study: {cause}; change [drive.city] in the study file") from None
-        raise WorkerError(f"study: a worker failed: {cause}; finished chunks are kept") from None
-    except ray.exceptions.RayError as error:
-        why = str(error).strip().splitlines()[0]
-        raise WorkerError(
-            f"study: a worker died more than twice: {why}; finished chunks are kept: run again"
-        ) from None
-    return rows

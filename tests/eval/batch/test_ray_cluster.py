@@ -15,11 +15,9 @@ import pytest
 
 from crosscue.eval.batch.jobs import exit_status_of, in_turn, run_many
 from crosscue.eval.batch.ray_jobs import LOCAL, OnRay, connect_ray
-from crosscue.eval.studies.town import work
 from crosscue.eval.studies.town.settings import LandmarkStudy
-from crosscue.eval.studies.town.work import assemble, chunks_of, run
 from crosscue.localization.town.settings import City, TownDrive
-from crosscue.replay.errors import CrosscueError, WorkerError
+from crosscue.replay.errors import CrosscueError
 from support.drive_work import letters, write_jobs
 from support.trees import tree
 
@@ -106,20 +104,3 @@ def test_drives_on_ray_equal_one_process_despite_dead_workers(
     assert [tree(job.run) for job in there] == [tree(job.run) for job in here]
     assert all(tree(job.run) or job.name == "drive2" for job in here)
     assert capfd.readouterr().out == ""
-
-
-@pytest.mark.slow
-@needs_ray
-def test_study_on_ray_equals_threads_and_reports_dead_workers(
-    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chunks = chunks_of(STUDY.cases(), STUDY.drives, STUDY.seed)
-    for name, address in (("ray", LOCAL), ("threads", None)):
-        list(run(chunks, tmp_path / name, 1, ray_address=address))
-        assemble(chunks, tmp_path / name)
-    rays, threads = (tmp_path / name / "drives.parquet" for name in ("ray", "threads"))
-    assert rays.read_bytes() == threads.read_bytes()
-
-    monkeypatch.setattr(work, "_drive_chunk", lambda chunk: os._exit(1))
-    with pytest.raises(WorkerError, match="worker died"):
-        list(run(chunks, tmp_path / "dead", 1, ray_address=LOCAL))
