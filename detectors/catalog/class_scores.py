@@ -9,16 +9,13 @@ calibration = {kind = "platt", slope = 1.4, offset = 0.3}
 
 from __future__ import annotations
 
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from crosscue.detectors.settings import Proportion, Settings
-
-# Weight of the network's score in ``Isotonic``, so that no two scores become equal.
-ORDER: Final = 1e-6
 
 
 class Platt(Settings):
@@ -35,31 +32,10 @@ class Platt(Settings):
         return np.asarray(1.0 / (1.0 + np.exp(-logit)), np.float64)
 
 
-class Isotonic(Settings):
-    """Isotonic calibration: increasing, piecewise linear, and constant outside the points."""
-
-    kind: Literal["isotonic"]
-    scores: Annotated[tuple[Proportion, ...], Field(min_length=1, max_length=1000)]
-    fractions: tuple[Proportion, ...]
-
-    @model_validator(mode="after")
-    def _increasing(self) -> Self:
-        if len(self.fractions) != len(self.scores):
-            raise ValueError(f"fractions: expected {len(self.scores)}, as many as scores")
-        if (np.diff(self.scores) <= 0.0).any() or (np.diff(self.fractions) < 0.0).any():
-            raise ValueError("scores and fractions: expected increasing numbers")
-        return self
-
-    def probabilities(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
-        """As ``Platt.probabilities``."""
-        found = np.interp(scores, self.scores, self.fractions)
-        return np.asarray((1.0 - ORDER) * found + ORDER * scores, np.float64)
-
-
 class ClassScores(Settings):
     """Threshold and calibration of one class."""
 
     threshold: Proportion | None = None
     """Calibrated score above which a detection is a cue; the vehicle file can override it."""
-    calibration: Annotated[Platt | Isotonic, Field(discriminator="kind")] | None = None
+    calibration: Platt | None = None
     """Maps the network's score to the fraction of such detections that are correct."""

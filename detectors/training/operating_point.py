@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.boxes import box_ious
-from crosscue.detectors.catalog.class_scores import Isotonic, Platt
+from crosscue.detectors.catalog.class_scores import Platt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,23 +130,3 @@ def fit_platt(scores: NDArray[np.float64], is_right: NDArray[np.bool_]) -> Platt
     best = minimize(cost, np.zeros(2), method="Nelder-Mead").x
     slope, offset = float(np.clip(np.exp(best[0]), 0.05, 20.0)), float(np.clip(best[1], -20, 20))
     return Platt(kind="platt", slope=round(slope, 5), offset=round(offset, 5))
-
-
-def fit_isotonic(scores: NDArray[np.float64], is_right: NDArray[np.bool_]) -> Isotonic:
-    """Isotonic regression, with its steps joined at their centres.
-
-    Args:
-        scores: Shape (N,), in [0, 1].
-        is_right: Shape (N,).
-    """
-    from scipy.optimize import isotonic_regression
-
-    order = np.argsort(scores, kind="stable")
-    level = np.asarray(isotonic_regression(is_right[order].astype(np.float64)).x, np.float64)
-    starts = np.flatnonzero(np.diff(level, prepend=-1.0) > 1e-12)
-    steps = [part.mean() for part in np.split(scores[order], starts[1:])]
-    middles, which = np.unique(np.round(steps, 6), return_index=True)
-    fractions = np.round(level[starts][which], 6)
-    return Isotonic(
-        kind="isotonic", scores=tuple(middles.tolist()), fractions=tuple(fractions.tolist())
-    )

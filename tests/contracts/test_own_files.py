@@ -199,7 +199,6 @@ PAST_THE_DOOR: Final[dict[str, str]] = {
     "eval/runs/folder.py": "copies files of ours that are no links, and reads this machine's",
     "eval/runs/tables/parquet.py": HANDLE,
     "eval/studies/simulated_drives.py": PACKAGE,
-    "eval/studies/town/work.py": PACKAGE,
     "localization/landmarks/database.py": NAMED,
     "replay/can/layout_cache.py": PACKAGE,
     "replay/compiled.py": PACKAGE,

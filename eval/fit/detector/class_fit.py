@@ -19,16 +19,16 @@ from typing import Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.catalog.class_scores import ClassScores, Isotonic, Platt
-from crosscue.detectors.training.operating_point import fit_isotonic, fit_platt
+from crosscue.detectors.catalog.class_scores import ClassScores, Platt
+from crosscue.detectors.training.operating_point import fit_platt
 from crosscue.eval.scoring.boxes.reliability import class_calibration
 from crosscue.eval.scoring.intervals import Interval, lower_bound, wilson
 from crosscue.replay.safe_text import counted
 
-CalibrationKind: TypeAlias = Literal["platt", "isotonic", "none"]
+CalibrationKind: TypeAlias = Literal["platt", "none"]
 # What is labelled: boxes, or whether a picture shows such an object.
 LabelUnit: TypeAlias = Literal["boxes", "pictures"]
-CALIBRATIONS: Final[tuple[CalibrationKind, ...]] = ("platt", "isotonic", "none")
+CALIBRATIONS: Final[tuple[CalibrationKind, ...]] = ("platt", "none")
 NOT_LABELLED: Final = "not labelled"
 # Min number of labelled boxes to fit a class.
 MIN_LABELS: Final = 20
@@ -193,16 +193,14 @@ def fit_class(
     return replace(base, scores=scores, bound=found.bound, held_out=held, notes=tuple(notes))
 
 
-def _calibration(judged: ClassDetections, kind: CalibrationKind) -> Platt | Isotonic | None:
+def _calibration(judged: ClassDetections, kind: CalibrationKind) -> Platt | None:
     right = int(judged.is_right.sum())
     if kind == "none" or min(right, len(judged.is_right) - right) < MIN_EACH:
         return None
-    return (fit_platt if kind == "platt" else fit_isotonic)(judged.scores, judged.is_right)
+    return fit_platt(judged.scores, judged.is_right)
 
 
-def _applied(
-    calibration: Platt | Isotonic | None, scores: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _applied(calibration: Platt | None, scores: NDArray[np.float64]) -> NDArray[np.float64]:
     return scores if calibration is None else calibration.probabilities(scores)
 
 

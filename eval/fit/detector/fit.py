@@ -167,9 +167,7 @@ def _calibration_text(one: ClassFit) -> str:
     assert one.scores is not None
     found = one.scores.calibration
     assert found is not None
-    if found.kind == "platt":
-        return f"platt, slope {found.slope:g}, offset {found.offset:g}"
-    return f"isotonic, {len(found.scores)} points"
+    return f"platt, slope {found.slope:g}, offset {found.offset:g}"
 
 
 def _class_tree(one: ClassFit) -> dict[str, Any]:

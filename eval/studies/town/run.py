@@ -18,7 +18,7 @@ from crosscue.verb import Option
 
 from . import drive_figure, landmark_study, range_study
 from .settings import LandmarkStudy, RangeStudy, drives_of
-from .work import DRIVES, assemble, chunks_of, run, split, workers_of
+from .work import DRIVES, chunks_of, run, split, workers_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -95,9 +95,8 @@ def run_range_study(
     """Measure the range without landmarks on 4,000 simulated drives.
 
     There are drives with three compasses and with none. Each goes from goal to goal until its
-    2-sigma ellipse is longer than 100 m. Results are shown next to the published ones. An
-    interrupted study continues where it stopped. The result does not depend on the number of
-    workers.
+    2-sigma ellipse is longer than 100 m. Results are shown next to the published ones. The result
+    does not depend on the number of workers.
 
     Examples:
         crosscue study range -o range
@@ -132,8 +131,8 @@ def run_landmark_study(
 
     The study has 52,500 drives, 700 for each of 5 landmark densities and 5 detection rates. It
     reports the success rate by distance to the goal, the range at 80 % success, and how much
-    farther the strategies drive, next to the published numbers. An interrupted study continues
-    where it stopped. The result does not depend on the number of workers.
+    farther the strategies drive, next to the published numbers. The result does not depend on the
+    number of workers.
 
     Examples:
         crosscue study landmarks -o landmarks
@@ -185,7 +184,6 @@ def drive_study(
         chunks = chunks_of(study.cases(), study.drives, study.seed)
         for done in run(chunks, folder, workers):
             yield done / len(chunks)
-        assemble(chunks, folder)
 
 
 def finish_range(study: RangeStudy, folder: Path) -> Written:

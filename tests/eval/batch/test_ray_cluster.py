@@ -15,8 +15,6 @@ import pytest
 
 from crosscue.eval.batch.jobs import exit_status_of, in_turn, run_many
 from crosscue.eval.batch.ray_jobs import LOCAL, OnRay, connect_ray
-from crosscue.eval.studies.town.settings import LandmarkStudy
-from crosscue.localization.town.settings import City, TownDrive
 from crosscue.replay.errors import CrosscueError
 from support.drive_work import letters, write_jobs
 from support.trees import tree
@@ -27,13 +25,6 @@ pytestmark = [
 ]
 needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed")
 WORDS = ("plain", "dies once", "damaged", "loss", "dies", "last")
-STUDY = LandmarkStudy(
-    drives=2,
-    drive=TownDrive(city=City(largest_km2=2.0)),
-    densities_per_km2=(0.5,),
-    detection_rates=(0.6,),
-    points=(),
-)
 
 
 @pytest.fixture(scope="module")

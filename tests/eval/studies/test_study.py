@@ -1,12 +1,6 @@
-"""Studies: reproducible with any number of workers, resumed after a stop, with checked input."""
+"""Studies: reproducible with any number of workers, with checked input."""
 
 import math
-import os
-import signal
-import subprocess
-import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -28,23 +22,12 @@ from crosscue.eval.studies.town.range_study import calibrate, drive_choices, sum
 from crosscue.eval.studies.town.replayed import through_log
 from crosscue.eval.studies.town.run import drive_study, finish_landmarks, finish_range
 from crosscue.eval.studies.town.settings import FieldStudy, LandmarkStudy, RangeStudy
-from crosscue.eval.studies.town.work import assemble, chunks_of, run, split
-from crosscue.localization.town.drive import DriveResult, Keys, drive_many
+from crosscue.eval.studies.town.work import chunks_of, run, split
+from crosscue.localization.town.drive import DriveResult, Keys
 from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import RunError, WorkerError
 from support.refusals import refusal
-
-
-def counting(calls: list[int], fail_at: int | None = None) -> Callable[[TownDrive, Keys], Floats]:
-    def drive(settings: TownDrive, seeds: Keys) -> Floats:
-        calls.append(len(seeds))
-        if fail_at is not None and len(calls) >= fail_at:
-            raise MemoryError("the worker died here")
-        return drive_many(settings, seeds)
-
-    return drive
-
 
 TOWN = TownDrive(city=City(largest_km2=2.0))
 SMALL = LandmarkStudy(
@@ -67,12 +50,6 @@ def run_study(study: LandmarkStudy, folder: Path, workers: int = 1) -> Path:
     return folder
 
 
-def run_drives(study: LandmarkStudy, folder: Path, workers: int = 1) -> Path:
-    """Run only the drives, because summaries and figures take longer."""
-    assert list(drive_study(study, folder, workers))[-1] == 1.0
-    return folder
-
-
 @pytest.mark.slow
 def test_study_files_do_not_depend_on_number_of_workers(tmp_path: Path) -> None:
     one = study_bytes(run_study(SMALL, tmp_path / "one", workers=1))
@@ -80,41 +57,6 @@ def test_study_files_do_not_depend_on_number_of_workers(tmp_path: Path) -> None:
 
     assert {"drives.parquet", "summary.json", "study.html", "landmarks_range.svg"} <= set(one)
     assert one == three
-
-
-DRIVE = """
-import sys
-from pathlib import Path
-from crosscue.eval.studies.town.run import drive_study
-from crosscue.eval.studies.town.settings import LandmarkStudy
-list(drive_study(LandmarkStudy.model_validate_json(sys.argv[1]), Path(sys.argv[2]), 1))
-"""
-
-
-@pytest.mark.slow
-def test_killed_study_resumes_to_same_bytes(tmp_path: Path) -> None:
-    study = LandmarkStudy(
-        drives=600,
-        densities_per_km2=(1.0,),
-        detection_rates=(0.6,),
-        strategies=("hybrid",),
-        points=(),
-    )
-    command = [sys.executable, "-c", DRIVE, study.model_dump_json(), str(tmp_path / "killed")]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    for _ in range(1200):
-        if len(list((tmp_path / "killed/chunks").glob("[!.]*.parquet"))) >= 2:
-            break
-        time.sleep(0.05)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(work, "CHUNK_DRIVES", 100)
-        left = run_drives(study, tmp_path / "killed")
-        clean = run_drives(study, tmp_path / "clean")
-
-    assert process.returncode == -signal.SIGKILL
-    assert study_bytes(left) == study_bytes(clean)
 
 
 def test_extra_distance_is_averaged_over_pairs_reached_goals_and_all_drives() -> None:
@@ -261,30 +203,11 @@ def test_field_runs_are_reused(tmp_path: Path) -> None:
         list(drive_field(FieldStudy(minutes=3.0), tmp_path, 1))
 
 
-def test_damaged_chunk_is_simulated_again(tmp_path: Path) -> None:
+def test_study_without_memory_writes_no_table(tmp_path: Path) -> None:
+    def drive(settings: TownDrive, seeds: Keys) -> Floats:
+        raise MemoryError("too many cities")
+
     chunks = chunks_of(SMALL.cases(), SMALL.drives, SMALL.seed)
-    list(run(chunks, tmp_path, 1))
-    victim = tmp_path / "chunks" / f"{chunks[1].name}.parquet"
-    damaged = bytearray(victim.read_bytes())
-    damaged[len(damaged) // 3] ^= 0xFF
-    victim.write_bytes(damaged)
-    calls: list[int] = []
-    list(run(chunks, tmp_path, 1, drive=counting(calls)))
-
-    assert calls == [chunks[1].count]
-
-
-def test_study_resumes_after_failed_worker(tmp_path: Path) -> None:
-    chunks = chunks_of(SMALL.cases(), SMALL.drives, SMALL.seed)
-    with pytest.raises(WorkerError, match="finished chunks are kept"):
-        list(run(chunks, tmp_path / "a", 1, drive=counting([], fail_at=5)))
-    kept = len(list((tmp_path / "a/chunks").glob("*.parquet")))
-    calls: list[int] = []
-    list(run(chunks, tmp_path / "a", 1, drive=counting(calls)))
-    assemble(chunks, tmp_path / "a")
-    clean = run_drives(SMALL, tmp_path / "b")
-
-    assert kept == 4
-    assert len(calls) == len(chunks) - kept
-    a, b = (folder / "drives.parquet" for folder in (tmp_path / "a", clean))
-    assert a.read_bytes() == b.read_bytes()
+    with pytest.raises(WorkerError, match=r"ran out of memory \(too many cities\); run it again"):
+        list(run(chunks, tmp_path, 2, drive))
+    assert not list(tmp_path.iterdir())
