@@ -101,26 +101,6 @@ class FactorGraph:
     cues: tuple[CueNode, ...]
     edges: tuple[Edge, ...]
 
-    def __post_init__(self) -> None:
-        """Reject duplicate names and edges to unknown nodes.
-
-        Raises:
-            ValueError: A name is duplicate or unknown; the message lists the valid names.
-        """
-        features, cues = self.feature_names, tuple(cue.name for cue in self.cues)
-        for kind, names in (("feature", features), ("cue", cues)):
-            twice = sorted({name for name in names if names.count(name) > 1})
-            if twice:
-                raise ValueError(f"{kind} {twice[0]!r} appears twice; name each once")
-        for edge in self.edges:
-            if edge.feature not in features:
-                raise ValueError(f"no feature {edge.feature!r}; there are: {', '.join(features)}")
-            if edge.cue not in cues:
-                raise ValueError(f"no cue {edge.cue!r}; there are: {', '.join(cues)}")
-        pairs = [(edge.cue, edge.feature) for edge in self.edges]
-        if len(set(pairs)) < len(pairs):
-            raise ValueError("edges: a cue and a feature are joined twice; keep one edge")
-
     @property
     def feature_names(self) -> tuple[str, ...]:
         """Names of all features, in the order of lists of log odds."""

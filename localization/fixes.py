@@ -23,19 +23,6 @@ class Fixes:
     xy_m: NDArray[np.float64]
     cov_m2: NDArray[np.float64]
 
-    def __post_init__(self) -> None:
-        """Reject columns of unequal length.
-
-        Raises:
-            ValueError: A shape is wrong; the message has expected and actual shapes.
-        """
-        n = len(self.t_ns)
-        if self.xy_m.shape != (n, 2) or self.cov_m2.shape != (n, 2, 2):
-            raise ValueError(
-                f"expected xy_m ({n}, 2), cov_m2 ({n}, 2, 2); got {self.xy_m.shape}, "
-                f"{self.cov_m2.shape}"
-            )
-
     def __len__(self) -> int:
         return len(self.t_ns)
 

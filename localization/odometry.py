@@ -13,7 +13,6 @@ are identical, bit for bit, to those of a single window.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, fields, replace
 from typing import Final, Literal, NamedTuple, Self, TypeAlias
 
@@ -32,16 +31,6 @@ BY_STEERING: Final = 1
 BY_WHEELS: Final = 2
 # Turn source of a gap between two time segments, without odometry.
 BY_NOTHING: Final = 3
-
-_POSITIVE: Final = (
-    "track_width_m",
-    "wheelbase_m",
-    "wheel_scale",
-    "right_wheel_scale",
-    "front_left_scale",
-    "front_right_scale",
-    "max_gap_s",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,29 +95,6 @@ class OdometrySettings:
     gap_accel_mps2: float = 3.0
     gap_yaw_accel_radps2: float = 0.5
 
-    def __post_init__(self) -> None:
-        """Validate the settings.
-
-        Raises:
-            ValueError: A value is invalid; the message has field and value.
-        """
-        for name in _POSITIVE:
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name}: expected > 0, got {value}")
-        if not math.isfinite(self.steering_ratio) or self.steering_ratio == 0.0:
-            raise ValueError(
-                f"steering_ratio: expected finite and not 0, got {self.steering_ratio}"
-            )
-        for name in ("turn_delay_s", "understeer_s2pm2"):
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"{name}: expected finite, got {getattr(self, name)}")
-        noises = [f.name for f in fields(self) if "_per_" in f.name or f.name.startswith("gap_")]
-        for name in (*noises, "wheel_step_mps", "steering_noise_rad_sqrt_m", "wheel_delay_s"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name}: expected >= 0, got {value}")
-
     @property
     def wheel_scales(self) -> Floats:
         """Scales of front left, front right, rear left and rear right wheel, shape (4,)."""
@@ -154,20 +120,6 @@ class WheelSamples:
     wheels_mps: Floats
     is_reverse: Bools | None = None
 
-    def __post_init__(self) -> None:
-        """Reject columns of unequal length.
-
-        Raises:
-            ValueError: A shape is wrong; the message has column, expected and actual shape.
-        """
-        n = len(self.t_ns)
-        if self.wheels_mps.shape not in ((n, 2), (n, 4)):
-            raise ValueError(
-                f"wheels_mps: expected ({n}, 2) or ({n}, 4), got {self.wheels_mps.shape}"
-            )
-        if self.is_reverse is not None and self.is_reverse.shape != (n,):
-            raise ValueError(f"is_reverse: expected ({n},), got {self.is_reverse.shape}")
-
     def __len__(self) -> int:
         return len(self.t_ns)
 
@@ -191,15 +143,6 @@ class TurnSignal:
     t_ns: Int64s
     values: Floats
     kind: TurnKind
-
-    def __post_init__(self) -> None:
-        """Reject columns of unequal length.
-
-        Raises:
-            ValueError: A shape is wrong; the message has expected and actual shape.
-        """
-        if self.values.shape != self.t_ns.shape or self.t_ns.ndim != 1:
-            raise ValueError(f"values: expected {self.t_ns.shape}, got {self.values.shape}")
 
     def __len__(self) -> int:
         return len(self.t_ns)

@@ -19,7 +19,6 @@ as landmarks at a camera's frames.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Final, NamedTuple, Protocol, Self, TypeAlias
@@ -59,17 +58,6 @@ class TrackSettings:
     accel_var_m2ps3: float = 1.0
     coast_turn_var_rad2ps: float = 0.01
 
-    def __post_init__(self) -> None:
-        """Validate the settings.
-
-        Raises:
-            ValueError: A value is invalid; the message has field and value.
-        """
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if value is not None and not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{f.name}: expected >= 0, got {value}")
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Headings:
@@ -84,18 +72,6 @@ class Headings:
     t_ns: Int64s
     heading_rad: Floats
     var_rad2: Floats
-
-    def __post_init__(self) -> None:
-        """Reject columns of unequal length.
-
-        Raises:
-            ValueError: A shape is wrong; the message has column, expected and actual shape.
-        """
-        for name in ("heading_rad", "var_rad2"):
-            if getattr(self, name).shape != self.t_ns.shape:
-                raise ValueError(
-                    f"{name}: expected {self.t_ns.shape}, got {getattr(self, name).shape}"
-                )
 
     def __len__(self) -> int:
         return len(self.t_ns)

@@ -1,13 +1,13 @@
 """Features of pictures, and the interface of matchers.
 
-A matcher is named in ``MATCHERS`` or as ``module:factory``. It extracts ``Keypoints`` from a grey
+A matcher is ``orb`` or ``module:factory``. It extracts ``Keypoints`` from a grey
 picture and scores two ``Keypoints``. ORB is built in; a learned matcher can replace it, because
 descriptors are bytes that only their matcher interprets.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol, cast
 
@@ -18,10 +18,7 @@ from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import UsageError
 from crosscue.replay.plugins import imported
 
-MATCHERS: Final[Mapping[str, str]] = {
-    "orb": "crosscue.localization.landmarks.matcher:orb",
-    "orb-essential": "crosscue.localization.landmarks.matcher:orb_essential",
-}
+ORB: Final = "crosscue.localization.landmarks.matcher:orb"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,16 +100,15 @@ class Matcher(Protocol):
 
 
 def make_matcher(name: str, camera: CameraGeometry = CameraGeometry()) -> Matcher:  # noqa: B008
-    """Build a matcher by its name in ``MATCHERS`` or as ``module:factory``.
+    """Build the matcher ``orb`` or ``module:factory``.
 
     Raises:
         UsageError: The name, module or factory does not exist, or the result is not a matcher.
     """
-    target = MATCHERS.get(name, name)
+    target = ORB if name == "orb" else name
     module, colon, factory = target.partition(":")
     if not (colon and module and factory):
-        known = ", ".join(sorted(MATCHERS))
-        raise UsageError(f"matcher {name!r}: there are: {known}, or module:factory of your own")
+        raise UsageError(f"matcher {name!r}: expected orb, or module:factory of your own")
     build = cast("Callable[[CameraGeometry], Matcher]", imported(target, "matcher"))
     try:
         made = build(camera)

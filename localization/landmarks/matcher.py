@@ -2,29 +2,27 @@
 
 See E. Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011. Two points match
 if they are mutual nearest neighbours in Hamming distance, much nearer than the second neighbour.
-The matches are verified with a homography (a plane, or a camera that only rotates) or an essential
-matrix (any rigid scene, with a known camera). OpenCV estimates both with a fixed seed, so the
-result is deterministic. The score is the number of consistent points.
+The matches are verified with a homography (a plane, or a camera that only rotates). OpenCV
+estimates it with a fixed seed, so the result is deterministic. The score is the number of
+consistent points.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
-from typing import Final, Literal
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Bytes
-from crosscue.replay.errors import UsageError
 
 from .features import CameraGeometry, Keypoints, Match
 
 # Minimum side of a picture: the size of ORB's patches.
 _MIN_SIDE_PX: Final = 32
-# Minimum number of pairs for a geometry, which four or five points always fit.
-_MIN_PAIRS: Final = {"homography": 6, "essential": 8}
+# Minimum number of pairs for a homography, which four points always fit.
+_MIN_PAIRS: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,28 +34,12 @@ class OrbSettings:
         side_px: Maximum length of a picture's longer side; larger pictures are scaled down.
         ratio: Upper bound of the nearest neighbour's distance over the second's.
         tolerance_px: Maximum error of a consistent point.
-        geometry: Geometric model of consistent points.
-        camera: Camera of database and drive, required for ``essential``.
     """
 
     features: int = 500
     side_px: int = 1280
     ratio: float = 0.8
     tolerance_px: float = 4.0
-    geometry: Literal["homography", "essential"] = "homography"
-    camera: CameraGeometry = field(default_factory=CameraGeometry)
-
-    def __post_init__(self) -> None:
-        """Validate the settings.
-
-        Raises:
-            ValueError: A value is invalid; the message has field and value.
-        """
-        if not 0.0 < self.ratio <= 1.0:
-            raise ValueError(f"ratio: expected 0 to 1, got {self.ratio}")
-        for name in ("features", "side_px", "tolerance_px"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected > 0, got {getattr(self, name)}")
 
 
 class OrbMatcher:
@@ -96,9 +78,9 @@ class OrbMatcher:
         ):
             return Match(0.0, 0, 0)
         here, there = self._pairs(seen, known)
-        if len(here) < _MIN_PAIRS[self.settings.geometry]:
+        if len(here) < _MIN_PAIRS:
             return Match(0.0, len(here), 0)
-        agreeing = self._agreeing(seen, here, there)
+        agreeing = self._agreeing(here, there)
         return Match(float(agreeing), len(here), agreeing)
 
     def _pairs(
@@ -121,9 +103,7 @@ class OrbMatcher:
         pairs = np.array([(i, j) for j, (_, i) in sorted(best.items())], np.intp).reshape(-1, 2)
         return seen.points_px[pairs[:, 0]], known.points_px[pairs[:, 1]]
 
-    def _agreeing(
-        self, seen: Keypoints, here: NDArray[np.float32], there: NDArray[np.float32]
-    ) -> int:
+    def _agreeing(self, here: NDArray[np.float32], there: NDArray[np.float32]) -> int:
         import cv2
 
         params = cv2.UsacParams()
@@ -132,31 +112,11 @@ class OrbMatcher:
         params.maxIterations = 2000
         params.threshold = self.settings.tolerance_px
         try:
-            if self.settings.geometry == "homography":
-                _, mask = cv2.findHomography(here, there, params)
-            else:
-                focal, (cx, cy) = self._camera_of(seen)
-                params.threshold = self.settings.tolerance_px / focal
-                centre = np.array([cx, cy], np.float32)
-                same = np.eye(3)
-                _, mask = cv2.findEssentialMat(
-                    (here - centre) / np.float32(focal),
-                    (there - centre) / np.float32(focal),
-                    same,
-                    same,
-                    np.zeros(4),
-                    np.zeros(4),
-                    params,
-                )
+            _, mask = cv2.findHomography(here, there, params)
         except cv2.error:
             # All points coincide or are on one line, so the geometry is undefined.
             return 0
         return 0 if mask is None else int(np.count_nonzero(mask))
-
-    def _camera_of(self, seen: Keypoints) -> tuple[float, tuple[float, float]]:
-        focal, centre = self.settings.camera
-        assert focal is not None
-        return focal, centre or (seen.width_px / 2.0, seen.height_px / 2.0)
 
 
 def _nothing() -> tuple[NDArray[np.float32], Bytes]:
@@ -164,19 +124,5 @@ def _nothing() -> tuple[NDArray[np.float32], Bytes]:
 
 
 def orb(camera: CameraGeometry) -> OrbMatcher:
-    """Build a matcher of ORB features with a homography."""
-    return OrbMatcher(OrbSettings(camera=camera))
-
-
-def orb_essential(camera: CameraGeometry) -> OrbMatcher:
-    """Build a matcher of ORB features with an essential matrix.
-
-    Raises:
-        UsageError: The camera's focal length is unknown.
-    """
-    if camera.focal_px is None or not math.isfinite(camera.focal_px):
-        raise UsageError(
-            "matcher 'orb-essential': needs camera.focal_px in the vehicle file; name the file "
-            "with --vehicle, or use orb"
-        )
-    return OrbMatcher(OrbSettings(geometry="essential", camera=camera))
+    """Build a matcher of ORB features; it needs nothing of the camera."""
+    return OrbMatcher(OrbSettings())

@@ -26,7 +26,7 @@ from crosscue.localization.ekf import PoseBelief, pack_belief, update_point
 from crosscue.localization.pose_filter import HEADING, SPEED, at_point
 from crosscue.localization.pose_track import ACCEPTED, REJECTED
 
-from .database import REACH_SIGMAS, LandmarkDatabase, LandmarkPosition, Nearby
+from .database import LandmarkDatabase, LandmarkPosition, Nearby
 from .features import Keypoints, Match, Matcher
 from .sighting import Sighting
 
@@ -55,19 +55,6 @@ class LandmarkSettings:
     interval_m: float = 1.0
     revisit_m: float = 100.0
     lever_m: tuple[float, float] = (0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        """Validate the settings.
-
-        Raises:
-            ValueError: A value is invalid; the message has field and value.
-        """
-        if not 0.0 < self.sigmas <= REACH_SIGMAS:
-            raise ValueError(f"sigmas: expected 0 to {REACH_SIGMAS}, got {self.sigmas}")
-        for name in ("min_score", "max_candidates", "interval_m", "revisit_m"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name}: expected >= 0, got {value}")
 
 
 @dataclass(slots=True)

@@ -46,18 +46,6 @@ class MobileyeSettings:
     is_shared_bus: bool = False
     ros_lane_sign: LaneSign = "auto"
 
-    def __post_init__(self) -> None:
-        """Check the settings.
-
-        Raises:
-            ValueError: A setting is out of range; the message names it and the valid range.
-        """
-        for name in ("within_ns", "repeat_within_ns"):
-            if getattr(self, name) <= 0:
-                raise ValueError(f"{name}: expected > 0, got {getattr(self, name)}")
-        if self.slots not in (10, 13):
-            raise ValueError(f"slots: expected 10 or 13, got {self.slots}")
-
 
 DEFAULTS: Final = MobileyeSettings()
 

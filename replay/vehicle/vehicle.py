@@ -330,7 +330,7 @@ class Landmarks(Section):
     """Matching of images with landmarks; ``crosscue fit landmarks`` writes ``min_score``."""
 
     matcher: str = "orb"
-    """``orb``, ``orb-essential``, or a user-defined ``module:factory``."""
+    """``orb``, or a user-defined ``module:factory``."""
     min_score: NotNegative = 20.0
     """Matches with a lower score are ignored."""
     sigmas: Annotated[float, Field(gt=0.0, le=4.0)] = 2.0

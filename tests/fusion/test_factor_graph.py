@@ -277,28 +277,3 @@ def test_graph_without_cue_drops_only_that_cue() -> None:
     there_are = ", ".join(node.name for node in DEFAULT_GRAPH.cues)
     with pytest.raises(ValueError, match=f"^no cue 'stop_sgn'; there are: {there_are}$"):
         DEFAULT_GRAPH.without("stop_sgn")
-
-
-@pytest.mark.parametrize(
-    ("edges", "match"),
-    [
-        ((Edge("z", "nowhere"),), "no feature 'nowhere'; there are: f, g"),
-        ((Edge("nobody", "f"),), "no cue 'nobody'; there are: z, y"),
-        (
-            (Edge("z", "f"), Edge("z", "f", False)),
-            "edges: a cue and a feature are joined twice; keep one edge",
-        ),
-    ],
-)
-def test_invalid_edges_are_refused(edges: tuple[Edge, ...], match: str) -> None:
-    with pytest.raises(ValueError, match=f"^{match}$"):
-        FactorGraph((Feature("f"), Feature("g")), (CueNode("z", 0.9), CueNode("y", 0.9)), edges)
-
-
-@pytest.mark.parametrize(
-    ("features", "cues", "match"),
-    [("gfgf", "", "feature 'f'"), ("f", "zyzy", "cue 'y'"), ("ff", "zz", "feature 'f'")],
-)
-def test_duplicate_names_are_refused(features: str, cues: str, match: str) -> None:
-    with pytest.raises(ValueError, match=f"^{match} appears twice; name each once$"):
-        FactorGraph(tuple(map(Feature, features)), tuple(CueNode(name, 0.9) for name in cues), ())
