@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Final, Literal
@@ -102,11 +102,11 @@ def recording(name: str) -> Recording:
     return read_model(path, Recording, VehicleError, "install crosscue again")
 
 
-def recording_folder(known: Recording, environment: Mapping[str, str] = os.environ) -> Path:
+def recording_folder(known: Recording) -> Path:
     """Return the cache folder of a recording, which is distinct for each list of files."""
     of_files = hashlib.sha256("".join(file.sha256 for file in known.files).encode()).hexdigest()
-    asked = environment.get(VARIABLE)
-    base = Path(asked) if asked else user_cache(VARIABLE, environment) / "drives"
+    asked = os.environ.get(VARIABLE)
+    base = Path(asked) if asked else user_cache(VARIABLE) / "drives"
     return base / of_files[:16] / known.name
 
 
@@ -114,7 +114,6 @@ def fetch_recording(
     known: Recording,
     given: Path | None = None,
     on_progress: Progress = lambda name, done, total: None,
-    environment: Mapping[str, str] = os.environ,
     place: Path | None = None,
 ) -> Path:
     """Fetch a recording, and check every file; existing files are kept.
@@ -123,7 +122,6 @@ def fetch_recording(
         known: The recording.
         given: Folder that contains it; the network is then not used.
         on_progress: Called with a file, the bytes of the recording fetched so far, and their total.
-        environment: Environment with the variables named above.
         place: Folder for it; the cache if None.
 
     Returns:
@@ -135,13 +133,13 @@ def fetch_recording(
         CrosscueError: A file cannot be fetched, or is not the published one.
         OutputError: The cache cannot be written.
     """
-    place = place or recording_folder(known, environment)
+    place = place or recording_folder(known)
     total, done = known.size_bytes, 0
     source = _folder_in(known, given)
     at_hand = None
-    if source is None and environment.get(DATA):
-        at_hand = _folder_below(known, Path(environment[DATA]))
-    mirror = environment.get(MIRROR)
+    if source is None and os.environ.get(DATA):
+        at_hand = _folder_below(known, Path(os.environ[DATA]))
+    mirror = os.environ.get(MIRROR)
     owner = f"recording {known.name}"
     for file in known.files:
         target, before = place / file.name, done

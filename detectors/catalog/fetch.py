@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -35,7 +35,6 @@ def fetch_weights(
     name: str,
     given: Path | None = None,
     on_progress: Progress = lambda name, done, total: None,
-    environment: Mapping[str, str] = os.environ,
 ) -> list[FetchedFile]:
     """Fetch all files of a catalog's model into the cache.
 
@@ -43,7 +42,6 @@ def fetch_weights(
         name: As ``crosscue model list`` prints it.
         given: A file, or a folder with the files, to copy; no network is used.
         on_progress: Called after each piece.
-        environment: Environment variables.
 
     Raises:
         UsageError: The model does not exist, or ``given`` is missing or a different file.
@@ -53,7 +51,7 @@ def fetch_weights(
     card = entry(name)
     if not card.files:
         raise UsageError(f"model {name}: part of crosscue; there is nothing to fetch")
-    return [_fetched(name, card, file, given, on_progress, environment) for file in card.files]
+    return [_fetched(name, card, file, given, on_progress) for file in card.files]
 
 
 def _fetched(
@@ -62,7 +60,6 @@ def _fetched(
     file: WeightFile,
     given: Path | None,
     on_progress: Progress,
-    environment: Mapping[str, str],
 ) -> FetchedFile:
     place, owner = weights_path(card, file), f"model {name}"
     source = None if given is None else given / file.name if given.is_dir() else given
@@ -71,18 +68,18 @@ def _fetched(
     if source is not None:
         take(source, file, place, owner)
         return FetchedFile(place, str(source))
-    for copy in _local_copies(file, environment):
+    for copy in _local_copies(file):
         if is_there(file, copy):
             take(copy, file, place, owner)
             return FetchedFile(place, str(copy))
-    mirror = environment.get(MIRROR)
+    mirror = os.environ.get(MIRROR)
     url = f"{mirror.rstrip('/')}/{file.name}" if mirror else file.url
     download(url, file, place, owner, OTHERWISE, on_progress)
     return FetchedFile(place, url)
 
 
-def _local_copies(file: WeightFile, environment: Mapping[str, str]) -> Iterator[Path]:
+def _local_copies(file: WeightFile) -> Iterator[Path]:
     """Yield the files of that name below ``$CROSSCUE_DATA/weights``."""
-    folder = environment.get(DATA)
+    folder = os.environ.get(DATA)
     if folder:
         yield from sorted(Path(folder, "weights").glob(f"*/{file.name}"))

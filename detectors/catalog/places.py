@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -20,27 +19,26 @@ FOLDER: Final = Path(__file__).parent / "models"
 VARIABLE: Final = "CROSSCUE_MODELS"
 
 
-def model_folder(environment: Mapping[str, str] = os.environ) -> Path:
+def model_folder() -> Path:
     """Folder of fetched weights.
 
     Raises:
         UsageError: The user has no home folder.
     """
-    asked = environment.get(VARIABLE)
-    return Path(asked) if asked else user_cache(VARIABLE, environment) / "models"
+    asked = os.environ.get(VARIABLE)
+    return Path(asked) if asked else user_cache(VARIABLE) / "models"
 
 
-def user_cache(variable: str, environment: Mapping[str, str] = os.environ) -> Path:
-    """The user's cache folder for crosscue.
+def user_cache(variable: str) -> Path:
+    """The user's cache folder for crosscue, below ``$XDG_CACHE_HOME``.
 
     Args:
         variable: Environment variable that can name another folder, for the error message.
-        environment: Environment variables; ``$XDG_CACHE_HOME`` is used.
 
     Raises:
         UsageError: The user has no home folder.
     """
-    base = Path(environment.get("XDG_CACHE_HOME", ""))
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
     try:
         base = base if base.is_absolute() else Path.home() / ".cache"
     except RuntimeError:

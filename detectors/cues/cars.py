@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,14 +94,6 @@ class Pairs:
     judged: CarCounts | None = None
     cars: CarCandidates = NO_CARS
     is_first: bool = False
-
-
-class Tracker(Protocol):
-    """Finds the cars of one frame in the next; ``pair_cars`` is the default."""
-
-    def __call__(self, before: CarShapes, now: CarShapes, settings: Cars, /) -> Pairs:
-        """Pair the cars, each at most once."""
-        ...
 
 
 def car_shapes(found: Sequence[Detections], settings: Cars) -> CarShapes:

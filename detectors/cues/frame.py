@@ -32,7 +32,7 @@ from .candidates import (
     thresholds_met,
     unsure_of,
 )
-from .cars import CarCandidates, CarShapes, Pairs, Tracker, car_shapes, no_pairs, pair_cars
+from .cars import CarCandidates, CarShapes, Pairs, car_shapes, no_pairs, pair_cars
 from .labelled import count_own
 from .observed import NOT_SEEN, FrameCues, FrameDetections, Place, RoadFractions
 from .road import road_fractions
@@ -46,14 +46,12 @@ class CuePass:
 
     Attributes:
         vehicle: Regions and thresholds.
-        tracker: Pairs cars of two frames, if the vehicle file has ``cars.kind = "pairs"``.
         candidates: Candidates of every evaluated cue so far; only cues with a label or a region.
         not_followed: Number of frames in which cars could not be tracked, by reason.
         controls: Tracks of stop signs and traffic lights.
     """
 
     vehicle: Vehicle
-    tracker: Tracker = pair_cars
     candidates: dict[str, Candidates] = field(default_factory=dict)
     not_followed: Counter[str] = field(default_factory=Counter)
     controls: ControlTracks = field(init=False)
@@ -198,7 +196,7 @@ class CuePass:
         if before is None:
             pairs = no_pairs(now.size_px[0])
         else:
-            pairs = self.tracker(before, now, self.vehicle.cars)
+            pairs = pair_cars(before, now, self.vehicle.cars)
         cars = self._candidates(boxes, len(now))
         return replace(pairs, cars=cars, is_first=before is None)
 

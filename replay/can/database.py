@@ -33,39 +33,16 @@ _EXTENDED_FLAG: Final = 0x8000_0000
 
 
 @dataclass(frozen=True, slots=True)
-class Conflict:
-    """Two definitions of one identifier.
-
-    Attributes:
-        kept: The definition that is used, which is the first one found.
-        other: The definition that is ignored.
-        is_harmless: True if both decode every frame to the same columns.
-    """
-
-    kept: CanMessage
-    other: CanMessage
-    is_harmless: bool
-
-    def __str__(self) -> str:
-        return (
-            f"{spell_id(*self.kept.key)} is defined as {self.kept.name} ({self.kept.source}) "
-            f"and as {self.other.name} ({self.other.source})"
-        )
-
-
-@dataclass(frozen=True, slots=True)
 class CanDatabase:
     """The messages of one bus.
 
     Attributes:
         messages: One message for each identifier, in the order of the files.
         notices: Warnings about doubtful contents of the files, one sentence each.
-        conflicts: Identifiers that are defined more than once.
     """
 
     messages: tuple[CanMessage, ...]
     notices: tuple[str, ...] = ()
-    conflicts: tuple[Conflict, ...] = ()
     _extractors: dict[tuple[int, bool, frozenset[str] | None], MessageExtractor] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -75,16 +52,12 @@ class CanDatabase:
         cls,
         paths: Sequence[Path | str],
         limits: Limits = DEFAULT_LIMITS,
-        *,
-        keep_first: bool = False,
     ) -> CanDatabase:
         """Read the database files that together describe one bus.
 
         Args:
             paths: Files ending in .dbc, .kcd, .arxml or .sym.
             limits: No file may be larger than ``message_bytes``.
-            keep_first: Where files define one identifier differently, use the first definition
-                instead of refusing.
 
         Raises:
             CanDatabaseError: A file is missing or does not parse.
@@ -97,37 +70,41 @@ class CanDatabase:
             messages, doubtful = _load_file(path, limits)
             found += messages
             notices += doubtful
-        return cls.of(found, notices, keep_first=keep_first)
+        return cls.of(found, notices)
 
     @classmethod
     def of(
         cls,
         messages: Iterable[CanMessage],
         notices: Iterable[str] = (),
-        *,
-        keep_first: bool = False,
     ) -> CanDatabase:
         """Build a database from messages, and check for duplicate identifiers and names.
 
         Raises:
-            SchemaError: Two messages with one identifier differ, and ``keep_first`` is not set.
+            SchemaError: Two messages with one identifier differ.
         """
         by_key: dict[tuple[int, bool], CanMessage] = {}
-        conflicts: list[Conflict] = []
+        said, harmful = [*notices], list[str]()
         for message in messages:
             kept = by_key.setdefault(message.key, message)
-            if kept is not message:
-                conflicts.append(Conflict(kept, message, kept.same_layout(message)))
-        said = [*notices, *(_notice_of(conflict) for conflict in conflicts)]
-        harmful = [conflict for conflict in conflicts if not conflict.is_harmless]
-        if harmful and not keep_first:
+            if kept is message:
+                continue
+            twice = (
+                f"{spell_id(*kept.key)} is defined as {kept.name} ({kept.source}) and as "
+                f"{message.name} ({message.source})"
+            )
+            if kept.same_layout(message):
+                said.append(f"{twice}: with the same layout")
+            else:
+                harmful.append(twice)
+        if harmful:
             more = f" (and {len(harmful) - 1} more)" if len(harmful) > 1 else ""
             raise SchemaError(
                 f"{harmful[0]}{more}, with different signals; expected one definition for each "
-                "identifier; pass only the file of this bus, or choose to keep the first definition"
+                "identifier; pass only the file of this bus"
             )
         named, renamed = _with_topics(by_key.values())
-        return cls(named, tuple(said + renamed), tuple(conflicts))
+        return cls(named, tuple(said + renamed))
 
     def find(self, arbitration_id: int, is_extended: bool) -> CanMessage | None:
         """Return the message with an identifier; 11-bit and 29-bit identifiers are distinct."""
@@ -169,11 +146,6 @@ class CanDatabase:
 def spell_id(arbitration_id: int, is_extended: bool) -> str:
     """Format an identifier with three hexadecimal digits, or eight if it is extended."""
     return f"0x{arbitration_id:08X} (extended)" if is_extended else f"0x{arbitration_id:03X}"
-
-
-def _notice_of(conflict: Conflict) -> str:
-    result = "with the same layout" if conflict.is_harmless else "the first is used"
-    return f"{conflict}: {result}"
 
 
 def _with_topics(messages: Iterable[CanMessage]) -> tuple[tuple[CanMessage, ...], list[str]]:

@@ -79,26 +79,25 @@ class Checkpoint:
     sha256: str
 
 
-def save_checkpoint(path: Path, network: Any, facts: Facts, *, halve: bool = True) -> None:
-    """Write weights and their description.
+def save_checkpoint(path: Path, network: Any, facts: Facts) -> None:
+    """Write weights, in 16 bits each, and their description.
 
     Args:
         path: File name, ending in ``.safetensors``.
         network: A torchvision ``MaskRCNN``.
         facts: Description of the network.
-        halve: Store 16 bits of each weight.
 
     Raises:
         OutputError: The file cannot be written.
     """
-    tensors = {name: _stored(value, halve) for name, value in network.state_dict().items()}
+    tensors = {name: _stored(value) for name, value in network.state_dict().items()}
     content = pack_weights(tensors, KEY, json.dumps(facts.model_dump(mode="json"), sort_keys=True))
     write_bytes(path, content)
 
 
-def _stored(value: Tensor, halve: bool) -> Tensor:
+def _stored(value: Tensor) -> Tensor:
     kept = value.detach().cpu().contiguous(memory_format=torch.contiguous_format)
-    return kept.half() if halve and kept.dtype == torch.float32 else kept
+    return kept.half() if kept.dtype == torch.float32 else kept
 
 
 def embedded_mask_rcnn() -> Path:

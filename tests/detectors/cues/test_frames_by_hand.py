@@ -31,7 +31,7 @@ from crosscue.detectors.cues.candidates import (
     thresholds_met,
     unsure_of,
 )
-from crosscue.detectors.cues.cars import CarCandidates, CarShapes, Pairs, no_pairs
+from crosscue.detectors.cues.cars import CarCandidates, Pairs, no_pairs
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.labelled import count, count_labels, count_own
 from crosscue.detectors.cues.observed import (
@@ -373,23 +373,6 @@ def test_cars_are_paired_with_the_previous_frame_until_restarted() -> None:
     assert cues(moved(200)).counts["cross_traffic_right"] == 1
     cues.restart()
     assert "cross_traffic_right" not in cues(moved(300)).counts
-
-
-def test_own_tracker_pairs_the_cars() -> None:
-    given: list[tuple[int, int, Cars]] = []
-
-    def tracker(before: CarShapes, now: CarShapes, settings: Cars, /) -> Pairs:
-        given.append((len(before), len(now), settings))
-        return Pairs(np.array([[-9.0, 0.0]]), np.zeros((1, 2)), np.zeros(1, np.int64), 640)
-
-    cues = CuePass(VEHICLE, tracker)
-    cues(FrameDetections(0, (found(("car", 0.9)),)))
-
-    assert (
-        cues(FrameDetections(0, (found(("car", 0.9), ("van", 0.9)),))).counts["cross_traffic_left"]
-        == 1
-    )
-    assert given == [(1, 2, VEHICLE.cars)]
 
 
 @pytest.mark.parametrize(
