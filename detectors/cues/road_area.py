@@ -137,13 +137,17 @@ class RoadArea:
         # A border stands for everything out of the picture.
         x = sums(*left) * (across * scale) + (plane.center_px[0] * across + 1.0)
         y = sums(*up) * (down * scale) + (plane.center_px[1] * down + 1.0)
-        x, y = np.clip(x, 0.0, mask_width + 1.0), np.clip(y, 0.0, mask_height + 1.0)
+        # Rows above the ground in reach show nothing that counts. An even number of them leaves
+        # the rounding of boxes as it is.
+        top = min(max(int(y.min(where=in_reach, initial=mask_height)) - 1, 0), mask_height - 1) & ~1
+        x, y = np.clip(x, 0.0, mask_width + 1.0), np.clip(y - top, 0.0, mask_height - top + 1.0)
         rows_px = (np.arange(mask_height) + 0.5) / down - plane.center_px[1]
         below = plane.focal_px * math.sin(pitch_rad) + rows_px * math.cos(pitch_rad)
         above_px = plane.focal_px * math.cos(pitch_rad) - rows_px * math.sin(pitch_rad)
         away_m = camera.z_m * above_px / np.maximum(below, 1e-3)
-        shown = _shown(road.pixels(), boxes_px * [across, down, across, down], away_m)
-        found = shown.take(x.astype(np.int32) * (mask_height + 2) + y.astype(np.int32))
+        boxes_px = boxes_px * [across, down, across, down] - [0, top, 0, top]
+        shown = _shown(road.pixels()[top:], boxes_px, away_m[top:])
+        found = shown.take(x.astype(np.int32) * shown.shape[1] + y.astype(np.int32))
         weight = SHARP_M**2 / np.maximum(ahead_m**2 + left_m**2, SHARP_M**2)
         weight *= in_reach * WEIGHTS[found]
         self._road[rows, columns] += weight * (found == SHOWS_ROAD)
@@ -209,8 +213,8 @@ def _shown(is_road: NDArray[np.bool_], boxes_px: Floats, away_m: Floats) -> NDAr
     after = np.where(pixels[stops - 1], 0, (stops - 1) % height + 1).astype(np.uint16)
     road_below = np.repeat(after, lengths).reshape(columns.shape)
     # First row that is too much nearer than a row above it; so are all rows further down.
-    is_nearer = np.triu(away_m < (away_m - BESIDE_M)[:, None])
-    nearer = np.where(is_nearer.any(axis=1), is_nearer.argmax(axis=1), height).astype(np.uint16)
+    falling_m = np.maximum.accumulate(away_m[::-1])[::-1]
+    nearer = np.searchsorted(-falling_m, BESIDE_M - away_m, side="right").astype(np.uint16)
     shown += (road_below > nearer).view(np.uint8) * np.uint8(SHOWS_BEHIND - SHOWS_GROUND)
     margin = MARGIN * (boxes_px[:, 2:] - boxes_px[:, :2])
     widened = boxes_px + np.column_stack([-margin[:, 0], 0.0 * margin[:, 0], margin])

@@ -286,8 +286,14 @@ def test_pixels_show_what_is_behind_the_edge_below_them(pitch_rad: float, share:
     above_px = 50.0 * math.cos(pitch_rad) - rows_px * math.sin(pitch_rad)
     away_m = 1.5 * above_px / np.maximum(below, 1e-3)
 
-    found = _shown(is_road, np.array([[2.0, 3.0, 5.0, 9.0]]), away_m)
+    boxes_px = np.array([[2.0, 3.5, 5.0, 9.0]])
 
+    found = _shown(is_road, boxes_px, away_m)
+
+    for top in (2, 12, 38):
+        # Rows above those in reach are left out.
+        part = _shown(is_road[top:], boxes_px - [0, top, 0, top], away_m[top:])
+        assert np.array_equal(part[:, 1:], found[:, top + 1 :])
     wanted = np.full((14, 42), HIDDEN)
     for row, column in np.ndindex(40, 12):
         edge = row
@@ -295,7 +301,7 @@ def test_pixels_show_what_is_behind_the_edge_below_them(pitch_rad: float, share:
             edge += 1
         is_behind = away_m[row] - away_m[edge] > BESIDE_M
         no_road = SHOWS_BEHIND if is_behind else SHOWS_GROUND
-        if not (2 <= column < 5 and 3 <= row < 9):
+        if not (2 <= column < 5 and 4 <= row < 9):
             wanted[column + 1, row + 1] = SHOWS_ROAD if is_road[row, column] else no_road
     assert np.array_equal(found, wanted)
     assert share == 0.98 or (wanted == SHOWS_BEHIND).any()
