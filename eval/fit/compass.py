@@ -61,7 +61,19 @@ class FittedCompass(Fitted):
     @property
     def section(self) -> dict[str, object]:
         """The vehicle file's section ``[compass]``."""
-        return compass_section(self.fitted)
+        compass = self.fitted.settings
+        section: dict[str, object] = {
+            "mounting_rotation": [list(row) for row in compass.mounting_rotation],
+            "mounting_yaw_rad": round(compass.mounting_yaw_rad, 6),
+            "hard_iron_t": [float(f"{value:.6g}") for value in compass.hard_iron_t],
+            "soft_iron": [[round(value, 6) for value in row] for row in compass.soft_iron],
+            "declination_rad": compass.declination_rad,
+        }
+        if np.isfinite(self.fitted.residual_sd_rad):
+            section["heading_sd_rad"] = round(self.fitted.residual_sd_rad, 4)
+        if np.isfinite(self.fitted.persists_s):
+            section["interval_s"] = round(2.0 * self.fitted.persists_s, 2)
+        return section
 
     @property
     def toml(self) -> str:
@@ -182,20 +194,3 @@ def fit_log_compass(logs: Sequence[Log], vehicle: Vehicle, selection: Selection)
     given = compass_settings(vehicle)
     fitted = fit_readings(readings.t_ns, readings.values, reference, given)
     return FittedCompass(fitted, given, readings.values, reference)
-
-
-def compass_section(fitted: CompassFit) -> dict[str, object]:
-    """Return the fit as a vehicle file's [compass] section."""
-    compass = fitted.settings
-    section: dict[str, object] = {
-        "mounting_rotation": [list(row) for row in compass.mounting_rotation],
-        "mounting_yaw_rad": round(compass.mounting_yaw_rad, 6),
-        "hard_iron_t": [float(f"{value:.6g}") for value in compass.hard_iron_t],
-        "soft_iron": [[round(value, 6) for value in row] for row in compass.soft_iron],
-        "declination_rad": compass.declination_rad,
-    }
-    if np.isfinite(fitted.residual_sd_rad):
-        section["heading_sd_rad"] = round(fitted.residual_sd_rad, 4)
-    if np.isfinite(fitted.persists_s):
-        section["interval_s"] = round(2.0 * fitted.persists_s, 2)
-    return section

@@ -95,9 +95,9 @@ class SourceFit:
     camera_yaw_sd_rad: float = math.nan
 
 
-@dataclass(frozen=True, slots=True)
-class DriveFit:
-    """Fit of a vehicle's odometry to a drive.
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FittedOdometry(Fitted):
+    """Odometry fitted to the first half of a drive and tested on the second.
 
     Attributes:
         log: Name of the log.
@@ -107,7 +107,7 @@ class DriveFit:
         start_ns: Start of the fitted half.
         middle_ns: End of the fitted half and start of the held-out half.
         end_ns: End of the held-out half.
-        sources: Fits by source of turns; that of the vehicle file first.
+        fits: Fits by source of turns; that of the vehicle file first.
         not_fitted: Reason why a source could not be fitted, by source.
         settings: Settings with the values of all sources.
         nees_band: 95 % interval of one drive's mean NEES for a consistent filter.
@@ -115,56 +115,47 @@ class DriveFit:
 
     log: str
     reference: str
-    is_of_camera: bool
-    is_gnss: bool
+    is_of_camera: bool = field(metadata=HIDDEN)
+    is_gnss: bool = field(metadata=HIDDEN)
     start_ns: int
     middle_ns: int
     end_ns: int
-    sources: tuple[SourceFit, ...]
+    fits: tuple[SourceFit, ...] = field(metadata=HIDDEN)
     not_fitted: dict[str, str]
-    settings: OdometrySettings
+    settings: OdometrySettings = field(metadata=HIDDEN)
     nees_band: tuple[float, float]
 
-
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FittedOdometry(Fitted):
-    """Odometry fitted to the first half of a drive and tested on the second.
-
-    Attributes:
-        fitted: Fit for each source of the turn rate, with errors before and after on both halves.
-    """
-
-    fitted: DriveFit = field(metadata=HIDDEN)
-
-    also: ClassVar = {
-        "odometry": "section",
-        "camera_yaw_rad": "camera_yaw_rad",
-        "log": "fitted.log",
-        "reference": "fitted.reference",
-        "start_ns": "fitted.start_ns",
-        "middle_ns": "fitted.middle_ns",
-        "end_ns": "fitted.end_ns",
-        "nees_band": "fitted.nees_band",
-        "not_fitted": "fitted.not_fitted",
-        "sources": "sources",
+    also: ClassVar = {name: name for name in ("camera_yaw_rad", "sources")} | {
+        "odometry": "section"
     }
 
     @property
     def section(self) -> dict[str, object]:
-        """The vehicle file's section ``[odometry]``."""
-        return odometry_section(self.fitted)
+        """The vehicle file's section ``[odometry]``, with its provenance."""
+        names = [
+            *SHARED,
+            "wheel_delay_s",
+            *(name for one in self.fits for name in OF_ONE_TURN[one.fit.source]),
+        ]
+        values = {
+            name: float(f"{value:.6g}")
+            for name in names
+            if (value := getattr(self.settings, name)) is not None
+        }
+        return {**values, "constants": constants_section(self), "fitted": _provenance(self)}
 
     @property
     def toml(self) -> str:
         """The sections of the vehicle file, without the record of the fit."""
-        document = toml_document(with_odometry("", self.fitted))
+        document = toml_document(with_odometry("", self))
         del document["odometry"]["fitted"]
         return tomlkit.dumps(document)
 
     @property
     def camera_yaw_rad(self) -> float | None:
         """Mounting yaw of the camera; None unless the positions are the camera's track."""
-        return camera_yaw_of(self.fitted)
+        yaw_rad = self.fits[0].camera_yaw_rad
+        return None if yaw_rad is None or not self.is_of_camera else round(yaw_rad, 5)
 
     @property
     def sources(self) -> list[dict[str, Any]]:
@@ -182,25 +173,24 @@ class FittedOdometry(Fitted):
                 "before": asdict(one.before),
                 "after": asdict(one.after),
             }
-            for one in self.fitted.sources
+            for one in self.fits
         ]
 
     def report(self) -> Iterator[str]:
         """Yield the parameters and errors of each source."""
-        found = self.fitted
-        middle_s, end_s = ((t - found.start_ns) * 1e-9 for t in (found.middle_ns, found.end_ns))
-        yield f"positions   {found.reference}"
+        middle_s, end_s = ((t - self.start_ns) * 1e-9 for t in (self.middle_ns, self.end_ns))
+        yield f"positions   {self.reference}"
         yield f"fitted to   the first {middle_s:.1f} s of {end_s:.1f} s; the rest is held out"
-        for one in found.sources:
+        for one in self.fits:
             yield from ("", *_source(one))
-        low, high = found.nees_band
+        low, high = self.nees_band
         yield ""
         yield f"NEES of x, y is consistent for one drive between {low:.2f} and {high:.2f}"
-        yield from (f"not fitted  {name}: {why}" for name, why in found.not_fitted.items())
+        yield from (f"not fitted  {name}: {why}" for name, why in self.not_fitted.items())
 
     def charts(self) -> Iterator[Chart]:
         """Yield the way by odometry alone, and its error, for each source of turns."""
-        for one in self.fitted.sources:
+        for one in self.fits:
             known_m, t_s = one.drive.fixes.xy_m, one.drive.seconds
             before_m, after_m = (
                 one.drive.reckon(one.fit.start, car).xy_m for car in (one.given, one.fit.car)
@@ -217,7 +207,7 @@ class FittedOdometry(Fitted):
                 is_map=True,
             )
             before, after = (np.hypot(*(xy_m - known_m).T) for xy_m in (before_m, after_m))
-            first = one.drive.fixes.t_ns < self.fitted.middle_ns
+            first = one.drive.fixes.t_ns < self.middle_ns
             yield Chart(
                 f"Distance from the known positions, turns from {one.fit.source}",
                 "time (s)",
@@ -301,7 +291,7 @@ def fit_odometry(
     with opened(log) as drive:
         found = fit_log_odometry(drive.logs, settings, drive.selection, known, keep=keep)
     path = write_fit(vehicle, output, lambda text: with_odometry(text, found))
-    return FittedOdometry(found, path=path)
+    return replace(found, path=path)
 
 
 def fit_log_odometry(
@@ -311,7 +301,7 @@ def fit_log_odometry(
     known: ReferencePositions | None = None,
     *,
     keep: bool = False,
-) -> DriveFit:
+) -> FittedOdometry:
     """Fit to the first half of the drive and test on the second.
 
     Args:
@@ -370,7 +360,7 @@ def fit_log_odometry(
         if len(sources) == 1:
             t_ns = drive.fixes.t_ns
             span = int(t_ns[0]), _middle_ns(drive), int(t_ns[-1]) + 1
-    return DriveFit(
+    return FittedOdometry(
         ", ".join(name_of(log).rstrip("/").rpartition("/")[2] for log in logs),
         reference.name,
         reference.is_of_camera,
@@ -468,23 +458,7 @@ def _together(
     return replace(given, **values)
 
 
-def odometry_section(found: DriveFit) -> dict[str, object]:
-    """Return the fit as a vehicle file's [odometry] section, with its provenance."""
-    names = [
-        *SHARED,
-        "wheel_delay_s",
-        *(name for one in found.sources for name in OF_ONE_TURN[one.fit.source]),
-    ]
-    values = {
-        name: float(f"{value:.6g}")
-        for name in names
-        if (value := getattr(found.settings, name)) is not None
-    }
-    constants = constants_section(found)
-    return {**values, "constants": constants, "fitted": _provenance(found)}
-
-
-def constants_section(found: DriveFit) -> dict[str, object]:
+def constants_section(found: FittedOdometry) -> dict[str, object]:
     """Return the errors of the fitted values as a section [odometry.constants].
 
     Values of several sources of turns are independent; the first source determines shared ones.
@@ -494,7 +468,7 @@ def constants_section(found: DriveFit) -> dict[str, object]:
     names: list[str] = []
     blocks: list[Floats] = []
     drift: dict[str, float] = {}
-    for of in (source.fit.constants for source in found.sources):
+    for of in (source.fit.constants for source in found.fits):
         rows = [i for i, name in enumerate(of.names) if name not in names]
         names += [of.names[i] for i in rows]
         blocks.append(of.cov[np.ix_(rows, rows)])
@@ -505,15 +479,15 @@ def constants_section(found: DriveFit) -> dict[str, object]:
     return {"names": names, "covariance": rounded, "drift_per_sqrt_s": drift}
 
 
-def _provenance(found: DriveFit) -> dict[str, object]:
-    first = found.sources[0]
+def _provenance(found: FittedOdometry) -> dict[str, object]:
+    first = found.fits[0]
     shown = [
         one
-        for source in found.sources
+        for source in found.fits
         for one in source.fit.fitted
         if hasattr(found.settings, one.parameter) or one.parameter == FIX_DELAY
     ]
-    missing = [one.parameter for source in found.sources for one in source.fit.not_observable]
+    missing = [one.parameter for source in found.fits for one in source.fit.not_observable]
     rounded = OdometryFitted(
         log=found.log,
         reference=found.reference,
@@ -531,21 +505,15 @@ def _provenance(found: DriveFit) -> dict[str, object]:
     return rounded.model_dump(mode="json")
 
 
-def camera_yaw_of(found: DriveFit) -> float | None:
-    """Return the camera's mounting yaw, or None if the reference was not its track."""
-    yaw_rad = found.sources[0].camera_yaw_rad
-    return None if yaw_rad is None or not found.is_of_camera else round(yaw_rad, 5)
-
-
-def with_odometry(text: str, found: DriveFit) -> str:
+def with_odometry(text: str, found: FittedOdometry) -> str:
     """Return a vehicle file's text with its [odometry] values replaced and comments kept."""
     document = toml_document(text)
     section = document.setdefault("odometry", tomlkit.table())
-    for key, value in odometry_section(found).items():
+    for key, value in found.section.items():
         section[key] = value
-    if found.is_gnss and (delay_s := found.sources[0].fit.value(FIX_DELAY)):
+    if found.is_gnss and (delay_s := found.fits[0].fit.value(FIX_DELAY)):
         gnss = document.setdefault("gnss", tomlkit.table())
         gnss["delay_s"] = round(float(gnss.get("delay_s", 0.0)) + delay_s, 4)
-    if (yaw_rad := camera_yaw_of(found)) is not None:
+    if (yaw_rad := found.camera_yaw_rad) is not None:
         document.setdefault("camera", tomlkit.table())["yaw_rad"] = yaw_rad
     return tomlkit.dumps(document)

@@ -40,24 +40,24 @@ def fitted(files: DriveFiles) -> FittedOdometry:
 
 
 def test_simulated_gyro_bias_is_estimated(fitted: FittedOdometry) -> None:
-    fit = fitted.fitted.sources[0].fit
+    fit = fitted.fits[0].fit
     (bias,) = (one for one in fit.fitted if one.parameter == "gyro_bias_radps")
 
     assert abs(bias.value - BIAS) < 4.0 * bias.sd
 
 
 def test_fit_reduces_held_out_error_and_nees_is_within_band(fitted: FittedOdometry) -> None:
-    one = fitted.fitted.sources[0]
+    one = fitted.fits[0]
 
     assert one.after.held_out_m < one.before.held_out_m
-    assert one.after.all_nees < fitted.fitted.nees_band[1]
+    assert one.after.all_nees < fitted.nees_band[1]
 
 
 def test_vehicle_file_states_the_constant_errors(fitted: FittedOdometry, files: DriveFiles) -> None:
     assert fitted.path is not None
     vehicle = crosscue.load_vehicle(fitted.path)
     constants = odometry_constants(vehicle, Signal.YAW_RATE)
-    fit = fitted.fitted.sources[0].fit
+    fit = fitted.fits[0].fit
 
     assert vehicle.odometry.constants is not None
     assert constants is not None
@@ -112,7 +112,7 @@ def test_fit_that_is_worse_on_the_held_out_half_is_refused(
         crosscue.fit_odometry(files.log, files.vehicle, output, truth=files.truth)
     assert not output.exists()
     kept = crosscue.fit_odometry(files.log, files.vehicle, output, truth=files.truth, keep=True)
-    assert kept.fitted.sources[0].after.held_out_m > kept.fitted.sources[0].before.held_out_m
+    assert kept.fits[0].after.held_out_m > kept.fits[0].before.held_out_m
     assert output.exists()
 
 

@@ -1,0 +1,138 @@
+"""Steps of the camera's pitch or yaw, injected into pictures: found within 10 s, none elsewhere.
+
+Run it as ``python -m benchmarks.camera_steps``. The pictures of real drives on straight road
+(``$CROSSCUE_DATA`` or ``../shared/data``) and of simulated approaches are warped from a moment on
+as by a camera that turns by half a degree. Pictures later than ten seconds after the step are left
+out. No signal of the car is used.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+
+import crosscue
+from benchmarks.real_roads import DATA, DRIVES
+from crosscue.datasets.simulate import Approaches, simulate_approaches
+from crosscue.eval.vehicle.picture_pass import Follower, reduced
+from crosscue.localization.camera_watch import MountingStep, steps_of
+from crosscue.replay.columns import Bytes
+from crosscue.replay.vehicle.camera import Camera
+from crosscue.replay.vehicle.vehicle import load, parse
+
+REAL: Final = ("kitti_t_junction", "pandaset_002")
+SIMULATED: Final = ("A", "B", "C")
+STEP_DEG: Final = 0.5
+WITHIN_S: Final = 10.0
+# Parts of the drive's directions of travel before the step.
+PARTS: Final = (0.4, 0.5, 0.6)
+
+
+class Drive(NamedTuple):
+    """Pictures of a camera, in grey, with their times."""
+
+    name: str
+    camera: Camera
+    pictures: Sequence[tuple[int, Bytes]]
+
+
+def real(name: str) -> Drive:
+    """Read the pictures of a real drive."""
+    drive = DRIVES[name]
+    camera = parse(f"version = 1\n[camera]\n{drive.camera}", drive.folder).camera
+    files = sorted((DATA / "sequences" / drive.folder).glob(drive.pictures))
+    grey = (np.asarray(cv2.imread(str(one), cv2.IMREAD_GRAYSCALE), np.uint8) for one in files)
+    pictures = [(round(i / drive.rate_hz * 1e9), one) for i, one in enumerate(grey)]
+    return Drive(name, camera, pictures)
+
+
+def simulated(folder: Path) -> Iterator[Drive]:
+    """Simulate one approach to each intersection."""
+    simulate_approaches(Approaches(SIMULATED, width_px=640), folder)
+    for place in sorted(folder.iterdir()):
+        with crosscue.open(place / "drive.mcap") as log:
+            topic = next(one for one in log.topics if "image" in one)
+            pictures = [
+                (frame.t_ns, np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8))
+                for frame in log[topic].frames()
+            ]
+        yield Drive(f"simulated {place.name}", load(place / "vehicle.toml").camera, pictures)
+
+
+def turned(grey: Bytes, camera: Camera, axis: str, by_deg: float) -> Bytes:
+    """Return the picture of a camera that is turned down (pitch) or to the left (yaw)."""
+    assert camera.focal_px is not None
+    center_px = camera.center_px or (0.5 * grey.shape[1], 0.5 * grey.shape[0])
+    matrix = np.array(
+        [[camera.focal_px, 0, center_px[0]], [0, camera.focal_px, center_px[1]], [0, 0, 1.0]]
+    )
+    cos, sin = math.cos(math.radians(by_deg)), math.sin(math.radians(by_deg))
+    turn = np.array(
+        [[1.0, 0, 0], [0, cos, -sin], [0, sin, cos]]
+        if axis == "pitch"
+        else [[cos, 0, sin], [0, 1.0, 0], [-sin, 0, cos]]
+    )
+    warp = matrix @ turn @ np.linalg.inv(matrix)
+    size = (grey.shape[1], grey.shape[0])
+    moved = cv2.warpPerspective(grey, warp, size, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(moved, np.uint8)
+
+
+def watched(
+    drive: Drive, axis: str = "", by_deg: float = 0.0, at_ns: int = 0
+) -> tuple[list[MountingStep], list[int]]:
+    """Return the steps that are found, and the times of the directions of travel."""
+    follower = None
+    for t_ns, grey in drive.pictures:
+        if axis and t_ns > at_ns + WITHIN_S * 1e9:
+            break
+        moved = turned(grey, drive.camera, axis, by_deg) if axis and t_ns >= at_ns else grey
+        small = reduced(moved)
+        size_px = (grey.shape[1], grey.shape[0])
+        follower = follower or Follower(drive.camera, size_px, small)
+        follower.follow(t_ns, small)
+    assert follower is not None
+    t_ns = np.array(follower.travel_ns, np.int64)
+    pitch = np.array([one.below_rad for one in follower.travel])
+    yaw = np.array([one.left_rad for one in follower.travel])
+    steps = [*steps_of("pitch", t_ns, pitch), *steps_of("yaw", t_ns, yaw)]
+    return steps, follower.travel_ns
+
+
+def main() -> None:
+    """Print a line for each drive, and the counts."""
+    found = injected = false = drives = 0
+    with tempfile.TemporaryDirectory() as folder:
+        for drive in [*map(real, REAL), *simulated(Path(folder))]:
+            steps, times = watched(drive)
+            false, drives, mine = false + len(steps), drives + 1, []
+            for part in PARTS if len(times) >= 20 else ():
+                at_ns = times[int(part * len(times))]
+                for axis in ("pitch", "yaw"):
+                    for by_deg in (-STEP_DEG, STEP_DEG):
+                        seen, _ = watched(drive, axis, by_deg, at_ns)
+                        right = [
+                            one
+                            for one in seen
+                            if one.value == axis and abs(math.degrees(one.by) - by_deg) < 0.25
+                        ]
+                        false += len(seen) - len(right)
+                        mine.append(len(right) == 1)
+            found, injected = found + sum(mine), injected + len(mine)
+            print(
+                f"{drive.name:32} {len(times):3} directions of travel; without a step "
+                f"{len(steps)} found; injected {sum(mine)} of {len(mine)} found"
+            )
+            sys.stdout.flush()
+    print(f"all: {found} of {injected} steps found within 10 s, {false} false in {drives} drives")
+
+
+if __name__ == "__main__":
+    main()
