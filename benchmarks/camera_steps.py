@@ -22,7 +22,7 @@ import crosscue
 from benchmarks.real_roads import DATA, DRIVES
 from crosscue.datasets.simulate import Approaches, simulate_approaches
 from crosscue.eval.vehicle.picture_pass import Follower, reduced
-from crosscue.localization.camera_watch import MountingStep, steps_of
+from crosscue.localization.camera_watch import MIN_MEASURED, MountingStep, steps_of
 from crosscue.replay.columns import Bytes
 from crosscue.replay.vehicle.camera import Camera
 from crosscue.replay.vehicle.vehicle import load, parse
@@ -31,8 +31,8 @@ REAL: Final = ("kitti_t_junction", "pandaset_002")
 SIMULATED: Final = ("A", "B", "C")
 STEP_DEG: Final = 0.5
 WITHIN_S: Final = 10.0
-# Parts of the drive's directions of travel before the step.
-PARTS: Final = (0.4, 0.5, 0.6)
+# Parts of the directions of travel before the step; a simulated drive is long, and has one.
+PARTS: Final = (0.5, 0.4, 0.6)
 
 
 class Drive(NamedTuple):
@@ -112,8 +112,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for drive in [*map(real, REAL), *simulated(Path(folder))]:
             steps, times = watched(drive)
+            if len(times) < 2 * MIN_MEASURED:
+                print(f"{drive.name:32} {len(times):3} directions of travel, too few")
+                continue
             false, drives, mine = false + len(steps), drives + 1, []
-            for part in PARTS if len(times) >= 20 else ():
+            for part in PARTS[: 1 if drive.name.startswith("simulated") else 3]:
                 at_ns = times[int(part * len(times))]
                 for axis in ("pitch", "yaw"):
                     for by_deg in (-STEP_DEG, STEP_DEG):

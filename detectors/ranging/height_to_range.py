@@ -8,8 +8,8 @@ family of curves fits best.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Final, Literal
+from dataclasses import dataclass, field
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.vehicle.vehicle import RangeCurve
+from crosscue.results import HIDDEN
 
 Family = Literal["pinhole", "pinhole-offset", "power"]
 FAMILIES: Final[tuple[Family, ...]] = ("pinhole", "pinhole-offset", "power")
@@ -52,10 +53,12 @@ class RangeFit:
         outliers: Number of pairs left out, which have a wrong object or mask.
     """
 
-    curve: RangeCurve
+    curve: RangeCurve = field(metadata=HIDDEN)
     pairs: int
     bins: tuple[Bin, ...]
     outliers: int = 0
+
+    also: ClassVar = {name: f"curve.{name}" for name in RangeCurve.model_fields}
 
 
 # Number of scales from the curve beyond which a pair is an outlier. It must be beyond both in

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal, TypeAlias
+from typing import ClassVar, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from crosscue.detectors.training.operating_point import fit_platt
 from crosscue.eval.scoring.boxes.reliability import class_calibration
 from crosscue.eval.scoring.intervals import Interval, lower_bound, wilson
 from crosscue.replay.safe_text import counted
+from crosscue.results import HIDDEN, json_key
 
 CalibrationKind: TypeAlias = Literal["platt", "none"]
 # What is labelled: boxes, or whether a picture shows such an object.
@@ -79,6 +80,8 @@ class HeldOut:
     error_after: float
     detections: int
 
+    also: ClassVar = {name: name for name in ("precision", "recall")}
+
     @property
     def is_worse(self) -> bool:
         """Whether the calibrated scores have a larger error than the network's."""
@@ -113,17 +116,17 @@ class ClassFit:
         seen: The detections fitted to, and those held out.
     """
 
-    name: str
-    members: tuple[str, ...]
-    labels: int
+    name: str = field(metadata=json_key("class"))
+    members: tuple[str, ...] = field(metadata=json_key("labels"))
+    labels: int = field(metadata=json_key("boxes"))
     detections: int
     right: int
     scores: ClassScores | None
     bound: float
     held_out: HeldOut | None
     notes: tuple[str, ...]
-    unit: LabelUnit
-    seen: tuple[ClassDetections, ClassDetections] = field(repr=False, compare=False)
+    unit: LabelUnit = field(metadata=HIDDEN)
+    seen: tuple[ClassDetections, ClassDetections] = field(metadata=HIDDEN)
 
     @property
     def counted(self) -> tuple[str, str]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, ClassVar, Final
 
 import numpy as np
 
@@ -65,7 +65,7 @@ class FittedDetector(Fitted):
     """
 
     detector: DetectorRow = field(metadata=HIDDEN)
-    classes: tuple[ClassFit, ...] = field(metadata=HIDDEN)
+    classes: tuple[ClassFit, ...]
     precision: float
     fitted_to: int = field(metadata=json_key("images_fitted_to"))
     held_out: int = field(metadata=json_key("images_held_out"))
@@ -76,7 +76,6 @@ class FittedDetector(Fitted):
     also: ClassVar = {
         "card": "path",
         "detector": "detector.name",
-        "classes": "classes_in_json",
         "confidence": "confidence",
     }
 
@@ -96,11 +95,6 @@ class FittedDetector(Fitted):
     def confidence(self) -> float:
         """Confidence of the bounds on precision."""
         return CONFIDENCE
-
-    @property
-    def classes_in_json(self) -> list[dict[str, Any]]:
-        """Fit of each class, as in JSON."""
-        return [_class_tree(one) for one in self.classes]
 
     @property
     def toml(self) -> str:
@@ -168,23 +162,6 @@ def _calibration_text(one: ClassFit) -> str:
     found = one.scores.calibration
     assert found is not None
     return f"platt, slope {found.slope:g}, offset {found.offset:g}"
-
-
-def _class_tree(one: ClassFit) -> dict[str, Any]:
-    held = one.held_out
-    return {
-        "class": one.name,
-        "labels": list(one.members),
-        "boxes": one.labels,
-        "detections": one.detections,
-        "right": one.right,
-        "scores": None if one.scores is None else one.scores.model_dump(mode="json"),
-        "bound": one.bound,
-        "held_out": None
-        if held is None
-        else asdict(held) | {"precision": held.precision, "recall": held.recall},
-        "notes": list(one.notes),
-    }
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
 
@@ -56,30 +56,18 @@ class FittedRanges(Fitted):
     """
 
     cue: RangeCue
-    fits: tuple[RangeFit, ...] = field(metadata=HIDDEN)
-    tested: RangeFit | None = field(metadata=HIDDEN)
+    fits: tuple[RangeFit, ...]
+    tested: RangeFit | None
     pairs: RangePairs = field(metadata=HIDDEN)
 
     also: ClassVar = {
         "best": "best.curve.family",
-        "fits": "fits_in_json",
-        "tested": "tested_in_json",
     }
 
     @property
     def best(self) -> RangeFit:
         """The fit with the smallest residual."""
         return min(self.fits, key=lambda fit: fit.curve.residual_sd_m)
-
-    @property
-    def fits_in_json(self) -> list[dict[str, Any]]:
-        """Curve and residuals of each family, as in JSON."""
-        return [_as_json(fit) for fit in self.fits]
-
-    @property
-    def tested_in_json(self) -> dict[str, Any] | None:
-        """Residuals on other drives, as in JSON."""
-        return None if self.tested is None else _as_json(self.tested)
 
     @property
     def toml(self) -> str:
@@ -145,15 +133,6 @@ def _bins(bins: tuple[Bin, ...]) -> list[str]:
         f"r.m.s. {b.rms_m:5.2f} m"
         for b in bins
     ]
-
-
-def _as_json(fit: RangeFit) -> dict[str, object]:
-    return {
-        **fit.curve.model_dump(),
-        "pairs": fit.pairs,
-        "outliers": fit.outliers,
-        "bins": [asdict(one) for one in fit.bins],
-    }
 
 
 @dataclass(frozen=True, slots=True)
