@@ -10,9 +10,8 @@ https://github.com/fzi-forschungszentrum-informatik/Lanelet2
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -23,18 +22,15 @@ from crosscue.replay.columns import Floats
 from crosscue.replay.errors import AnnotationError
 
 from .label_xml import parse_xml
+from .lanes import Lane, lane_graph
 from .openstreetmap import MAX_BYTES, MapExtract, MapReader
-from .road_map import SIDE_RAD, Control, Road, RoadMap
+from .road_map import Control, RoadMap
 
 SUBTYPES: Final = ("road", "highway", "play_street")
 CARS: Final = ("participant:vehicle", "participant:vehicle:car", "participant:car")
 # Subtypes of a stop sign: Lanelet2's country and number, and Autoware's name.
 STOP_SIGNS: Final = ("de206", "usR1-1", "stop_sign")
 STEP_M: Final = 4.0
-# Longest turn from one road into another.
-TURN_M: Final = 50.0
-# Lanes that cross at another height do not meet.
-BRIDGE_M: Final = 3.0
 
 
 class _Lanelet(NamedTuple):
@@ -43,15 +39,6 @@ class _Lanelet(NamedTuple):
     right: Sequence[str]
     tags: Mapping[str, str]
     rules: Sequence[str]
-
-
-class _Lane(NamedTuple):
-    """A lanelet in a local frame."""
-
-    ends: tuple[str, str]
-    middle_m: Floats
-    width_m: float
-    height_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,37 +66,11 @@ class LaneMap:
         flat_m = geodetic_to_enu(lat, lon, np.full(len(used), origin[2]), origin)[:, :2]
         xyz_m = dict(zip(used, np.column_stack([flat_m, height_m]), strict=True))
         lanes = {one.key: _lane(one, xyz_m) for one in self.lanelets}
-        points_m: dict[str, Floats] = {}
-        roads: dict[tuple[str, str], Road] = {}
-        for one in self.lanelets:
-            lane = lanes[one.key]
-            names = [f"{one.key}:{row}" for row in range(len(lane.middle_m))]
-            names[0], names[-1] = lane.ends
-            points_m |= zip(names, lane.middle_m, strict=True)
-            opposite = roads.get((lane.ends[1], lane.ends[0]))
-            if opposite is not None:
-                roads[lane.ends[1], lane.ends[0]] = replace(opposite, is_one_way=False)
-                continue
-            one_way = one.tags.get("one_way", "yes") not in ("no", "false")
-            roads[lane.ends] = Road(tuple(names), lane.width_m, one_way)
-        count = Counter(at for lane in lanes.values() for at in lane.ends)
-        turns = [
-            lanes[one.key].ends
-            for one in self.lanelets
-            if "turn_direction" in one.tags
-            or (max(count[at] for at in lanes[one.key].ends) > 2 and _turns(lanes[one.key]))
-        ]
-        # A lanelet that nothing continues may be a crossing for people, drawn as a road.
-        linked = [lane for lane in lanes.values() if any(count[at] > 1 for at in lane.ends)]
-        crossed = [(*a.ends, *b.ends) for a, b in _crossings(linked)]
-        inside = [
-            [at for a, b in zip(ends[::2], ends[1::2], strict=True) for at in _nodes(roads, a, b)]
-            for ends in [*turns, *crossed]
-        ]
-        controls = self._controls(lanes)
-        return RoadMap(points_m, list(roads.values()), controls, inside, min_leg_m=0.0)
+        two_way = {one.key for one in self.lanelets if one.tags.get("one_way") in ("no", "false")}
+        turns = {one.key for one in self.lanelets if "turn_direction" in one.tags}
+        return lane_graph(lanes, self._controls(lanes), two_way=two_way, turns=turns)
 
-    def _controls(self, lanes: Mapping[str, _Lane]) -> dict[str, tuple[Control, float | None]]:
+    def _controls(self, lanes: Mapping[str, Lane]) -> dict[str, tuple[Control, float | None]]:
         """Return controls at the end of the lanes they are for, or before a turn's first point."""
         found: dict[str, tuple[Control, float | None]] = {}
         for one in self.lanelets:
@@ -124,19 +85,7 @@ class LaneMap:
         return found
 
 
-def _nodes(roads: Mapping[tuple[str, str], Road], a: str, b: str) -> tuple[str, ...]:
-    return (roads.get((a, b)) or roads[b, a]).nodes
-
-
-def _turns(lane: _Lane) -> bool:
-    """Whether a lane is as short as one inside an intersection, and leads left or right."""
-    ways = np.diff(lane.middle_m, axis=0)
-    (x0, y0), (x1, y1) = ways[0], ways[-1]
-    turn_rad = abs(np.arctan2(x0 * y1 - y0 * x1, x0 * x1 + y0 * y1))
-    return bool(turn_rad > SIDE_RAD and np.hypot(*ways.T).sum() < TURN_M)
-
-
-def _lane(lanelet: _Lanelet, xyz_m: Mapping[str, Floats]) -> _Lane:
+def _lane(lanelet: _Lanelet, xyz_m: Mapping[str, Floats]) -> Lane:
     bounds = lanelet.left, lanelet.right
     left, right = (np.array([xyz_m[at] for at in side]) for side in bounds)
     names = [(side[0], side[-1]) for side in bounds]
@@ -153,7 +102,7 @@ def _lane(lanelet: _Lanelet, xyz_m: Mapping[str, Floats]) -> _Lane:
     middle = 0.5 * (left + right)
     first, last = ("/".join(sorted((names[0][end], names[1][end]))) for end in (0, 1))
     width_m = float(np.linalg.norm(left - right, axis=1).mean())
-    return _Lane((first, last), middle[:, :2], width_m, float(middle[:, 2].mean()))
+    return Lane((first, last), middle[:, :2], width_m, float(middle[:, 2].mean()))
 
 
 def _resampled(line_m: Floats, count: int) -> Floats:
@@ -161,30 +110,6 @@ def _resampled(line_m: Floats, count: int) -> Floats:
     along = np.concatenate([[0.0], np.cumsum(steps)])
     at = np.linspace(0.0, along[-1], count)
     return np.column_stack([np.interp(at, along, column) for column in line_m.T])
-
-
-def _crossings(lanes: Sequence[_Lane]) -> Iterator[tuple[_Lane, _Lane]]:
-    """Yield pairs of lanes whose middles cross and that have no common end."""
-    low = np.array([one.middle_m.min(axis=0) for one in lanes])
-    high = np.array([one.middle_m.max(axis=0) for one in lanes])
-    for row, one in enumerate(lanes):
-        near = ((low[row + 1 :] <= high[row]) & (high[row + 1 :] >= low[row])).all(axis=1)
-        for other in (lanes[row + 1 + at] for at in np.flatnonzero(near).tolist()):
-            apart = {*one.ends}.isdisjoint(other.ends)
-            if apart and abs(one.height_m - other.height_m) < BRIDGE_M and _cross(one, other):
-                yield one, other
-
-
-def _cross(one: _Lane, other: _Lane) -> bool:
-    a, b = one.middle_m[:, None], other.middle_m[None]
-    ways_a, ways_b = np.diff(a, axis=0), np.diff(b, axis=1)
-
-    def side(way: Floats, off: Floats) -> Floats:
-        return np.sign(way[..., 0] * off[..., 1] - way[..., 1] * off[..., 0])
-
-    of_b = side(ways_a, b - a[:-1])
-    of_a = side(ways_b, a - b[:, :-1])
-    return bool(((of_b[:, :-1] * of_b[:, 1:] < 0) & (of_a[:-1] * of_a[1:] < 0)).any())
 
 
 def read_map(path: Path) -> MapExtract | LaneMap:
