@@ -1,4 +1,6 @@
-"""Write the truth of a nuScenes scene: the ego trajectory, and boxes in the front key frames.
+"""Write the truth of a nuScenes scene: ego trajectory, boxes in front key frames, intersections.
+
+Intersections are those of the map expansion, if it is in ``maps/expansion`` of the data root.
 
 A box is the rectangle around the corners of a cuboid, which must all be ahead of the camera. It is
 wider than the visible part, and exists for hidden cars as well (``visible`` is the middle of the
@@ -16,6 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from crosscue.datasets.truth.coco import Objects
+from crosscue.datasets.truth.map_approaches import approaches_on
 from crosscue.datasets.truth.truth import Mounting
 from crosscue.datasets.truth.tum import Trajectory, write_track_truth
 from crosscue.replay.columns import Floats
@@ -23,6 +26,7 @@ from crosscue.replay.errors import LogFormatError
 
 from .nuscenes import (
     FRONT,
+    Scene,
     SceneTables,
     ego_poses,
     find_scene,
@@ -30,6 +34,7 @@ from .nuscenes import (
     numbers,
     read_scene_tables,
 )
+from .nuscenes_map import read_expansion
 from .nuscenes_tables import Row, RowsOf, checked, whole_table
 
 # COCO's names by prefix of a category; other categories keep their names.
@@ -68,20 +73,44 @@ def write_nuscenes_truth(path: Path, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     objects, lost = _objects(tables)
     what = "nuScenes (Motional; CC BY-NC-SA 4.0)"
+    track = Trajectory(poses.t_ns, poses.xyz_m, poses.wxyz)
+    on_map, of_map = _intersections(tables.scene, track, folder)
     return write_track_truth(
         folder,
         tables.scene.name,
-        Trajectory(poses.t_ns, poses.xyz_m, poses.wxyz),
+        track,
         "nuScenes: the ego frame, the middle of the rear axle, in its map's axes",
         pose_point="rear_axle",
         mounting=Mounting(),
         mounting_source="nuScenes: the ego frame's origin is the middle of the rear axle",
         source=(
             f"{what}: ego poses (localised against a map by laser, in the plane); boxes of key "
-            f"frames in {FRONT}" + (f"; {lost} damaged annotations are left out" if lost else "")
+            f"frames in {FRONT}"
+            + (f"; {lost} damaged annotations are left out" if lost else "")
+            + f"; {of_map}"
         ),
         objects=objects.save(folder, f"{what}: cuboids as seen by {FRONT}"),
+        **on_map,
     )
+
+
+def _intersections(
+    scene: Scene, track: Trajectory, folder: Path
+) -> tuple[Mapping[str, object], str]:
+    """Return the fields of the truth that the map fills, and a sentence on it."""
+    of_scene = whole_table(scene.tables / "scene.json", "name")[scene.token]
+    logs = scene.tables / "log.json"
+    log = whole_table(logs).get(str(of_scene.get("log_token"))) if logs.is_file() else None
+    if log is None or not isinstance(log.get("location"), str):
+        return {}, f"no intersections: {logs.name} does not tell the scene's location"
+    path = scene.root / "maps" / "expansion" / f"{Path(log['location']).name}.json"
+    if not path.is_file():
+        where = path.relative_to(scene.root).as_posix()
+        return {}, f"no intersections: {where} is missing (nuScenes' map expansion)"
+    found = approaches_on(track, read_expansion(path))
+    if not found.approaches:
+        return {}, f"no intersection on the lanes of {path.name} that the car follows"
+    return found.save(folder), found.source(path.name)
 
 
 def _objects(tables: SceneTables) -> tuple[Objects, int]:

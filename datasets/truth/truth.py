@@ -306,13 +306,17 @@ class WrittenTruth(Result):
 
     Attributes:
         path: The file.
+        source: Where its content is from, and what is missing; empty if not known.
     """
 
     path: Path = field(metadata=json_key("truth"))
+    source: str = ""
 
     def lines(self) -> Iterator[str]:
-        """Yield the path."""
+        """Yield the path, and where its content is from."""
         yield str(self.path)
+        if self.source:
+            yield f"source  {self.source}"
 
 
 def write_truth(
@@ -335,4 +339,5 @@ def write_truth(
         OutputError: The files cannot be written.
     """
     with open_log(log, limits) as opened:
-        return WrittenTruth(write_carried(opened.format, Path(opened.path), Path(output)))
+        path = write_carried(opened.format, Path(opened.path), Path(output))
+        return WrittenTruth(path, read_truth(path).source)

@@ -10,41 +10,15 @@ import pytest
 
 from crosscue.datasets.truth.lanelet2 import read_map
 from crosscue.datasets.truth.road_map import Ahead, RoadMap
-from support.street_map import Bound, write_lanelets
-
-LANE_M = 3.5
-# A crossing, 60 to 67 m east, whose roads have a lane each way; its lanes end 4 m before the kerbs.
-WEST, EAST, SOUTH, NORTH = 56.0, 71.0, -7.5, 7.5
-MIDDLE = 63.5
-
-
-def _straight(a: tuple[float, float], b: tuple[float, float]) -> tuple[Bound, Bound]:
-    """Left and right bound of a lane whose left bound is the road's middle line."""
-    (x0, y0), (x1, y1) = a, b
-    length = np.hypot(x1 - x0, y1 - y0)
-    right = LANE_M * (y1 - y0) / length, -LANE_M * (x1 - x0) / length
-    return [a, b], [(x0 + right[0], y0 + right[1]), (x1 + right[0], y1 + right[1])]
-
-
-def _joined(a: tuple[Bound, Bound], b: tuple[Bound, Bound]) -> tuple[Bound, Bound]:
-    """A turn from the end of a lane to the begin of another one."""
-    return [a[0][-1], b[0][0]], [a[1][-1], b[1][0]]
-
-
-def _crossing() -> dict[str, tuple[Bound, Bound, str]]:
-    arms = {
-        "w": ((-80.0, 0.0), (WEST, 0.0)),
-        "e": ((160.0, 0.0), (EAST, 0.0)),
-        "s": ((MIDDLE, -80.0), (MIDDLE, SOUTH)),
-        "n": ((MIDDLE, 80.0), (MIDDLE, NORTH)),
-    }
-    to = {name: _straight(far, near) for name, (far, near) in arms.items()}
-    away = {name: _straight(near, far) for name, (far, near) in arms.items()}
-    found = {f"{name}-in": (*lane, "") for name, lane in to.items()}
-    found |= {f"{name}-out": (*lane, "") for name, lane in away.items()}
-    for a in arms:
-        found |= {f"{a}-{b}": (*_joined(to[a], away[b]), "") for b in arms if a != b}
-    return found
+from support.street_map import (
+    LANE_M,
+    MIDDLE,
+    Bound,
+    crossing_lanes,
+    joined_lane,
+    straight_lane,
+    write_lanelets,
+)
 
 
 def _turned(
@@ -78,7 +52,7 @@ def test_distances_are_those_to_the_kerbs_of_the_crossroad(
     tmp_path: Path, turn_deg: float, reversed_bounds: bool
 ) -> None:
     turn_rad = np.radians(turn_deg)
-    lanelets = _turned(_crossing(), turn_rad)
+    lanelets = _turned(crossing_lanes(), turn_rad)
     roads = _around(write_lanelets(tmp_path / "a.osm", lanelets, reversed_bounds=reversed_bounds))
 
     ahead = _ahead(roads, 10.0, turn_rad=turn_rad)
@@ -89,7 +63,7 @@ def test_distances_are_those_to_the_kerbs_of_the_crossroad(
 
 
 def test_an_approach_goes_on_past_the_stop_line_to_the_kerb(tmp_path: Path) -> None:
-    roads = _around(write_lanelets(tmp_path / "a.osm", _crossing()))
+    roads = _around(write_lanelets(tmp_path / "a.osm", crossing_lanes()))
     x_m = np.arange(40.25, 70.0, 0.5)
 
     found = roads.along(np.column_stack([x_m, np.full(len(x_m), -1.75)]), np.zeros(len(x_m)))
@@ -99,7 +73,7 @@ def test_an_approach_goes_on_past_the_stop_line_to_the_kerb(tmp_path: Path) -> N
 
 
 def test_an_arm_counts_where_the_map_ends_at_its_mouth(tmp_path: Path) -> None:
-    cut = {key: lane for key, lane in _crossing().items() if not key.startswith("n-")}
+    cut = {key: lane for key, lane in crossing_lanes().items() if not key.startswith("n-")}
     roads = _around(write_lanelets(tmp_path / "a.osm", cut))
 
     ahead = _ahead(roads, 10.0)
@@ -111,7 +85,7 @@ def test_an_arm_counts_where_the_map_ends_at_its_mouth(tmp_path: Path) -> None:
 
 def test_control_is_that_of_the_lane(tmp_path: Path) -> None:
     rules = {"light": ("traffic_light", "w-in"), "sign": ("stop", "e-in")}
-    roads = _around(write_lanelets(tmp_path / "a.osm", _crossing(), rules))
+    roads = _around(write_lanelets(tmp_path / "a.osm", crossing_lanes(), rules))
     west, east = _ahead(roads, 30.0), roads.along(np.array([[100.0, 1.75]]), np.array([np.pi]))[0]
     south = roads.along(np.array([[MIDDLE + 1.75, -40.0]]), np.array([np.pi / 2.0]))[0]
 
@@ -125,7 +99,7 @@ def test_lanes_with_a_turn_direction_are_inside_and_their_rules_count_before(
 ) -> None:
     turns = {
         k: (left, right, "turn_direction=straight" if k == "w-e" else said)
-        for k, (left, right, said) in _crossing().items()
+        for k, (left, right, said) in crossing_lanes().items()
         if k not in ("s-n", "n-s")
     }
     rules = {"light": ("traffic_light", "w-e")}
@@ -148,10 +122,10 @@ def _wide(a: tuple[float, float], b: tuple[float, float]) -> tuple[Bound, Bound]
 def test_one_wide_lane_each_way_has_its_side_road_where_it_meets(tmp_path: Path) -> None:
     west, east = _wide((-80.0, 0.0), (55.0, 0.0)), _wide((72.0, 0.0), (160.0, 0.0))
     north = _wide((63.5, 5.0), (63.5, 60.0))
-    lanelets = {"w": west, "e": east, "n": north, "w-e": _joined(west, east)}
+    lanelets = {"w": west, "e": east, "n": north, "w-e": joined_lane(west, east)}
     lanelets |= {
-        "w-n": _joined(west, north),
-        "n-e": _joined((north[0][::-1], north[1][::-1]), east),
+        "w-n": joined_lane(west, north),
+        "n-e": joined_lane((north[0][::-1], north[1][::-1]), east),
     }
     # From the north to the east the bounds change sides.
     lanelets["n-e"] = [north[1][0], east[0][0]], [north[0][0], east[1][0]]
@@ -171,11 +145,11 @@ def test_one_wide_lane_each_way_has_its_side_road_where_it_meets(tmp_path: Path)
 @pytest.mark.parametrize("height_m", [0.0, 6.0])
 def test_a_bridge_is_no_intersection(tmp_path: Path, height_m: float) -> None:
     roads_under = {
-        f"w{part}": (*_straight((-80.0 + 80.0 * part, 0.0), (80.0 * part, 0.0)), "")
+        f"w{part}": (*straight_lane((-80.0 + 80.0 * part, 0.0), (80.0 * part, 0.0)), "")
         for part in range(3)
     }
     over = {
-        f"s{part}": (*_straight((20.0, -120.0 + 80.0 * part), (20.0, -40.0 + 80.0 * part)), "")
+        f"s{part}": (*straight_lane((20.0, -120.0 + 80.0 * part), (20.0, -40.0 + 80.0 * part)), "")
         for part in range(3)
     }
     heights_m = dict.fromkeys(over, height_m)
@@ -187,10 +161,10 @@ def test_a_bridge_is_no_intersection(tmp_path: Path, height_m: float) -> None:
 @pytest.mark.parametrize("tags", ["", "subtype=walkway", "participant:bicycle=yes"])
 def test_a_crossing_for_people_is_no_intersection(tmp_path: Path, tags: str) -> None:
     lanelets = {
-        f"w{part}": (*_straight((-80.0 + 80.0 * part, 0.0), (80.0 * part, 0.0)), "")
+        f"w{part}": (*straight_lane((-80.0 + 80.0 * part, 0.0), (80.0 * part, 0.0)), "")
         for part in range(3)
     }
-    lanelets["over"] = (*_straight((30.0, -9.0), (30.0, 9.0)), tags)
+    lanelets["over"] = (*straight_lane((30.0, -9.0), (30.0, 9.0)), tags)
     roads = _around(write_lanelets(tmp_path / "a.osm", lanelets))
 
     assert _ahead(roads, -10.0) is None

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import crosscue
+from crosscue.datasets.adapters.nuscenes_map import read_expansion
 from crosscue.datasets.adapters.nuscenes_truth import write_nuscenes_truth
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.truth import read_truth
@@ -21,6 +23,7 @@ from support.nuscenes_drive import (
     YAW_RATE_RADPS,
     nuscenes_drive,
     pose,
+    write_expansion,
 )
 
 
@@ -82,6 +85,66 @@ def test_truth_has_rear_axle_pose_and_visible_boxes(tmp_path: Path) -> None:
     assert first["motion"] == "parked"
     assert (first["x_m"], first["y_m"]) == (20.0, 3.0)
     assert first["visible"] == 0.9
+
+
+def test_truth_has_intersections_of_the_map_expansion(tmp_path: Path) -> None:
+    drive = nuscenes_drive(tmp_path / "root")
+    write_expansion(drive)
+
+    written = crosscue.write_truth(drive, tmp_path / "truth")
+
+    truth = read_truth(written.path)
+    (one,) = truth.approaches
+    assert one.features.model_dump() == {"left": True, "right": True, "straight": True}
+    assert one.control == "traffic_light"
+    assert one.length_m == pytest.approx(7.0, abs=0.3)
+    assert truth.ranges is not None
+    head, first, *_ = (tmp_path / "truth" / truth.ranges).read_text().splitlines()
+    assert head == "t_ns,approach,start_m,end_m"
+    assert float(first.split(",")[2]) == pytest.approx(40.0, abs=0.3)
+    assert "intersections from the map boston-seaport.json" in written.source
+
+
+def test_arcs_of_the_map_expansion_are_followed(tmp_path: Path) -> None:
+    drive = nuscenes_drive(tmp_path / "root")
+    place = write_expansion(drive)
+    tree = json.loads(place.read_text())
+    radius = 12.0
+    piece = tree["arcline_path_3"]["w-n"][0]
+    piece |= {"start_pose": [600.0, 1600.0, 0.0], "shape": "LSR", "radius": radius}
+    piece["segment_length"] = [radius * np.pi / 2.0, 5.0, radius * np.pi / 4.0]
+    place.write_text(json.dumps(tree))
+
+    roads = read_expansion(place)
+
+    (turn,) = [one for one in roads.roads if one.nodes[1].startswith("w-n:")]
+    inner = np.array([roads.points_m[at] for at in turn.nodes[1:-1]])
+    # Left about (600, 1612), straight to the north, then right about (624, 1617).
+    np.testing.assert_allclose(np.hypot(*(inner[:9] - (600.0, 1612.0)).T), radius, atol=1e-6)
+    np.testing.assert_allclose(inner[9:11, 0], 612.0, atol=1e-6)
+    np.testing.assert_allclose(np.hypot(*(inner[11:] - (624.0, 1617.0)).T), radius, atol=1e-6)
+
+
+def test_truth_says_which_map_is_missing(tmp_path: Path) -> None:
+    drive = nuscenes_drive(tmp_path / "root")
+
+    written = crosscue.write_truth(drive, tmp_path / "truth")
+
+    assert not read_truth(written.path).approaches
+    assert "no intersections: maps/expansion/boston-seaport.json is missing" in written.source
+    assert [*written.lines()][-1].startswith("source")
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"lane": 3}', '{"lane": [{"token": 1}]}'])
+def test_unusable_map_expansion_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    drive = nuscenes_drive(tmp_path / "root")
+    place = write_expansion(drive)
+    place.write_text(text)
+
+    with pytest.raises(LogFormatError, match=r"boston-seaport.json: .*map expansion") as caught:
+        crosscue.write_truth(drive, tmp_path / "truth")
+
+    assert "\n" not in str(caught.value)
 
 
 def test_box_matches_pinhole_projection(tmp_path: Path) -> None:

@@ -4,9 +4,10 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from support.pictures import picture
+from support.street_map import Bound, crossing_lanes
 
 FIRST_US: Final = 1_532_402_927_612_460
 SPEED_MPS: Final = 6.0
@@ -14,6 +15,7 @@ YAW_RATE_RADPS: Final = 0.1
 SIZE_PX: Final = (1600, 900)
 FOCAL_PX: Final = 1266.0
 WHEEL_RADIUS_M: Final = 0.305
+LOCATION: Final = "boston-seaport"
 CAMERA_M: Final = (1.7, 0.0, 1.5)
 # Rotation from the camera's axes (right, down, ahead) to the vehicle's (ahead, left, up).
 OF_CAMERA: Final = (0.5, -0.5, 0.5, -0.5)
@@ -42,7 +44,9 @@ def nuscenes_drive(path: Path, count: int = 12, *, with_can: bool = True, scenes
     tables = path / "v1.0-mini"
     tables.mkdir(parents=True)
     names = [f"scene-{61 + i:04d}" for i in range(scenes)]
-    table(tables, "scene", "token name", [(f"s{i}", name) for i, name in enumerate(names)])
+    scene_rows = [(f"s{i}", name, "l0") for i, name in enumerate(names)]
+    table(tables, "scene", "token name log_token", scene_rows)
+    table(tables, "log", "token location", [("l0", LOCATION)])
     sensors = [("cam", "CAM_FRONT", "camera"), ("lid", "LIDAR_TOP", "lidar")]
     table(tables, "sensor", "token channel modality", sensors)
     matrix = [[FOCAL_PX, 0.0, 816.0], [0.0, FOCAL_PX, 491.0], [0.0, 0.0, 1.0]]
@@ -76,6 +80,59 @@ def nuscenes_drive(path: Path, count: int = 12, *, with_can: bool = True, scenes
     if with_can:
         _can(path, count)
     return path
+
+
+def write_expansion(path: Path) -> Path:
+    """Write a map expansion with a crossing 40 m ahead of the first pose, and return its path.
+
+    A traffic light's stop line lies over the end of the lane that the car is in.
+    """
+    tree: dict[str, Any] = {"version": "1.3", "node": [], "polygon": [], "lane": []}
+    tree |= {"lane_connector": [], "arcline_path_3": {}, "connectivity": {}, "stop_line": []}
+
+    def polygon(token: str, corners: Bound) -> str:
+        names = [f"{token}-{i}" for i in range(len(corners))]
+        tree["node"] += [
+            {"token": name, "x": 580.0 + x, "y": 1601.75 + y}
+            for name, (x, y) in zip(names, corners, strict=True)
+        ]
+        row = {"token": f"{token}-p", "exterior_node_tokens": names, "holes": []}
+        tree["polygon"].append(row)
+        return f"{token}-p"
+
+    lanes = crossing_lanes()
+    for token, (left, right, _) in lanes.items():
+        is_lane = token.endswith(("-in", "-out"))
+        area = polygon(token, [*left, *right[::-1]])
+        row = {"token": token, "polygon_token": area}
+        if is_lane:
+            tree["lane"].append(row | {"lane_type": "CAR"})
+        else:
+            tree["lane_connector"].append({"token": token})
+        (x0, y0), (x1, y1) = (
+            (580.0 + (a[0] + b[0]) / 2, 1601.75 + (a[1] + b[1]) / 2)
+            for a, b in ((left[0], right[0]), (left[-1], right[-1]))
+        )
+        yaw, length = math.atan2(y1 - y0, x1 - x0), math.hypot(x1 - x0, y1 - y0)
+        piece = {"start_pose": [x0, y0, yaw], "end_pose": [x1, y1, yaw], "shape": "LSR"}
+        piece |= {"radius": 999.999, "segment_length": [0.0, length, 0.0]}
+        tree["arcline_path_3"][token] = [piece]
+        arm, to = token.split("-")
+        before = [] if is_lane else [f"{arm}-in"]
+        after = [] if is_lane else [f"{to}-out"]
+        if to == "in":
+            after = [one for one in lanes if one.startswith(f"{arm}-") and one[-1] in "wens"]
+            after = [one for one in after if not one.endswith(("-in", "-out"))]
+        if to == "out":
+            before = [one for one in lanes if one.endswith(f"-{arm}")]
+        tree["connectivity"][token] = {"incoming": before, "outgoing": after}
+    area = polygon("stop", [(53.0, -3.4), (55.0, -3.4), (55.0, -0.1), (53.0, -0.1)])
+    stop = {"token": "stop", "polygon_token": area, "stop_line_type": "TRAFFIC_LIGHT"}
+    tree["stop_line"].append(stop)
+    place = path / "maps" / "expansion" / f"{LOCATION}.json"
+    place.parent.mkdir(parents=True)
+    place.write_text(json.dumps(tree))
+    return place
 
 
 def _boxes(tables: Path, keys: Iterable[int]) -> None:

@@ -48,6 +48,40 @@ def _degrees(xy_m: tuple[float, float], origin: tuple[float, float]) -> str:
 
 
 Bound = Sequence[tuple[float, float]]
+LANE_M = 3.5
+# A crossing, 60 to 67 m east, whose roads have a lane each way; its lanes end 4 m before the kerbs.
+WEST, EAST, SOUTH, NORTH = 56.0, 71.0, -7.5, 7.5
+MIDDLE = 63.5
+
+
+def straight_lane(a: tuple[float, float], b: tuple[float, float]) -> tuple[Bound, Bound]:
+    """Left and right bound of a lane whose left bound is the road's middle line."""
+    (x0, y0), (x1, y1) = a, b
+    length = math.hypot(x1 - x0, y1 - y0)
+    right = LANE_M * (y1 - y0) / length, -LANE_M * (x1 - x0) / length
+    return [a, b], [(x0 + right[0], y0 + right[1]), (x1 + right[0], y1 + right[1])]
+
+
+def joined_lane(a: tuple[Bound, Bound], b: tuple[Bound, Bound]) -> tuple[Bound, Bound]:
+    """A turn from the end of a lane to the begin of another one."""
+    return [a[0][-1], b[0][0]], [a[1][-1], b[1][0]]
+
+
+def crossing_lanes() -> dict[str, tuple[Bound, Bound, str]]:
+    """Bounds and tags of the lanes of a crossing."""
+    arms = {
+        "w": ((-80.0, 0.0), (WEST, 0.0)),
+        "e": ((160.0, 0.0), (EAST, 0.0)),
+        "s": ((MIDDLE, -80.0), (MIDDLE, SOUTH)),
+        "n": ((MIDDLE, 80.0), (MIDDLE, NORTH)),
+    }
+    to = {name: straight_lane(far, near) for name, (far, near) in arms.items()}
+    away = {name: straight_lane(near, far) for name, (far, near) in arms.items()}
+    found = {f"{name}-in": (*lane, "") for name, lane in to.items()}
+    found |= {f"{name}-out": (*lane, "") for name, lane in away.items()}
+    for a in arms:
+        found |= {f"{a}-{b}": (*joined_lane(to[a], away[b]), "") for b in arms if a != b}
+    return found
 
 
 def write_lanelets(
