@@ -24,7 +24,7 @@ from crosscue.replay.limits import MIB
 
 MAX_BYTES: Final = 512 * MIB
 STEP_M: Final = 2.0
-# Width of a lane connector, which has no polygon.
+# Width of every lane, because connectors have no polygon.
 LANE_M: Final = 3.5
 # Part of a lane at its end on which its stop line lies.
 END_M: Final = 10.0
@@ -47,7 +47,7 @@ def read_expansion(path: Path) -> RoadMap:
             row["token"]: np.array([nodes[at] for at in row["exterior_node_tokens"]])
             for row in tree["polygon"]
         }
-        lanes = _lanes(tree, areas)
+        lanes = _lanes(tree)
         return lane_graph(lanes, dict(_controls(tree, areas, lanes)))
     except OSError as error:
         raise LogFormatError(f"{path}: {error.strerror}; expected a map expansion") from None
@@ -56,10 +56,9 @@ def read_expansion(path: Path) -> RoadMap:
         raise LogFormatError(f"{path}: {why}: not a map expansion of nuScenes, 1.3") from None
 
 
-def _lanes(tree: Mapping[str, Any], areas: Mapping[str, Floats]) -> dict[str, Lane]:
-    rows = {row["token"]: row for row in tree["lane"] if row.get("lane_type", "CAR") == "CAR"}
-    plain = {*rows}
-    rows |= {row["token"]: row for row in tree["lane_connector"]}
+def _lanes(tree: Mapping[str, Any]) -> dict[str, Lane]:
+    plain = {row["token"] for row in tree["lane"] if row.get("lane_type", "CAR") == "CAR"}
+    all_lanes = plain | {row["token"] for row in tree["lane_connector"]}
     links: Mapping[str, Mapping[str, Sequence[str]]] = tree["connectivity"]
 
     def last(token: str) -> str:
@@ -68,21 +67,17 @@ def _lanes(tree: Mapping[str, Any], areas: Mapping[str, Floats]) -> dict[str, La
         return f"{after}<" if after else f"{token}>"
 
     def first(token: str) -> str:
-        before = next((one for one in links.get(token, {}).get("incoming", ()) if one in rows), "")
+        before = next(
+            (one for one in links.get(token, {}).get("incoming", ()) if one in all_lanes), ""
+        )
         return last(before) if before and token not in plain else f"{token}<"
 
     found = {}
-    for token, row in rows.items():
-        pieces = tree["arcline_path_3"].get(token, ())
-        if not pieces:
-            continue
-        middle = np.concatenate([_line(piece) for piece in pieces])
+    for token in sorted(all_lanes & tree["arcline_path_3"].keys()):
+        middle = np.concatenate([_line(piece) for piece in tree["arcline_path_3"][token]])
         middle = middle[np.r_[True, np.hypot(*np.diff(middle, axis=0).T) > 0.01]]
-        length_m = float(np.hypot(*np.diff(middle, axis=0).T).sum())
-        area = areas.get(row.get("polygon_token", ""))
-        width_m = LANE_M if area is None else _size_m2(area) / max(length_m, STEP_M)
         if len(middle) > 1:
-            found[token] = Lane((first(token), last(token)), middle, width_m)
+            found[token] = Lane((first(token), last(token)), middle, LANE_M)
     return found
 
 
@@ -101,11 +96,6 @@ def _line(piece: Mapping[str, Any]) -> Floats:
             yaw += turn_rad
             points.append((x, y))
     return np.array(points)
-
-
-def _size_m2(area: Floats) -> float:
-    x, y = area.T
-    return 0.5 * abs(float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()))
 
 
 def _controls(

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from crosscue.datasets.truth.coco import Objects
-from crosscue.datasets.truth.map_approaches import approaches_on
+from crosscue.datasets.truth.map_approaches import write_approaches
 from crosscue.datasets.truth.truth import Mounting
 from crosscue.datasets.truth.tum import Trajectory, write_track_truth
 from crosscue.replay.columns import Floats
@@ -107,10 +107,7 @@ def _intersections(
     if not path.is_file():
         where = path.relative_to(scene.root).as_posix()
         return {}, f"no intersections: {where} is missing (nuScenes' map expansion)"
-    found = approaches_on(track, read_expansion(path))
-    if not found.approaches:
-        return {}, f"no intersection on the lanes of {path.name} that the car follows"
-    return found.save(folder), found.source(path.name)
+    return write_approaches(track, read_expansion(path), path.name, folder)
 
 
 def _objects(tables: SceneTables) -> tuple[Objects, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -23,44 +23,23 @@ NOT_STATED: Final = "control_not_stated"
 STEP_NS: Final = 50_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class MapApproaches:
-    """Approaches with their distances.
-
-    Attributes:
-        approaches: The approaches.
-        ranges: Rows of the file of ranges.
-    """
-
-    approaches: Sequence[Approach]
-    ranges: Sequence[str]
-
-    def save(self, folder: Path) -> dict[str, Any]:
-        """Write the ranges, and return the fields of ``Truth`` that the approaches fill.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
-        folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / RANGES, "\n".join(["t_ns,approach,start_m,end_m", *self.ranges, ""]))
-        return {"approaches": tuple(self.approaches), "ranges": RANGES}
-
-    def source(self, name: str) -> str:
-        """Return a sentence on where they are from."""
-        unstated = sum(NOT_STATED in one.conditions for one in self.approaches)
-        return (
-            f"intersections from the map {name}, widths by its lanes; control not stated for "
-            f"{unstated} of {len(self.approaches)}"
-        )
-
-
-def approaches_on(track: Trajectory, roads: RoadMap, ahead_m: float = 0.0) -> MapApproaches:
-    """Return the approaches of a track.
+def write_approaches(
+    track: Trajectory, roads: RoadMap, name: str, folder: Path, ahead_m: float = 0.0
+) -> tuple[dict[str, Any], str]:
+    """Write the ranges of a track's approaches to the intersections of a map.
 
     Args:
         track: Positions in the map's frame, with headings.
         roads: The map.
+        name: Name of the map.
+        folder: Folder for the ranges; it is not written without an approach.
         ahead_m: Distance of the track's body ahead of the rear axle, whose ranges are wanted.
+
+    Returns:
+        Fields of ``Truth``, and a sentence on their source; no field without an approach.
+
+    Raises:
+        OutputError: The file cannot be written.
     """
     t_ns = track.t_ns
     rows = np.unique(np.searchsorted(t_ns, np.arange(t_ns[0], t_ns[-1] + 1, STEP_NS)))
@@ -82,7 +61,16 @@ def approaches_on(track: Trajectory, roads: RoadMap, ahead_m: float = 0.0) -> Ma
             assert one is not None
             start_m, end_m = (float(m) + ahead_m for m in (one.start_m, one.end_m))
             ranges.append(f"{t},{number},{start_m:.2f},{end_m:.2f}")
-    return MapApproaches(approaches, ranges)
+    if not approaches:
+        return {}, f"no intersection of the map {name} on the roads that the drive follows"
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / RANGES, "\n".join(["t_ns,approach,start_m,end_m", *ranges, ""]))
+    unstated = sum(NOT_STATED in one.conditions for one in approaches)
+    source = (
+        f"intersections from the map {name}, widths by its lanes; control not stated for "
+        f"{unstated} of {len(approaches)}"
+    )
+    return {"approaches": tuple(approaches), "ranges": RANGES}, source
 
 
 def _approach(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from crosscue.datasets.truth.lanelet2 import read_map
-from crosscue.datasets.truth.map_approaches import approaches_on
+from crosscue.datasets.truth.map_approaches import write_approaches
 from crosscue.datasets.truth.truth import WrittenTruth
 from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.replay.errors import EmptyResultError
@@ -48,17 +48,9 @@ def truth_from_map(
         truth, track = gnss_truth(drive.logs, settings, drive.selection)
     assert truth.origin is not None
     origin = truth.origin.latitude_deg, truth.origin.longitude_deg, truth.origin.altitude_m
-    found = approaches_on(track, extract.around(origin), settings.gnss.x_m)
-    if not found.approaches:
-        raise EmptyResultError(f"{path}: no intersection on the roads that the drive follows")
-    folder = Path(output)
-    more = found.save(folder)
-    return WrittenTruth(
-        save_with_track(
-            truth.model_copy(
-                update=more | {"source": f"{truth.source}; {found.source(path.name)}"}
-            ),
-            track,
-            folder,
-        )
-    )
+    folder, roads = Path(output), extract.around(origin)
+    more, source = write_approaches(track, roads, path.name, folder, settings.gnss.x_m)
+    if not more:
+        raise EmptyResultError(f"{path}: {source}")
+    more["source"] = f"{truth.source}; {source}"
+    return WrittenTruth(save_with_track(truth.model_copy(update=more), track, folder))

@@ -69,7 +69,7 @@ def test_map_of_another_place_is_refused(tmp_path: Path) -> None:
     points = {"a": (0.0, 0.0), "b": (100.0, 0.0)}
     streets = write_map(tmp_path / "far.osm", points, [("ab", "")], origin=(50.0, 8.4))
 
-    with pytest.raises(EmptyResultError, match="no intersection on the roads"):
+    with pytest.raises(EmptyResultError, match=r"no intersection of the map .* on the roads"):
         crosscue.truth_from_map(raw_drive(tmp_path / "kitti"), streets, tmp_path / "truth")
 
     assert not (tmp_path / "truth").exists()
