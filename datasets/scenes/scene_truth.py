@@ -132,6 +132,9 @@ SIMULATED: Final[dict[str, Simulated]] = {
     "one_way_left": _sign("one_way_left"),
     "one_way_right": _sign("one_way_right"),
     "do_not_enter": _sign("do_not_enter"),
+    "map_left": _always(lambda layout, _: layout.has_left),
+    "map_straight": _always(lambda layout, _: layout.has_ahead),
+    "map_right": _always(lambda layout, _: layout.has_right),
 }
 
 

@@ -156,6 +156,8 @@ class Truth(TruthSection):
     origin: Origin | None = None
     source: str = ""
     """Source and accuracy of the measurements."""
+    map_sha256: str = ""
+    """Hash of the map that the approaches are from. A run that used it is refused."""
     approaches: tuple[Approach, ...] = ()
     cues: tuple[CueTruth, ...] = ()
     own_cues: tuple[Name, ...] = ()

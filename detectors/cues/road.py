@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from functools import lru_cache
 from typing import Final
 
@@ -27,6 +28,11 @@ def is_road(fractions: RoadFractions, vehicle: Vehicle, cue: CueSpec) -> Count:
     scores = [fraction] if fraction > 0.0 else []
     low = sum(one <= limit for one in scores)
     return Count(int(fraction > limit), scores, {TOO_LITTLE_ROAD: low}, [limit], SETTING, "frames")
+
+
+def is_on_map(sides: Collection[str], vehicle: Vehicle, cue: CueSpec) -> int:
+    """Count 1 if the map has a way out of the next intersection on the cue's side, else 0."""
+    return int(cue.supports[0] in sides)
 
 
 @lru_cache(maxsize=64)

@@ -9,6 +9,7 @@ from crosscue.datasets.truth.map_approaches import write_approaches
 from crosscue.datasets.truth.truth import WrittenTruth
 from crosscue.eval.logs.log import DriveGiven, opened
 from crosscue.replay.errors import EmptyResultError
+from crosscue.replay.files.whole_file import file_sha256
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 
 from .gnss_truth import gnss_truth, save_with_track
@@ -52,5 +53,5 @@ def truth_from_map(
     more, source = write_approaches(track, roads, path.name, folder, settings.gnss.x_m)
     if not more:
         raise EmptyResultError(f"{path}: {source}")
-    more["source"] = f"{truth.source}; {source}"
+    more |= {"source": f"{truth.source}; {source}", "map_sha256": file_sha256(path)}
     return WrittenTruth(save_with_track(truth.model_copy(update=more), track, folder))

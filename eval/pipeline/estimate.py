@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
@@ -35,7 +36,7 @@ from crosscue.eval.runs.tables.parquet import TableSink
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.localization.pose_track import PoseColumns
 from crosscue.replay.base import Log
-from crosscue.replay.files.whole_file import sha256_of
+from crosscue.replay.files.whole_file import file_sha256, sha256_of
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.signals.extractor import SampleExtractor, probe_clocks
 from crosscue.replay.signals.kinds import Signal, SignalPlan
@@ -217,7 +218,7 @@ class EstimateStage:
         timings = None if found is None else run.timings()
         detect = None if timings is None else timings.detect
         write_timings(run, Timings(seconds=seconds, detect=detect))
-        landmarks = self._landmarks
+        landmarks, road_map = self._landmarks, drive.vehicle.road_map
         manifest = EstimateManifest(
             versions=versions_and_commit(),
             logs=tuple(rows),
@@ -237,6 +238,7 @@ class EstimateStage:
             ),
             scene=scene,
             detect=found,
+            map_sha256=None if road_map is None else file_sha256(Path(road_map)),
         )
         write_manifest(run, manifest)
         return Outcome(

@@ -282,6 +282,8 @@ class EstimateManifest(_Drive):
     scene: SceneSummary | None
     detect: DetectManifest | None
     """The detect part; None if no detector ran."""
+    map_sha256: str | None = None
+    """Hash of the map whose cues were used; None without."""
 
     def with_files(self, named: Callable[[str], str]) -> Self:
         """Return the manifest with other names of the files in its settings."""

@@ -21,7 +21,7 @@ from crosscue.eval.runs.account import (
 )
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.logs import log_location
-from crosscue.eval.runs.manifest import LogRow
+from crosscue.eval.runs.manifest import EstimateManifest, LogRow
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.eval.scoring.pose.errors import FilterAndSmoother
 from crosscue.eval.scoring.scene.ranges import score_smoothed
@@ -210,8 +210,14 @@ def judge_scene(
         RunError: A table is damaged, or the run contains merged drives.
         SchemaError: The truth does not fit the run.
     """
-    run.drive_manifest()
+    manifest = run.drive_manifest()
     truth = score_truth.read_scored_truth(truth_path, spelled(str(run.path)))
+    of_map = truth.truth.map_sha256
+    if of_map and isinstance(manifest, EstimateManifest) and manifest.map_sha256 == of_map:
+        raise UsageError(
+            f"{truth_path}: its approaches are from the map that {run.path} used as a cue; use "
+            "another truth, or replay without road_map in the vehicle file"
+        )
     if not any_log:
         _check_log(run, truth.truth, truth_path)
     tables = read_run_tables(run)

@@ -6,7 +6,7 @@ from typing import Literal
 from crosscue.replay.colours import FEATURES, Colour
 
 Scoring = Literal["object", "feature"]
-Input = Literal["objects", "car pairs", "signs", "road", "mobileye"]
+Input = Literal["objects", "car pairs", "signs", "road", "mobileye", "map"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -139,6 +139,28 @@ def _one_way(side: str, other: str) -> CueSpec:
     )
 
 
+# Assumed, as nobody has counted: maps are out of date, and a position may be on the wrong road.
+MAP_PRECISION: Final = 0.9
+
+
+def _map(side: str, *, can_start: bool) -> CueSpec:
+    return CueSpec(
+        name=f"map_{side}",
+        group="map",
+        title="map",
+        observed_by="map",
+        rule="crosscue.detectors.cues.road:is_on_map",
+        precision=MAP_PRECISION,
+        supports=(side,),
+        scored_as="feature",
+        can_start=can_start,
+        absence_counts=True,
+        colour=FEATURES[side],
+        # An error of the map is the same over the whole approach.
+        fade_m=100.0,
+    )
+
+
 STOP_SIGN: Final = _control("stop_sign", 0.97)
 TRAFFIC_LIGHT: Final = _control("traffic_light", 0.95, AT_INTERSECTIONS)
 DO_NOT_ENTER: Final = CueSpec(
@@ -179,6 +201,9 @@ BUILTIN_CUES: Final[dict[str, CueSpec]] = {
         _one_way("left", "right"),
         _one_way("right", "left"),
         DO_NOT_ENTER,
+        _map("left", can_start=True),
+        _map("straight", can_start=False),
+        _map("right", can_start=True),
     )
 }
 

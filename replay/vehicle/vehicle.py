@@ -373,6 +373,9 @@ class Vehicle(Section):
     fusion: Annotated[Fusion, Field(validate_default=True)] = Fusion()
     detectors: dict[str, DetectorSection] = Field(default_factory=dict)
     """Settings of each detector, by its name."""
+    road_map: str | None = None
+    """OpenStreetMap extract or Lanelet2 map, .osm, for the cues ``map_left``, ``map_straight`` and
+    ``map_right``; it needs ``start.map_origin`` or GNSS. By default there is no map."""
     lost_above_m: Positive = 100.0
     """Maximum full major axis of the 2-sigma ellipse; above it, the pose is reported as lost."""
 
@@ -446,7 +449,7 @@ class Vehicle(Section):
         return {name: self.labels_of(cue) for name, cue in CUES.items()} | own
 
     def with_files(self, named: Callable[[str], str]) -> Self:
-        """Return the settings with other names of DBC files and model cards."""
+        """Return the settings with other names of DBC files, model cards and the map."""
         dbc = tuple(map(named, self.can.dbc))
         detectors = {
             name: section
@@ -454,7 +457,9 @@ class Vehicle(Section):
             else section.model_copy(update={"card": named(section.card)})
             for name, section in self.detectors.items()
         }
-        changed = {"can": self.can.model_copy(update={"dbc": dbc}), "detectors": detectors}
+        can = self.can.model_copy(update={"dbc": dbc})
+        road_map = None if self.road_map is None else named(self.road_map)
+        changed = {"can": can, "detectors": detectors, "road_map": road_map}
         return self.model_copy(update=changed)
 
     @property

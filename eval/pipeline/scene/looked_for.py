@@ -22,6 +22,7 @@ NO_ROAD: Final = "no detector of road"
 NO_MOBILEYE: Final = "no Mobileye, or no range to an intersection"
 NO_PLACE: Final = 'no range to an intersection, or not cars.kind = "tracks"'
 NOT_WANTED: Final = "not cars.leg_traffic = true, or no range to an intersection"
+NO_MAP: Final = "no road_map in the vehicle file, or no intersection of it ahead"
 NO_MASKS: Final = "only masks show which way a parked car faces (eq. 16), and all cars are boxes"
 NEVER: Final = "no frame in which they could be computed"
 
@@ -67,6 +68,8 @@ def not_looked_for(
         observed_by = CUES[cue].observed_by if cue in CUES else "objects"
         if observed_by == "mobileye":
             return NO_MOBILEYE
+        if observed_by == "map":
+            return NO_MAP
         if observed_by == "road":
             return NEVER if DetectorRole.ROAD in roles else NO_ROAD
         if cue in without:

@@ -39,6 +39,7 @@ from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.vehicle import Vehicle
 
+from .map_cue import map_ahead
 from .roads import Roads, pitches_of
 
 ROWS_HELD: Final = 8192
@@ -165,6 +166,7 @@ class Scene:
         self._is_area = vehicle.regions.kind == "area"
         self._roads = Roads(vehicle, pitches_of(run)) if self._is_area else None
         self._past = StoredMobileye(run, vehicle.past)
+        self._map = map_ahead(run, vehicle)
         self._cues = CuePass(vehicle)
         self._signs = SignRanges(vehicle)
         self._motion = MotionRanges(vehicle)
@@ -203,7 +205,10 @@ class Scene:
     def observe(self, step: SceneStep) -> FrameCues:
         """Return the cues of a frame."""
         found = self._cues(step.frame, step.ego, step.place)
-        counts = {cue: count for cue, count in found.counts.items() if cue not in self._without}
+        on_map = self._map(step.frame.t_ns)
+        counts = {
+            cue: count for cue, count in (found.counts | on_map).items() if cue not in self._without
+        }
         return replace(found, counts=counts)
 
     def range(self, step: SceneStep, cues: FrameCues) -> FrameEvidence:
