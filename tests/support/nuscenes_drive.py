@@ -114,7 +114,11 @@ def write_expansion(path: Path) -> Path:
             for a, b in ((left[0], right[0]), (left[-1], right[-1]))
         )
         yaw, length = math.atan2(y1 - y0, x1 - x0), math.hypot(x1 - x0, y1 - y0)
-        piece = {"start_pose": [x0, y0, yaw], "end_pose": [x1, y1, yaw], "shape": "LSR"}
+        piece: dict[str, Any] = {
+            "start_pose": [x0, y0, yaw],
+            "end_pose": [x1, y1, yaw],
+            "shape": "LSR",
+        }
         piece |= {"radius": 999.999, "segment_length": [0.0, length, 0.0]}
         tree["arcline_path_3"][token] = [piece]
         arm, to = token.split("-")

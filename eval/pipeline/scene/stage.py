@@ -207,7 +207,9 @@ class Scene:
         found = self._cues(step.frame, step.ego, step.place)
         on_map = self._map(step.frame.t_ns)
         counts = {
-            cue: count for cue, count in (found.counts | on_map).items() if cue not in self._without
+            cue: count
+            for cue, count in {**found.counts, **on_map}.items()
+            if cue not in self._without
         }
         return replace(found, counts=counts)
 
