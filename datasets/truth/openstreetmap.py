@@ -80,7 +80,7 @@ class MapExtract:
 class MapReader(XmlReader):
     """Points, roads and controls of a file."""
 
-    kind = "OpenStreetMap's XML"
+    kind = "OpenStreetMap's or Lanelet2's XML"
     max_depth = 16
     points: dict[str, tuple[float, float]] = field(default_factory=dict)
     controls: dict[str, tuple[Control, str]] = field(default_factory=dict)

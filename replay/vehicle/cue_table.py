@@ -151,7 +151,7 @@ def _map(side: str, *, can_start: bool) -> CueSpec:
         observed_by="map",
         rule="crosscue.detectors.cues.road:is_on_map",
         precision=MAP_PRECISION,
-        supports=(side,),
+        supports=(side, "intersection") if can_start else (side,),
         scored_as="feature",
         can_start=can_start,
         absence_counts=True,

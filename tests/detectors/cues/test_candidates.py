@@ -98,7 +98,7 @@ def test_region_with_too_little_road_is_counted_as_skipped() -> None:
 
 
 # Groups of cues that need the place of an intersection.
-UNPLACED = ("cars_past", "leg_traffic")
+UNPLACED = ("cars_past", "leg_traffic", "map")
 
 
 @given(FRAMES, FRAMES, st.sampled_from([VEHICLE, TRACKED]))

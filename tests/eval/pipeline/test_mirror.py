@@ -177,7 +177,7 @@ def test_simulated_drive_in_a_mirror_is_mirrored_and_shows_every_cue(simulated: 
 
     # Cars beyond an intersection and in its legs need one whose range is known: see real drives.
     unseen = BUILTIN_CUES.keys() - seen
-    assert {BUILTIN_CUES[cue].group for cue in unseen} <= {"cars_past", "leg_traffic"}
+    assert {BUILTIN_CUES[cue].group for cue in unseen} <= {"cars_past", "leg_traffic", "map"}
 
 
 def test_mirror_finds_a_rule_that_assumes_a_side(
