@@ -238,7 +238,7 @@ class EstimateStage:
             ),
             scene=scene,
             detect=found,
-            map_sha256=None if road_map is None else file_sha256(Path(road_map)),
+            map_sha256=file_sha256(Path(road_map)) if road_map and scene else None,
         )
         write_manifest(run, manifest)
         return Outcome(
