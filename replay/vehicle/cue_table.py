@@ -151,10 +151,9 @@ def _map(side: str, *, can_start: bool) -> CueSpec:
         observed_by="map",
         rule="crosscue.detectors.cues.road:is_on_map",
         precision=MAP_PRECISION,
-        supports=(side, "intersection") if can_start else (side,),
+        supports=(side,),
         scored_as="feature",
         can_start=can_start,
-        absence_counts=True,
         colour=FEATURES[side],
         # An error of the map is the same over the whole approach.
         fade_m=100.0,

@@ -54,8 +54,8 @@ def test_legs_of_the_map_are_cues_that_open_an_approach(tmp_path: Path) -> None:
 
     assert _counts(run) == {"map_left": {1}, "map_straight": {1}, "map_right": {0}}
     last = pq.read_table(run / "belief.parquet").to_pylist()[-1]
-    assert min(last["left"], last["intersection"], last["straight"]) > 0.85
-    assert last["right"] <= 0.5
+    assert min(last["left"], last["straight"]) > 0.85
+    assert last["right"] == 0.5
 
 
 def test_without_a_map_there_is_no_such_cue(tmp_path: Path) -> None:
