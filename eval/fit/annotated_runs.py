@@ -25,6 +25,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.travelled import odometer_of
 from crosscue.eval.scoring.columns import NONE
 from crosscue.eval.scoring.places import group_places
+from crosscue.eval.scoring.runs import refuse_own_map
 from crosscue.eval.scoring.truth import CROSSING_NS, DriveTruth, read_scored_truth
 from crosscue.fusion.factor_graph import FactorGraph, graph_of
 from crosscue.fusion.fit.annotated_approach import NOT_EVALUATED, AnnotatedApproach
@@ -69,7 +70,9 @@ def read_annotated(
     graph, vehicle = graph_of_runs(folders)
     parts: list[Part] = []
     for done, (folder, known) in enumerate(zip(folders, truth, strict=True), 1):
-        parts += parts_of(folder, read_scored_truth(Path(known), str(folder.path)), vehicle)
+        one = read_scored_truth(Path(known), str(folder.path))
+        refuse_own_map(folder, one.truth, Path(known))
+        parts += parts_of(folder, one, vehicle)
         emit(Progress("reading", done, len(folders), "runs"))
     return graph, by_place(parts)
 

@@ -210,19 +210,29 @@ def judge_scene(
         RunError: A table is damaged, or the run contains merged drives.
         SchemaError: The truth does not fit the run.
     """
-    manifest = run.drive_manifest()
+    run.drive_manifest()
     truth = score_truth.read_scored_truth(truth_path, spelled(str(run.path)))
-    of_map = truth.truth.map_sha256
-    if of_map and isinstance(manifest, EstimateManifest) and manifest.map_sha256 == of_map:
-        raise UsageError(
-            f"{truth_path}: its approaches are from the map that {run.path} used as a cue; use "
-            "another truth, or replay without road_map in the vehicle file"
-        )
+    refuse_own_map(run, truth.truth, truth_path)
     if not any_log:
         _check_log(run, truth.truth, truth_path)
     tables = read_run_tables(run)
     _check_times(run, truth.truth, tables, truth_path)
     return SceneJudged(truth, score_drive(tables, truth, settings))
+
+
+def refuse_own_map(run: RunFolder, truth: Truth, path: Path) -> None:
+    """Refuse truth from the map that the run used as a cue.
+
+    Raises:
+        UsageError: It is from that map.
+    """
+    manifest = run.drive_manifest()
+    used = manifest.map_sha256 if isinstance(manifest, EstimateManifest) else None
+    if used is not None and used == truth.map_sha256:
+        raise UsageError(
+            f"{path}: its approaches are from the map that {run.path} used as a cue; use another "
+            "truth, or replay without road_map in the vehicle file"
+        )
 
 
 def read_run_tables(run: RunFolder) -> RunTables:

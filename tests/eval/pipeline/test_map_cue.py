@@ -12,6 +12,8 @@ import crosscue
 from crosscue.detectors.base import Frame, View
 from crosscue.detectors.box_detector import BoxDetector, ScoredBox
 from crosscue.eval import cli
+from crosscue.eval.fit.annotated_runs import read_annotated
+from crosscue.replay.errors import UsageError
 from support.kitti_drive import raw_drive
 from support.refusals import refusal
 from support.street_map import write_crossing, write_map
@@ -75,6 +77,8 @@ def test_a_run_that_used_a_map_is_not_scored_by_truth_from_it(tmp_path: Path) ->
 
     assert "its approaches are from the map that" in said
     assert not (tmp_path / "score").exists()
+    with pytest.raises(UsageError, match="its approaches are from the map that"):
+        read_annotated([run], [same], lambda *_: ())
     assert cli.run(["score", str(run), "--truth", str(another), "-q"]) in (0, 3)
 
 
