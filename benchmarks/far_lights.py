@@ -24,7 +24,6 @@ PLACED_SD_M: Final = 3.5
 BEARING_SD_PX: Final = 1.5
 # Mean residual of the bearings, above which the boxes are not those of one light.
 ONE_LIGHT_RAD: Final = 0.002
-FRAME_NS: Final = 1e8
 
 
 def placed(at_m: Floats, bearings: Floats, sd_rad: float) -> tuple[Floats, Floats, float]:
@@ -55,7 +54,8 @@ def main() -> None:
     forward = turned.apply([0.0, 0.0, 1.0])
     table: dict[str, Any] = pq.read_table(args.run / "ranged_objects.parquet").to_pydict()
     columns = {name: np.array(values) for name, values in table.items()}
-    frame = np.round(columns["t_ns"] / FRAME_NS).astype(int)
+    times = pq.read_table(args.run / "frames.parquet", columns=["t_ns"])["t_ns"].to_numpy()
+    frame = np.searchsorted(np.sort(times), columns["t_ns"])
     u, v = (0.5 * (columns[f"{axis}0"] + columns[f"{axis}1"]) for axis in "xy")
     rays = np.stack([(u - lens["cx"]) / lens["fx"], (v - lens["cy"]) / lens["fy"]], axis=1)
     rays = np.column_stack([rays, np.ones(len(rays))])

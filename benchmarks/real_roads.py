@@ -2,7 +2,8 @@
 
 Run it as ``python benchmarks/real_roads.py OUT [DRIVE ...]``; without names it replays every drive
 of ``$CROSSCUE_DATA`` (or ``../shared/data``), pictures alone unless the name says otherwise.
-Detections are cached in OUT. Drives marked ``*`` were used in development and prove nothing.
+Detections are cached in OUT. ``--fusion FILE`` adds the sections of ``crosscue fit temporal`` to
+each vehicle file. Drives marked ``*`` were used in development and prove nothing.
 
 ``real_roads.json`` has drives of public repositories that are not in ``$CROSSCUE_DATA``: put the
 file of ``source`` to ``sequences/`` + ``pictures`` there, or the drive is left out. Its annotations
@@ -20,6 +21,7 @@ those of the annotations; ranges are scored only where a track gives the true di
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -219,6 +221,7 @@ class Score:
     false_intersections: int = 0
     ranges: tuple[int, int] = (0, 0)
     minutes: float = 0.0
+    brier: list[float] = field(default_factory=list)
 
 
 def pictures_of(source: Path, pattern: str) -> Iterator[Path | NDArray[np.uint8]]:
@@ -253,12 +256,14 @@ def log_of(name: str, drive: Drive, out: Path) -> Path:
     return folder
 
 
-def replayed(name: str, drive: Drive, out: Path) -> Run:
+def replayed(name: str, drive: Drive, out: Path, fusion: str = "") -> Run:
     """Replay a drive; detections come from the cache in ``out`` where they are known."""
     vehicle = out / f"{name}.toml"
     camera = f"[camera]\n{drive.camera}" if drive.camera else ""
     topics = '[topics]\ncamera = "front_camera"\nodometry = "odometry"\n'
-    vehicle.write_text(f"version = 1\n{topics if drive.has_odometry else ''}{camera}{DETECTORS}")
+    vehicle.write_text(
+        f"version = 1\n{topics if drive.has_odometry else ''}{camera}{DETECTORS}{fusion}"
+    )
     return replay_drive(
         log_of(name, drive, out),
         out / "runs" / name,
@@ -322,6 +327,12 @@ def scored(run: Run, drive: Drive) -> Score:
             if (truth := approach.features.get(leg)) is not None:
                 is_shown = any(found.get((t_ns, f"road_{leg}")) for t_ns in within)
                 score.messages[prefix + leg] = truth, is_shown
+        believes = {frame_of[row["t_ns"]]: row for row in rows}
+        inside = range(approach.first, min(approach.last + 1, len(times)))
+        for feature, truth in approach.features.items():
+            if truth is not None and inside:
+                values = [believes.get(frame, {}).get(feature, 0.5) for frame in inside]
+                score.brier.append(float(np.mean((np.array(values) - truth) ** 2)))
         ours = {
             number
             for number, frames in believed.items()
@@ -446,7 +457,12 @@ _LEG_WORDS: Final = {
 
 def main(arguments: Sequence[str]) -> None:
     """Replay and score the named drives, or all."""
-    out = Path(arguments[0])
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("out", type=Path, metavar="OUT")
+    parser.add_argument("drives", nargs="*", metavar="DRIVE")
+    parser.add_argument("--fusion", type=Path, metavar="FILE", help="sections of [fusion]")
+    given = parser.parse_args(arguments)
+    out, fusion = given.out, given.fusion.read_text(encoding="utf-8") if given.fusion else ""
     out.mkdir(parents=True, exist_ok=True)
     for model, folder in MODELS.items():
         fetch_weights(model, DATA / "weights" / folder)
@@ -456,12 +472,12 @@ def main(arguments: Sequence[str]) -> None:
         f"{'first':>9} {'pieces':>6} {'false':>6} {'in 95 %':>8}"
     )
     scores = {}
-    for name in arguments[1:] or DRIVES:
+    for name in given.drives or DRIVES:
         drive = DRIVES[name]
         if not any((DATA / "sequences" / drive.folder).glob(drive.pictures)):
             print(f"{name:24} no {drive.folder}/{drive.pictures} in sequences")
             continue
-        score = scores[name] = scored(replayed(name, drive, out), drive)
+        score = scores[name] = scored(replayed(name, drive, out, fusion), drive)
         lights, stops = (
             "/".join(str(score.cues[cue][kind]) for kind in ("right", "missed", "false"))
             for cue in CUES
@@ -476,6 +492,8 @@ def main(arguments: Sequence[str]) -> None:
             flush=True,
         )
     print(*evidence(scores), sep="\n")
+    brier = [one for score in scores.values() for one in score.brier]
+    print(f"Brier score {np.mean(brier or [np.nan]):.3f} of {len(brier)} features of approaches")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from runpy import run_path
 from typing import Any, cast
 
 import pyarrow as pa
+import pytest
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "real_roads.py"
 
@@ -76,3 +77,18 @@ def test_a_message_in_any_annotated_frame_shows_its_leg() -> None:
 
     assert scored.messages == {"left": (True, True), "right": (False, False)}
     assert scored.legs == {"left": "not seen", "right": "not seen"}
+
+
+def test_belief_is_judged_in_each_annotated_frame_and_outside_approaches_by_its_prior() -> None:
+    names = run_path(str(BENCHMARK))
+    approach = names["Approach"](0, 1, {"intersection": True, "left": None})
+    row = {"t_ns": 20, "approach": 0, "intersection": 0.9, "left": 0.5}
+    run = {
+        "frames": pa.table({"t_ns": [10, 20, 30]}),
+        "cues": pa.table({"t_ns": [10], "cue": ["stop_sign"], "count": [0]}),
+        "belief": pa.Table.from_pylist([row]),
+    }
+
+    score = names["scored"](run, names["Drive"]("one", "*.jpg", 10.0, approaches=(approach,)))
+
+    assert score.brier == [pytest.approx((0.5**2 + 0.1**2) / 2.0)]
