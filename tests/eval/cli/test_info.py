@@ -3,10 +3,9 @@
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,27 +24,23 @@ from crosscue.results import plain
 from support.clock_streams import START_NS, Stream, table_of
 from support.data import shared
 from support.gap_drive import Clock, write_drive
+from support.memory_log import MemoryLog
 
 MS = 1_000_000
 HOSTILE = "/cam\x1b[31m\n\u202e\udcff\x00<b>"
 
 
-@dataclass(slots=True)
-class BlockLog:
-    """A log in memory of the given blocks and losses."""
+@dataclass(frozen=True, slots=True, eq=False)
+class LossyLog(MemoryLog):
+    """A log in memory with losses, which declares its rows."""
 
-    blocks: tuple[Block, ...]
-    topics: tuple[Topic, ...]
+    path: Path = Path("made.mcap")
     dropped: int = 0
     unknown: bool = False
-    path: Path = Path("made.mcap")
-    format: str = "made"
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """Yield the blocks and account for them."""
-        for block in self.blocks:
-            ledger.find(block.topic, len(block))
-            yield block
+        yield from MemoryLog.read(self, ledger, selection)
         if self.dropped:
             ledger.drop(self.topics[0].name, "chunk CRC", self.dropped, "at byte 7", START_NS)
         if self.unknown:
@@ -53,22 +48,6 @@ class BlockLog:
         for topic in self.topics:
             ledger.declare(topic.name, topic.declared)
             ledger.settle(topic.name)
-        ledger.integrity = "every chunk's CRC verified"
-
-    def close(self) -> None:
-        """Drop the blocks."""
-        self.blocks = ()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def column_topic(
@@ -90,7 +69,7 @@ def can_block(bus: str, ids: list[int], extended: list[bool]) -> Block:
     return Block(bus, START_NS + MS * np.arange(n, dtype=np.int64), frames)
 
 
-def example_log(**changes: Any) -> BlockLog:
+def example_log(**changes: Any) -> LossyLog:
     stream = Stream(300, 50 * MS, wait_ns=MS)
     blocks = (
         table_of("/imu", stream.log_ns(), stream.header_ns()),
@@ -100,7 +79,7 @@ def example_log(**changes: Any) -> BlockLog:
         column_topic("/imu", "sensor_msgs/msg/Imu", 300 + changes.get("dropped", 0)),
         column_topic("can0", "crosscue/CanFrames"),
     )
-    return replace(BlockLog(blocks, topics), **changes)
+    return LossyLog(topics, blocks, **changes)
 
 
 def test_losses_are_reported_by_topic_reason_and_place() -> None:
@@ -117,9 +96,9 @@ def test_losses_are_reported_by_topic_reason_and_place() -> None:
 
 def test_hostile_names_are_escaped_in_text_and_json() -> None:
     stream = Stream(40, 50 * MS)
-    log = BlockLog(
-        (table_of(HOSTILE, stream.log_ns() * 0),),
+    log = LossyLog(
         (Topic(HOSTILE, HOSTILE, "columns"),),
+        (table_of(HOSTILE, stream.log_ns() * 0),),
         dropped=1,
         path=Path(HOSTILE),
     )
