@@ -14,6 +14,7 @@ from crosscue.replay.files.made_of import made_of
 from crosscue.replay.files.tree_text import strict_json
 from support.coco import stop_signs
 from support.pictures import picture
+from support.refusals import refusal
 from support.scenes import shorten
 from support.trees import tree
 
@@ -80,17 +81,13 @@ def test_changed_settings_are_refused_and_files_are_unchanged(
     folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     argv = _prepare(name, folder, tmp_path / "out", monkeypatch)
     _, flag, other = COMMANDS[name]
     before = tree(tmp_path)
-    capsys.readouterr()
 
-    assert cli.run([*argv, flag, *other.split()]) == 2
+    message = refusal(2, *argv, "-q", flag, *other.split())
 
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
     assert "seed: 0 there, 3 here" in message
     assert f"{flag} would destroy it" in message
     assert tree(tmp_path) == before
@@ -102,18 +99,12 @@ def test_changed_pictures_are_refused_with_both_identities(
     folder: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     argv = _prepare(name, folder, tmp_path / "out", monkeypatch)
     (folder / "images" / "1.png").write_bytes(picture(7, width=128, height=80))
     before = tree(tmp_path)
-    capsys.readouterr()
 
-    assert cli.run([*argv, "--resume"]) == 2
-
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
-    assert message.count(" bytes)") == 2
+    assert refusal(2, *argv, "-q", "--resume").count(" bytes)") == 2
     assert tree(tmp_path) == before
 
 
@@ -127,24 +118,19 @@ def test_unchanged_inputs_are_accepted(
     assert cli.run([*argv, COMMANDS[name][1]]) == 0
 
 
-def test_resume_refuses_finished_training(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_resume_refuses_finished_training(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "net.safetensors"
     out.write_bytes(b"weights")
-    argv = ["train", "mask-rcnn", "--data", str(folder / "coco.json"), "--images"]
+    argv = ["train", "mask-rcnn", "--data", folder / "coco.json", "--images", folder / "images"]
 
-    assert cli.run([*argv, str(folder / "images"), "-o", str(out), "--resume"]) == 1
-    assert "--overwrite starts over" in capsys.readouterr().err
+    assert "--overwrite starts over" in refusal(1, *argv, "-o", out, "-q", "--resume")
     assert out.read_bytes() == b"weights"
 
 
-def test_drive_without_recorded_inputs_is_not_overwritten(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_drive_without_recorded_inputs_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "A-01").mkdir()
     (tmp_path / "A-01" / "drive.mcap").write_bytes(b"recorded")
 
-    assert cli.run(["simulate", "A", "-o", str(tmp_path), "--width", "64", "--overwrite"]) == 2
-    assert "its inputs are not recorded" in capsys.readouterr().err
+    argv = ["simulate", "A", "-o", tmp_path, "--width", "64", "--overwrite"]
+    assert "its inputs are not recorded" in refusal(2, *argv)
     assert (tmp_path / "A-01" / "drive.mcap").read_bytes() == b"recorded"

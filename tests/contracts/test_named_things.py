@@ -19,6 +19,7 @@ from support.landmark_files import database_of
 from support.mcap_files import McapFile
 from support.onnx_models import bright_box_model
 from support.opened_files import opened_files
+from support.refusals import refusal
 
 # A command line of each command with such options, without the option to be tested.
 BASE: Final[dict[str, str]] = {
@@ -167,7 +168,6 @@ def test_option_that_names_nonexistent_thing_is_refused_before_log_is_read(
     log: str,
     names: dict[str, Path],
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -176,14 +176,9 @@ def test_option_that_names_nonexistent_thing_is_refused_before_log_is_read(
     argv = [*name.split(), *_base(name, option).format(**known).split(), option, word]
 
     with opened_files() as opened:
-        status = cli.run(argv)
+        error = refusal((2, 4), *argv)
 
-    captured = capsys.readouterr()
-    assert status in (2, 4), captured
-    assert captured.out == ""
-    assert captured.err.startswith("crosscue: ")
-    assert captured.err.count("\n") == 1
-    assert Path(word.partition("=")[0]).name in captured.err
+    assert Path(word.partition("=")[0]).name in error
     assert not list(tmp_path.iterdir())
     if option not in NEEDS_LOG:
         assert str(known["log"]) not in opened

@@ -19,6 +19,7 @@ from crosscue.eval.runs.folder import RunFolder, own_files
 from crosscue.eval.runs.owned import files_in
 from support.empty_inputs import empty_inputs
 from support.failures import table_of_failures
+from support.refusals import refusal
 
 REPLAY: Final = "replay {log} -o {out} --vehicle {car} --no-cache"
 DETECT: Final = "detect {log} -o {out} --vehicle {car} --detectors grey --no-cache --draw 3"
@@ -101,11 +102,7 @@ FOREIGN: Final[dict[str, dict[str, str]]] = {
 @pytest.mark.parametrize("command", WRITING)
 @pytest.mark.parametrize("case", FOREIGN)
 def test_folder_of_user_is_refused_with_list_of_its_files(
-    case: str,
-    command: str,
-    names: dict[str, Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    case: str, command: str, names: dict[str, Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     for name, text in FOREIGN[case].items():
@@ -113,12 +110,10 @@ def test_folder_of_user_is_refused_with_list_of_its_files(
         (out / name).write_text(text)
     before = _content(out)
 
-    assert _run(WRITING[command], names, out, "--overwrite") == 2
+    error = refusal(2, *shlex.split(WRITING[command].format(**names, out=out)), "--overwrite")
 
     assert _content(out) == before
-    error = capsys.readouterr().err
     assert all(name in error for name in before)
-    assert error.count("\n") == 1
 
 
 HAND_MADE: Final[dict[str, Callable[[Path], object]]] = {
@@ -150,7 +145,6 @@ def test_result_with_one_file_of_user_keeps_everything(
     names: dict[str, Path],
     made: dict[str, Path],
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "out"
     shutil.copytree(made[command], out)
@@ -158,10 +152,10 @@ def test_result_with_one_file_of_user_keeps_everything(
     HAND_MADE[foreign](out / foreign)
     before = _content(out)
 
-    assert _run(WRITING[command], names, out, "--overwrite") == 2
+    error = refusal(2, *shlex.split(WRITING[command].format(**names, out=out)), "--overwrite")
 
     assert _content(out) == before
-    assert foreign in capsys.readouterr().err
+    assert foreign in error
 
 
 @pytest.mark.parametrize("command", WRITING)

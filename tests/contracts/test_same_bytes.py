@@ -17,6 +17,7 @@ import pytest
 from crosscue.eval.batch.journal import JOURNAL
 from crosscue.eval.runs.folder import LOCK, MANIFEST, TIMINGS, RunFolder
 from support.gap_drive import Clock, write_drive
+from support.trees import contents
 
 pytestmark = pytest.mark.slow
 NOT_COMPARED: Final[Mapping[str, str]] = {
@@ -74,19 +75,13 @@ def _run(folder: Path, lines: Sequence[Sequence[str]], environment: Mapping[str,
     )
 
 
-def _files(folder: Path) -> dict[str, bytes]:
-    """Return the content of each file below a folder by its name."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and not NOT_COMPARED.keys() & {*path.relative_to(folder).parts}
-    }
-
-
 def _different(there: Path, here: Path) -> list[str]:
     """Return the names of files that are missing or different."""
-    a, b = _files(there), _files(here)
-    return sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name))
+    a, b = contents(there), contents(here)
+    compared = {
+        name for name in a.keys() | b.keys() if not NOT_COMPARED.keys() & {*Path(name).parts}
+    }
+    return sorted(name for name in compared if a.get(name) != b.get(name))
 
 
 @pytest.fixture(scope="module")

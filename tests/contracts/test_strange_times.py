@@ -6,6 +6,7 @@ import pytest
 
 from crosscue.eval import cli
 from support.mcap_files import ChunkOf, McapFile, channel, message, schema
+from support.refusals import refusal
 
 AFTER_2262_NS = (1 << 63) + 10**9
 CANDUMP = "".join(f"({9_300_000_000 + k}.000000) can0 064#0011\n" for k in range(30))
@@ -23,14 +24,10 @@ def _mcap(path: Path, start_ns: int, step_ns: int) -> Path:
 
 
 @pytest.mark.parametrize("command", ["decode", "replay"])
-def test_log_after_2262_names_its_times_as_reason(
-    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_log_after_2262_names_its_times_as_reason(command: str, tmp_path: Path) -> None:
     log = _mcap(tmp_path / "late.mcap", AFTER_2262_NS, 10**8)
 
-    assert cli.run([command, str(log), "-o", str(tmp_path / "out")]) == 1
-
-    error = capsys.readouterr().err
+    error = refusal(1, command, log, "-o", tmp_path / "out")
     assert "holds 30 rows, none usable (30 of them: log time after the year 2262" in error
 
 
@@ -40,8 +37,8 @@ def test_text_log_after_2115_names_its_times_as_reason(
     (tmp_path / "can.log").write_text(CANDUMP)
     (tmp_path / "can.asc").write_text(ASC)
 
-    assert cli.run(["info", str(tmp_path / "can.log")]) == 4
-    assert "time of the year 2116 or later, which is out of range" in capsys.readouterr().err
+    error = refusal(4, "info", tmp_path / "can.log")
+    assert "time of the year 2116 or later, which is out of range" in error
     assert cli.run(["info", str(tmp_path / "can.asc")]) == 0
     assert "no readable start date before 2116" in capsys.readouterr().out
 

@@ -78,7 +78,7 @@ def test_damaged_json_file_is_reported_as_loss(tmp_path: Path, name: str, text: 
     assert found["gnss"] == COUNT
 
 
-def test_real_sequence_is_read_with_known_speed_and_distance(tmp_path: Path) -> None:
+def test_real_sequence_is_read_with_known_speed_and_distance() -> None:
     """The sequence has 80 pictures in 8 s; the car starts at rest and travels 21.5 m."""
     path = shared("sequences", "pandaset_002")
 

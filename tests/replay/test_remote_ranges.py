@@ -101,7 +101,7 @@ def test_window_of_remote_bag_transfers_only_its_chunks(tmp_path: Path, web: Ser
     assert opened < 0.1 * path.stat().st_size
 
 
-def test_format_without_range_reads_is_downloaded_completely(tmp_path: Path, web: Served) -> None:
+def test_format_without_range_reads_is_downloaded_completely(web: Served) -> None:
     web.files["can.log"] = b"(1.000000) can0 123#00\n(2.000000) can0 123#01\n"
     ledger = Ledger("there")
 

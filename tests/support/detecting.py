@@ -24,11 +24,7 @@ class BrightBlob:
     """A detector that returns one box around all bright pixels."""
 
     settings: BrightSettings
-
-    @property
-    def view(self) -> View:
-        """Full size, grey."""
-        return View(is_grey=True)
+    view = View(is_grey=True)
 
     @property
     def identity(self) -> str:

@@ -203,15 +203,8 @@ def _write_truth(folder: Path, true_ns: Int64s) -> None:
 class GreyNumber:
     """A detector that reads the frame's number and returns the sign visible at that position."""
 
-    @property
-    def view(self) -> View:
-        """Grey."""
-        return View(is_grey=True)
-
-    @property
-    def identity(self) -> str:
-        """The same for all, because it has no settings."""
-        return "grey number"
+    view = View(is_grey=True)
+    identity = "grey number"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         """Detect."""

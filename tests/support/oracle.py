@@ -23,17 +23,9 @@ class Oracle:
         self._found: dict[int, list[dict[str, Any]]] = {t: [] for t in times.values()}
         for one in tree["annotations"]:
             self._found[times[one["image_id"]]].append({**one, "label": names[one["category_id"]]})
-        self._text = objects
-
-    @property
-    def view(self) -> View:
-        """Small pictures, because it does not use them."""
-        return View(min_width_px=64)
-
-    @property
-    def identity(self) -> str:
-        """Identity by the text of the setting."""
-        return f"oracle {self._text}"
+        # Small pictures, because it does not use them.
+        self.view = View(min_width_px=64)
+        self.identity = f"oracle {objects}"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         """Return the labelled objects at the time of each frame."""

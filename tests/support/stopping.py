@@ -12,11 +12,7 @@ class Stopping:
     """A detector that sends a signal to its process at the first frame."""
 
     number: signal.Signals
-
-    @property
-    def view(self) -> View:
-        """Grey."""
-        return View(is_grey=True)
+    view = View(is_grey=True)
 
     @property
     def identity(self) -> str:

@@ -10,6 +10,15 @@ from crosscue.eval.runs.folder import TIMINGS
 NO_RESULTS = {".drives", "failure.log", TIMINGS}
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return the content of each file below a folder by its relative name."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
 def tree(folder: Path) -> dict[str, str]:
     """Map relative names to hashes, without the paths of logs, which depend on the run's place."""
     return {

@@ -120,7 +120,7 @@ def test_list_file_names_drives_line_by_line(tmp_path: Path) -> None:
     assert found.drives[4].logs == ("memory://bucket/x.mcap",)
 
 
-def test_remote_patterns_are_expanded(tmp_path: Path) -> None:
+def test_remote_patterns_are_expanded() -> None:
     bucket = f"bucket-{uuid.uuid4().hex}"
     system = import_module("fsspec").filesystem("memory")
     for name in ("a/drive.mcap", "b/drive.mcap"):

@@ -28,6 +28,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from support.data import shared
 from support.landmark_files import database_of, encoded, seen_from, wall
 from support.manifests import estimate_manifest
+from support.refusals import refusal
 
 pytestmark = pytest.mark.slow
 
@@ -134,16 +135,8 @@ def test_landmarks_correct_a_drifting_pose(
     assert axis[-1] < 0.7 * without.table("pose")["major_axis_m"].to_numpy()[-1]
 
 
-def _refusal(capsys: pytest.CaptureFixture[str], *command: str) -> tuple[int, str]:
-    status = cli.run(list(command))
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
-    return status, captured.err
-
-
 def test_landmarks_list_and_match_report_stored_landmarks(
-    town: Town, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    town: Town, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()
     assert cli.run(["landmarks", "list", str(town.database), "--json"]) == 0
@@ -192,14 +185,11 @@ def photos(folder: Path, table: str) -> tuple[Path, Path]:
     ],
 )
 def test_bad_coordinates_are_refused_and_nothing_is_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], table: str, status: int, why: str
+    tmp_path: Path, table: str, status: int, why: str
 ) -> None:
     folder, csv = photos(tmp_path / "photos", table)
     add = ["landmarks", "add", str(tmp_path / "lm.sqlite"), "--images", str(folder)]
-    got, text = _refusal(capsys, *add, "--coordinates", str(csv))
-
-    assert got == status
-    assert why in text
+    assert why in refusal(status, *add, "--coordinates", csv)
     assert not (tmp_path / "lm.sqlite").exists()
 
 

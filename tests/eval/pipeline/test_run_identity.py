@@ -15,7 +15,7 @@ from crosscue.eval.pipeline.detecting import Detecting
 from crosscue.eval.runs.manifest import FORMAT_VERSION
 from crosscue.replay.files.log_identity import of_row
 from support.refusals import refusal
-from support.trees import tree
+from support.trees import contents, tree
 
 pytestmark = pytest.mark.slow
 
@@ -33,14 +33,6 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _bytes(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
 def _replay(place: Path | str, out: Path, *more: str) -> int:
     return run(["replay", str(place), "-o", str(out), "-q", *more])
 
@@ -50,19 +42,17 @@ def test_resume_with_another_log_or_setting_is_refused_and_changes_nothing(
 ) -> None:
     keep = tmp_path / "keep"
     assert _replay(drives / "D-0", keep) == 0
-    before, replayed = _bytes(keep), tree(keep)
+    before, replayed = contents(keep), tree(keep)
     theirs = of_row(json.loads((keep / "input.json").read_text())["identity"])
 
-    assert _replay(drives / "D-1", keep, "--resume") == 2
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
+    message = refusal(2, "replay", drives / "D-1", "-o", keep, "-q", "--resume")
     assert theirs.short in message
     assert "drive.mcap" in message
-    assert _bytes(keep) == before
+    assert contents(keep) == before
 
     assert _replay(drives / "D-0", keep, "--resume", "--to", "2") == 2
     assert "selection.end_ns: null there, " in capsys.readouterr().err
-    assert _bytes(keep) == before
+    assert contents(keep) == before
 
     assert _replay(drives / "D-0", keep, "--resume") == 0
     assert tree(keep) == replayed

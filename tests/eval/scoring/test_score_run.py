@@ -51,12 +51,6 @@ def _one(tmp_path: Path, name: str = "one") -> Path:
     return tmp_path / name / "run"
 
 
-def _fails(capsys: pytest.CaptureFixture[str], status: int, *argv: object) -> str:
-    """Return the one line that a command prints when it fails with an exit status."""
-    capsys.readouterr()
-    return refusal(status, *argv)
-
-
 def test_score_finds_truth_next_to_log_and_writes_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -113,10 +107,8 @@ def test_gates_set_exit_status_and_write_junit_file(tmp_path: Path) -> None:
         ("metric = [", "not TOML"),
     ],
 )
-def test_invalid_gate_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], gate: str, message: str
-) -> None:
-    line = _fails(capsys, 2, "score", _one(tmp_path), "--gate", _gates(tmp_path, gate))
+def test_invalid_gate_is_refused(tmp_path: Path, gate: str, message: str) -> None:
+    line = refusal(2, "score", _one(tmp_path), "--gate", _gates(tmp_path, gate))
 
     assert message in line
 
@@ -168,9 +160,7 @@ def test_metric_values_use_wider_interval() -> None:
     assert list(metric_values(tree, parts=False)) == ["precision"]
 
 
-def test_truth_of_another_log_is_refused_by_time_or_hash(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_truth_of_another_log_is_refused_by_time_or_hash(tmp_path: Path) -> None:
     run = _one(tmp_path)
     late = approach(start_ns=at(1000), enter_ns=at(1040))
     other = truth_folder(tmp_path / "other", truth([], [late], end=2000))
@@ -179,10 +169,8 @@ def test_truth_of_another_log_is_refused_by_time_or_hash(
     tree = json.loads(hashed.read_text())
     hashed.write_text(json.dumps(tree | {"log": "b.mcap", "log_sha256": {"b.mcap": "11"}}))
 
-    assert "another log or clock" in _fails(capsys, 1, "score", run, "--truth", other)
-    assert "belongs to another b.mcap by its hash" in _fails(
-        capsys, 1, "score", run, "--truth", hashed
-    )
+    assert "another log or clock" in refusal(1, "score", run, "--truth", other)
+    assert "belongs to another b.mcap by its hash" in refusal(1, "score", run, "--truth", hashed)
     assert cli.run(["score", str(run), "--truth", str(hashed), "-q", "--any-log"]) == 0
     hashed.write_text(json.dumps(tree | {"log_sha256": {"drive.mcap": "00"}}))
     assert cli.run(["score", str(run), "--truth", str(hashed), "-q"]) == 0
@@ -204,9 +192,7 @@ def test_truth_of_another_log_is_refused_by_time_or_hash(
         ({"ranges": "../run/manifest.json"}, "manifest.json"),
     ],
 )
-def test_invalid_truth_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict[str, Any], message: str
-) -> None:
+def test_invalid_truth_is_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     run = _one(tmp_path)
     path = tmp_path / "one" / "truth.json"
     tree = json.loads(path.read_text())
@@ -214,24 +200,20 @@ def test_invalid_truth_is_refused(
         change = {"approaches": [*tree["approaches"], tree["approaches"][0] | {"id": 1}]}
     path.write_text(json.dumps(tree | change))
 
-    assert message in _fails(capsys, 4, "score", run)
+    assert message in refusal(4, "score", run)
 
 
 @pytest.mark.parametrize(
     "line", ["x,0,1,2", "5,9,1,2", "5,0,nan,2", "5,0,inf,2", "99999999999999999999,0,1,2", "5"]
 )
-def test_invalid_range_row_is_refused_with_line_number(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str
-) -> None:
+def test_invalid_range_row_is_refused_with_line_number(tmp_path: Path, line: str) -> None:
     run = _one(tmp_path)
     (tmp_path / "one" / "ranges.csv").write_text(f"t_ns,approach,start_m,end_m\n{line}\n")
 
-    assert "ranges.csv:2" in _fails(capsys, 4, "score", run)
+    assert "ranges.csv:2" in refusal(4, "score", run)
 
 
-def test_invalid_tables_are_refused_with_reason(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_tables_are_refused_with_reason(tmp_path: Path) -> None:
     truth_folder(tmp_path)
     belief = belief_table(BELIEF)
     broken = {
@@ -243,7 +225,7 @@ def test_invalid_tables_are_refused_with_reason(
     }
     for i, (message, tables) in enumerate(broken.items()):
         run = run_folder(tmp_path / f"run{i}", tables)
-        assert message in _fails(capsys, 4, "score", run.path)
+        assert message in refusal(4, "score", run.path)
 
 
 def test_run_with_nothing_to_score_reports_reasons(
@@ -253,7 +235,7 @@ def test_run_with_nothing_to_score_reports_reasons(
     bare = run_folder(tmp_path / "bare", {"frames": frame_table(5)})
     only_cues = run_folder(tmp_path / "cues", {"cues": cue_table(CUES)})
 
-    line = _fails(capsys, 1, "score", bare.path)
+    line = refusal(1, "score", bare.path)
     assert "the run has no cues; the run has no belief; the run has no range" in line
     assert cli.run(["score", str(only_cues.path)]) == 0
     assert "not scored belief: the run has no belief" in capsys.readouterr().out
