@@ -296,7 +296,11 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def truth_schema() -> dict[str, Any]:
-    """Return the JSON Schema of the file, for other tools."""
+    """Print the JSON Schema of truth.json, for editors and other tools.
+
+    Examples:
+        crosscue truth schema > truth.schema.json
+    """
     from crosscue.replay.meanings import SchemaWithMeanings
 
     return Truth.model_json_schema(schema_generator=SchemaWithMeanings)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.folder import open_run as open_folder
-from crosscue.eval.runs.manifest import Manifest, manifest_json_schema
+from crosscue.eval.runs.manifest import Manifest
 from crosscue.replay.errors import LogError, RunError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.safe_text import visible
@@ -175,11 +175,6 @@ def open_run_of_logs(
 RunGiven: TypeAlias = Annotated[Run | Path | str, Option(made_by=open_run_of_logs)]
 # A run of a verb that shows its pictures, unless ``--without-images`` is set.
 PicturedRun: TypeAlias = Annotated[Run | Path | str, Option(made_by=open_run)]
-
-
-def run_schema() -> dict[str, Any]:
-    """Return the JSON Schema of a run's ``manifest.json``, for editors and other tools."""
-    return manifest_json_schema()
 
 
 def run_given(run: Run | Path | str) -> Run:

@@ -1,7 +1,7 @@
 """The manifest of a run: its inputs, settings, results, and the account of every row.
 
 Each stage that can finish a run folder has a record. ``RunFolder.manifest`` reads a manifest,
-``write_manifest`` writes it, and ``crosscue run schema`` prints the JSON Schema.
+``write_manifest`` writes it.
 """
 
 from __future__ import annotations
@@ -393,10 +393,3 @@ def parse_manifest(content: bytes) -> Manifest:
     except ValidationError as error:
         place, why = _first_of(error, skip=1)
         raise ValueError(f"{place or 'stage'}: {why}") from None
-
-
-def manifest_json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of ``manifest.json``."""
-    from crosscue.replay.meanings import SchemaWithMeanings
-
-    return _ANY.json_schema(mode="serialization", schema_generator=SchemaWithMeanings)

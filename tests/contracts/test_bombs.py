@@ -68,7 +68,6 @@ OPENS_NO_LOG: dict[str, str] = {
     "landmarks list": "a database", "landmarks match": "a picture", "train road": "pictures",
     "fit landmarks": "pictures",
     "train mask-rcnn": "pictures", "train frames": "nothing", "truth schema": "nothing",
-    "run schema": "nothing",
     "fetch": "nothing",
     "demo": "what it made", "simulate": "nothing", "study range": "what it made",
     "study landmarks": "what it made", "study field": "what it made",

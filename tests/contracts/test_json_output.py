@@ -46,13 +46,12 @@ LINES: Final[dict[str, tuple[str, int]]] = {
     "status": ("runs", 0),
     "history": ("runs --by version", 0),
     "truth schema": ("", 0),
-    "run schema": ("", 0),
     "landmarks list": ("marks.sqlite", 0),
     "model list": ("", 0),
     "model show": ("yolox-nano", 0),
     "plugins": ("", 0),
 }
-ALWAYS_JSON: Final = frozenset({"truth schema", "run schema"})
+ALWAYS_JSON: Final = frozenset({"truth schema"})
 NO_JSON: Final = frozenset({"view", "completion"})
 # The same for commands that create or fit something.
 MADE: Final[dict[str, tuple[str, int]]] = {
