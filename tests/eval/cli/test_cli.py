@@ -131,7 +131,7 @@ def test_help_lists_eight_commands_and_help_all_the_rest(
     assert max(map(len, whole.splitlines())) <= 100
 
 
-@pytest.mark.parametrize("group", ["fit", "landmarks", "model", "run", "study", "train", "vehicle"])
+@pytest.mark.parametrize("group", ["fit", "landmarks", "model", "study", "train", "vehicle"])
 def test_help_of_a_group_has_an_example_of_each_command(
     group: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
