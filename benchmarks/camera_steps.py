@@ -99,10 +99,10 @@ def watched(
         follower = follower or Follower(drive.camera, size_px, small)
         follower.follow(t_ns, small)
     assert follower is not None
-    t_ns = np.array(follower.travel_ns, np.int64)
+    travel_ns = np.array(follower.travel_ns, np.int64)
     pitch = np.array([one.below_rad for one in follower.travel])
     yaw = np.array([one.left_rad for one in follower.travel])
-    steps = [*steps_of("pitch", t_ns, pitch), *steps_of("yaw", t_ns, yaw)]
+    steps = [*steps_of("pitch", travel_ns, pitch), *steps_of("yaw", travel_ns, yaw)]
     return steps, follower.travel_ns
 
 

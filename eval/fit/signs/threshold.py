@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, ClassVar, Final
 
 import numpy as np
 
@@ -41,6 +41,19 @@ class SignRates:
     precision: Proportion
     recall: Proportion
 
+    def as_json(self) -> dict[str, object]:
+        """Return counts, rates and intervals."""
+        found: dict[str, object] = {
+            "found": self.precision.of,
+            "right": self.recall.right,
+            "signs": self.recall.of,
+        }
+        for name, part in (("precision", self.precision), ("recall", self.recall)):
+            found[name] = part.value
+            found[f"{name}_interval"] = (part.low, part.high)
+            found[f"{name}_interval_by_drive"] = (part.clusters_low, part.clusters_high)
+        return found
+
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class SignFit(Fitted):
@@ -64,19 +77,14 @@ class SignFit(Fitted):
         return 1 if self.threshold is None else 0
 
     @property
-    def chosen_rates(self) -> dict[str, Any] | None:
-        """Rates on the pictures of the choice, as in JSON."""
-        return self._rates(on_others=False)
+    def chosen_rates(self) -> SignRates | None:
+        """Rates on the pictures of the choice."""
+        return None if self.threshold is None else self.rates(self.threshold, on_others=False)
 
     @property
-    def other_rates(self) -> dict[str, Any] | None:
-        """Rates on the held-out pictures, as in JSON."""
-        return self._rates(on_others=True)
-
-    def _rates(self, *, on_others: bool) -> dict[str, Any] | None:
-        if self.threshold is None:
-            return None
-        return _tree(self.rates(self.threshold, on_others=on_others))
+    def other_rates(self) -> SignRates | None:
+        """Rates on the held-out pictures."""
+        return None if self.threshold is None else self.rates(self.threshold)
 
     def rates(self, threshold: float, *, on_others: bool = True) -> SignRates:
         """Return precision and recall at any threshold, by default on the held-out pictures."""
@@ -231,16 +239,3 @@ def _proportion_text(name: str, part: Proportion) -> str:
     interval = f"95 % interval {between(part.low, part.high)}"
     interval += f", by drive {between(part.clusters_low, part.clusters_high)}"
     return f"{name:9} {part.value:.2f} ({part.right} of {part.of}; {interval})"
-
-
-def _tree(rates: SignRates) -> dict[str, object]:
-    found: dict[str, object] = {
-        "found": rates.precision.of,
-        "right": rates.recall.right,
-        "signs": rates.recall.of,
-    }
-    for name, part in (("precision", rates.precision), ("recall", rates.recall)):
-        found[name] = part.value
-        found[f"{name}_interval"] = (part.low, part.high)
-        found[f"{name}_interval_by_drive"] = (part.clusters_low, part.clusters_high)
-    return found
