@@ -25,10 +25,8 @@ CUED = ("cues", "range", "belief", "ranged_objects")
 class Second(GreyNumber):
     """Finds the same signs a second time under another name, with a lower score, and two more."""
 
-    @property
-    def identity(self) -> str:
-        """Another than that of the first, for the cache."""
-        return "second"
+    # Another than that of the first, for the cache.
+    identity = "second"
 
     def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
         """Detect."""
