@@ -542,6 +542,8 @@ def _narrowed(part: Selection, wanted: Selection) -> Selection:
 
 
 def _batches_of(log: OneLog, wanted: Selection) -> Iterator[tuple[str, pa.RecordBatch]]:
+    import pyarrow as pa
+
     decoders: dict[str, Decoder] = {}
     for topic in log.topics:
         if wanted.wants(topic.name):
@@ -554,8 +556,8 @@ def _batches_of(log: OneLog, wanted: Selection) -> Iterator[tuple[str, pa.Record
     for block in ledger.handing_on(log.read(ledger, part)):
         decoded = decoders[block.topic](block, ledger)
         if len(decoded):
-            for batch in _table_of([decoded], {}).to_batches():
-                yield block.topic, batch
+            arrays, schema = _columns_of([decoded])
+            yield block.topic, pa.RecordBatch.from_arrays(arrays, schema=schema)
     ledger.check()
     for name in ("", *decoders):
         _warn(ledger, name)
@@ -575,6 +577,14 @@ def _table_of(blocks: Sequence[Block], reported: Mapping[str, object]) -> pa.Tab
     if not blocks:
         empty = pa.array([], pa.int64())
         return pa.table([empty], names=["log_t_ns"], metadata=_metadata(reported))
+    arrays, schema = _columns_of(blocks)
+    return pa.table(arrays, schema.with_metadata(_metadata(reported)))
+
+
+def _columns_of(blocks: Sequence[Block]) -> tuple[list[pa.Array | pa.ChunkedArray], pa.Schema]:
+    """Return the rows of one topic as columns of Arrow, with their schema."""
+    import pyarrow as pa
+
     units = blocks[0].rows.units if isinstance(blocks[0].rows, Table) else {}
     arrays = {name: numpy_column(values) for name, values in topic_columns(blocks).items()}
     pictures = [block.rows for block in blocks if isinstance(block.rows, Images)]
@@ -589,7 +599,7 @@ def _table_of(blocks: Sequence[Block], reported: Mapping[str, object]) -> pa.Tab
         pa.field(name, array.type, metadata={"unit": units[name]} if units.get(name) else None)
         for name, array in arrays.items()
     ]
-    return pa.table(list(arrays.values()), pa.schema(fields, metadata=_metadata(reported)))
+    return list(arrays.values()), pa.schema(fields)
 
 
 def _views(messages: Messages) -> pa.Array:
@@ -599,14 +609,14 @@ def _views(messages: Messages) -> pa.Array:
     """
     import pyarrow as pa
 
+    length = messages.stop - messages.start
     views = np.zeros((len(messages), 4), np.int32)
-    views[:, 0] = messages.stop - messages.start
-    is_long = views[:, 0] > 12
-    views[is_long, 3] = messages.start[is_long]
-    inline = views.view(np.uint8)
-    for row, is_viewed in enumerate(is_long.tolist()):
-        content = messages.payload(row)[: 4 if is_viewed else 12]
-        inline[row, 4 : 4 + len(content)] = content
+    views[:, 0] = length
+    views[:, 3] = np.where(length > 12, messages.start, 0)
+    inline = views.view(np.uint8)[:, 4:]
+    for k in range(12):
+        has = np.flatnonzero((length > k) & ((length <= 12) | (k < 4)))
+        inline[has, k] = messages.buffer[messages.start[has] + k]
     buffers = [None, pa.py_buffer(views), pa.py_buffer(messages.buffer)]
     return pa.Array.from_buffers(pa.binary_view(), len(messages), buffers)
 

@@ -46,7 +46,8 @@ def arrow_column(values: Any, kind: pa.DataType) -> pa.Array:
         texts = arrow_column([*names], kind.value_type)
         return pa.DictionaryArray.from_buffers(kind, size, [present, pa.py_buffer(codes)], texts)
     if is_text:
-        parts = [str(one).encode() for one in values]
+        coded = {one: str(one).encode() for one in {*values}}
+        parts = [coded[one] for one in values]
         ends = np.cumsum([0, *map(len, parts)]).astype(np.int32)
         buffers = [present, pa.py_buffer(ends), pa.py_buffer(b"".join(parts))]
         return pa.Array.from_buffers(kind, size, buffers)

@@ -12,6 +12,7 @@ from crosscue.replay.base import EVERYTHING, Selection
 from crosscue.replay.columns import Block, Bytes
 from crosscue.replay.ledger import DAMAGED_RECORD, Ledger
 from crosscue.replay.limits import Limits
+from crosscue.replay.readers.can_rows import keep_memory
 from crosscue.replay.readers.mcap.chunks.blocks import BlockBuilder
 from crosscue.replay.readers.mcap.chunks.load import ChunkRecords, Load, Loader
 from crosscue.replay.readers.mcap.chunks.rows import (
@@ -79,6 +80,7 @@ def read_segments(
     selection: Selection,
 ) -> Iterator[Block]:
     """Yield all blocks of a file, then settle the ledger."""
+    keep_memory()
     checks = Checks()
     if len(segments) > 1:
         ledger.notice(f"the file contains {len(segments)} consecutive recordings; all are read")

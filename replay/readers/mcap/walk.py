@@ -316,9 +316,12 @@ class Walk:
             return False
         return self._before is None or self._resync.continues(at + PREFIX.size + length, 1)
 
-    def _whole(self, length: int) -> memoryview:
+    def _whole(self, length: int, near: memoryview | None = None) -> memoryview:
+        """Return the content of the record here, of which ``near`` may have been read."""
         if length > self._limits.records_per_chunk * INDEX_ENTRY.itemsize:
             raise BrokenRecordError(f"a record of {length} bytes is over the limit")
+        if near is not None and len(near) >= PREFIX.size + length:
+            return near[PREFIX.size : PREFIX.size + length]
         content = self._file.peek(self._at + PREFIX.size, length)
         if len(content) < length:
             raise BrokenRecordError("the file became shorter while being read")
@@ -468,16 +471,16 @@ class Walk:
         found: list[MessageIndex] = []
         fault = ""
         while at + PREFIX.size <= bound:
-            head = self._file.peek(at, PREFIX.size)
-            if len(head) < PREFIX.size:
+            near = self._file.window(at, PREFIX.size)
+            if len(near) < PREFIX.size:
                 break
-            opcode, length = PREFIX.unpack(head)
+            opcode, length = PREFIX.unpack_from(near)
             after = at + PREFIX.size + length
             if opcode != Op.MESSAGE_INDEX or after > bound:
                 break
             self._at = at
             try:
-                found.append(read_message_index(bytes(self._whole(length))))
+                found.append(read_message_index(bytes(self._whole(length, near))))
             except BrokenRecordError as error:
                 fault = str(error)
             at = after

@@ -336,9 +336,14 @@ class _Pages:
             pages = lot.reshape(count, self._size)
             after = pages[:, :4].copy().view(">u4")[:, 0]
             good = min(count, _first(after != np.arange(page + 1, page + count + 1)) + 1)
-            part = pages[:good, 4 : self._usable].reshape(-1)[: len(target) - done]
-            target[done : done + len(part)] = part
-            done, page = done + len(part), int(after[good - 1])
+            # Row by row into the target: one copy of each payload.
+            whole = min(good, (len(target) - done) // room)
+            begin, done = done, done + whole * room
+            target[begin:done].reshape(whole, room)[:] = pages[:whole, 4 : self._usable]
+            if whole < good:
+                begin, done = done, len(target)
+                target[begin:] = pages[whole, 4 : 4 + done - begin]
+            page = int(after[good - 1])
             longest = len(self._scratch) // self._size
             self._run = min(longest, 2 * self._run) if good == count else good
         if page:

@@ -35,7 +35,7 @@ _SETTINGS: Final = (
     "writable_schema=ON",
     "trusted_schema=OFF",
     "cell_size_check=ON",
-    "cache_size=-2000",
+    "cache_size=-200",
 )
 
 

@@ -82,7 +82,7 @@ class BlockBuilder:
         """Return whether any of these messages is selected."""
         if not self._selection.wants(self.declarations.topic(index.channel_id)):
             return False
-        return bool(self._in_time(index.entries["log"]).any())
+        return self._is_timeless or bool(self._in_time(index.entries["log"]).any())
 
     def skip_unread(self, index: MessageIndex) -> None:
         """Account for unselected messages without reading them."""

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 UNKNOWN_SIZES: Final = (-1, 0)
 # Small steps keep what precedes damage. The lz4 library also allocates memory for each.
 STEP: Final = 256 << 10
+# The zstd library copies what it decompresses once more, unless a frame's room is passed at once.
+AT_ONCE: Final = 1 << 62
 
 
 def inflate_chunk(body: Bytes, head: ChunkHead, room: Bytes) -> Bytes:
@@ -40,7 +42,7 @@ def inflate_chunk(body: Bytes, head: ChunkHead, room: Bytes) -> Bytes:
         raise BrokenRecordError(f"holds {len(body)} of {head.body_size} bytes")
     records = body
     if head.compression and len(body):
-        done, fault = _FILL[head.compression](body, head.size, room)
+        done, fault = _FILL[head.compression](body, head.size, room, AT_ONCE)
         if done > head.size:
             fault = f"decompresses to more than the {head.size} bytes it declares"
         if fault:
@@ -56,7 +58,7 @@ def inflate_prefix(body: Bytes, head: ChunkHead) -> Bytes:
     if not head.compression or not len(body):
         return body[: head.size]
     room = np.empty(head.size + 1, dtype=np.uint8)
-    done, _ = _FILL[head.compression](body, head.size, room)
+    done, _ = _FILL[head.compression](body, head.size, room, STEP)
     records = room[: min(done, head.size)]
     return _verified(records, head) if len(records) == head.size else records
 
@@ -67,7 +69,7 @@ def _verified(records: Bytes, head: ChunkHead) -> Bytes:
     return records
 
 
-def _fill_zstd(body: Bytes, size: int, room: Bytes) -> tuple[int, str]:
+def _fill_zstd(body: Bytes, size: int, room: Bytes, most: int) -> tuple[int, str]:
     """Decompress up to one byte more than ``size``; return the number, and what ended it early."""
     import zstandard
 
@@ -77,7 +79,7 @@ def _fill_zstd(body: Bytes, size: int, room: Bytes) -> tuple[int, str]:
         if declared > size:
             return 0, f"its zstd frame declares {declared} bytes, the chunk {size}"
         with _decompressor().stream_reader(body.data, read_across_frames=True) as stream:
-            while step := stream.readinto(room.data[done : min(done + STEP, size + 1)]):
+            while step := stream.readinto(room.data[done : min(done + most, size + 1)]):
                 done += step
     except zstandard.ZstdError as error:
         return done, f"zstd: {error}"
@@ -96,7 +98,7 @@ def _decompressor() -> zstandard.ZstdDecompressor:
     return cast("zstandard.ZstdDecompressor", _of_thread.zstd)
 
 
-def _fill_lz4(body: Bytes, size: int, room: Bytes) -> tuple[int, str]:
+def _fill_lz4(body: Bytes, size: int, room: Bytes, _: int) -> tuple[int, str]:
     import lz4.frame
 
     done, used, is_done = 0, 0, False
@@ -118,7 +120,7 @@ def _fill_lz4(body: Bytes, size: int, room: Bytes) -> tuple[int, str]:
     return done, "" if is_done else f"its lz4 frame does not end after {done} bytes"
 
 
-_FILL: Final[dict[str, Callable[[Bytes, int, Bytes], tuple[int, str]]]] = {
+_FILL: Final[dict[str, Callable[[Bytes, int, Bytes, int], tuple[int, str]]]] = {
     "lz4": _fill_lz4,
     "zstd": _fill_zstd,
 }
