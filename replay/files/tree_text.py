@@ -115,21 +115,33 @@ def yaml_tree(text: str, scalars: Literal["safe", "base"] = "safe") -> Any:
         ValueError: The text is not YAML, too long, nested too deeply, or has an anchor or alias.
     """
     from ruamel.yaml import YAML
+    from ruamel.yaml.composer import Composer
     from ruamel.yaml.error import YAMLError
-    from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
+    from ruamel.yaml.events import CollectionStartEvent
+
+    class Bounded(Composer):
+        """Composer without anchors and aliases, and of limited depth."""
+
+        levels = 0
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            event = self.parser.peek_event()
+            if event.anchor is not None:
+                raise ValueError("an anchor or alias, which is not supported")
+            nested = isinstance(event, CollectionStartEvent)
+            self.levels += nested
+            if self.levels > MAX_DEPTH:
+                raise ValueError(_TOO_DEEP)
+            node = super().compose_node(parent, index)
+            self.levels -= nested
+            return node
 
     if len(text) > _MAX_YAML:
         raise ValueError(f"{len(text)} characters, the limit is {_MAX_YAML}")
-    depth = 0
+    yaml = YAML(typ=scalars, pure=True)
+    yaml.Composer = Bounded
     try:
-        for event in YAML(typ=scalars, pure=True).parse(text):
-            depth += isinstance(event, CollectionStartEvent)
-            depth -= isinstance(event, CollectionEndEvent)
-            if depth > MAX_DEPTH:
-                raise ValueError(_TOO_DEEP)
-            if getattr(event, "anchor", None) is not None:
-                raise ValueError("an anchor or alias, which is not supported")
-        return YAML(typ=scalars, pure=True).load(text)
+        return yaml.load(text)
     except (YAMLError, RecursionError) as error:
         raise ValueError(str(error)) from None
 
