@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crosscue.eval.runs.drive import Drive
+from crosscue.eval.runs.tables.parquet import numbers_of
 from crosscue.replay.base import Log, Selection
 from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import UsageError, VehicleError
@@ -77,7 +78,7 @@ def refuse_other_segments(run: RunFolder, timeline: Timeline) -> None:
         UsageError: The segment of a frame differs.
     """
     for batch in run.batches("frames", ["t_ns", "segment"]):
-        t_ns, there = (batch[name].to_numpy() for name in ("t_ns", "segment"))
+        t_ns, there = (numbers_of(batch[name]) for name in ("t_ns", "segment"))
         wanted = timeline.numbers(t_ns)
         if (other := np.flatnonzero(wanted != there)).size:
             at = int(other[0])

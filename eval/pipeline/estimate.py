@@ -32,7 +32,7 @@ from crosscue.eval.runs.manifest import (
 from crosscue.eval.runs.tables import measurements
 from crosscue.eval.runs.tables.labelled import LabelledSink
 from crosscue.eval.runs.tables.mobileye_tables import MobileyeSink
-from crosscue.eval.runs.tables.parquet import TableSink
+from crosscue.eval.runs.tables.parquet import TableSink, arrow_column
 from crosscue.eval.runs.tables.skipped import write_skipped
 from crosscue.localization.pose_track import PoseColumns
 from crosscue.replay.base import Log
@@ -356,11 +356,12 @@ def begin_again(run: RunFolder, found: DetectManifest | None) -> None:
 
 def _camera_skips(run: RunFolder, camera: str) -> pa.Table:
     """Return the detect stage's skipped rows of the camera; other topics are read again."""
+    import pyarrow as pa
     import pyarrow.compute as pc
 
     table = run.table("skipped")
-    ours = pc.or_(pc.equal(table["topic"], camera), pc.equal(table["topic"], UNATTRIBUTED))
-    return table.filter(ours)
+    ours = arrow_column([camera, UNATTRIBUTED], pa.string())
+    return table.filter(pc.is_in(table["topic"], value_set=ours))
 
 
 def _sources(planned: SignalPlan, logs: Sequence[Log]) -> dict[str, str | None]:

@@ -136,6 +136,14 @@ assert not found, found
     run_without((*HEAVY, "pandas", "multiprocessing"), code, line, folder=drive.parent)
 
 
+def test_replay_and_estimate_with_detector_do_not_import_pandas(drive: Path) -> None:
+    lines = (
+        "replay drive.mcap -o seen --vehicle car.toml --detectors bright -q",
+        "estimate seen --vehicle car.toml -q",
+    )
+    run_without((*HEAVY, "pandas"), CHAIN, *lines, folder=drive.parent)
+
+
 def test_tables_and_batches_of_a_log_do_not_import_pandas(drive: Path) -> None:
     code = """
 import sys

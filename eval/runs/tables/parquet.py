@@ -27,14 +27,14 @@ GROUP_ROWS: Final = 8192
 def arrow_column(values: Any, kind: pa.DataType) -> pa.Array:
     """Return values, None where one is missing, as a column of Arrow.
 
-    Numbers and texts are not left to ``pa.array``: it imports pandas where that is installed, which
-    takes as long as a short replay.
+    Numbers, texts and bytes are not left to ``pa.array``: it imports pandas where that is installed,
+    which takes as long as a short replay.
     """
     import pyarrow as pa
 
     if isinstance(values, pa.Array | pa.ChunkedArray):
         return values
-    size, present, is_text = len(values), None, kind == pa.string()
+    size, present, is_text = len(values), None, kind in (pa.string(), pa.binary())
     if not (is_text or pa.types.is_dictionary(kind) or pa.types.is_primitive(kind)):
         return pa.array(values, kind)
     if not isinstance(values, np.ndarray) and None in values:
@@ -46,7 +46,7 @@ def arrow_column(values: Any, kind: pa.DataType) -> pa.Array:
         texts = arrow_column([*names], kind.value_type)
         return pa.DictionaryArray.from_buffers(kind, size, [present, pa.py_buffer(codes)], texts)
     if is_text:
-        coded = {one: str(one).encode() for one in {*values}}
+        coded = {one: one if isinstance(one, bytes) else str(one).encode() for one in {*values}}
         parts = [coded[one] for one in values]
         ends = np.cumsum([0, *map(len, parts)]).astype(np.int32)
         buffers = [present, pa.py_buffer(ends), pa.py_buffer(b"".join(parts))]
@@ -68,6 +68,15 @@ def numpy_column(values: NDArray[np.generic]) -> pa.Array:
     else:
         content = pa.py_buffer(np.ascontiguousarray(values))
     return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, content])
+
+
+def numbers_of(column: pa.Array) -> NDArray[Any]:
+    """Return a column of numbers, NaN where one is missing; unlike ``to_numpy``, without pandas."""
+    if column.null_count:
+        return np.asarray(column.to_numpy(zero_copy_only=False))
+    dtype = np.dtype(column.type.to_pandas_dtype())
+    content = column.buffers()[1]
+    return np.frombuffer(content, dtype, len(column), column.offset * dtype.itemsize)
 
 
 def _bits(flags: NDArray[np.bool_]) -> pa.Buffer:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from crosscue.fusion.intersection_range import range_noise_m2
 from crosscue.replay.columns import Floats, Int64s
 
-from .parquet import TableFolder
+from .parquet import TableFolder, arrow_column, numbers_of
 
 COLUMNS: Final = ("start_ns", "t_ns", "distance_m", "turn_rad", "distance_var_m2")
 
@@ -127,16 +127,14 @@ def _parts(run: TableFolder) -> Iterator[_Part]:
     import pyarrow as pa
     import pyarrow.compute as pc
 
-    kinds = pa.array(["odometry", "gap"])
+    kinds, gap = (arrow_column(some, pa.string()) for some in (("odometry", "gap"), ("gap",)))
     for batch in run.batches("measurements", ["kind", *COLUMNS]):
         kind = batch["kind"].cast("string")
         is_way = pc.is_in(kind, kinds)
         part = batch.filter(is_way)
         if part.num_rows:
-            start, stop, metres, radians, variance = (
-                part[name].to_numpy(zero_copy_only=False) for name in COLUMNS
-            )
-            is_gap = pc.equal(kind.filter(is_way), "gap").to_numpy(zero_copy_only=False)
+            start, stop, metres, radians, variance = (numbers_of(part[name]) for name in COLUMNS)
+            is_gap = numbers_of(pc.is_in(kind.filter(is_way), gap).cast("uint8")).astype(np.bool_)
             moves = stop > start
             yield (
                 start[moves].astype(np.int64),
