@@ -13,10 +13,11 @@ _BLOCK: Final = 128
 
 def box_ious(boxes: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
     """Intersection over union of boxes, shape (..., 4), with others of a shape that fits."""
-    low = np.maximum(boxes[..., :2], others[..., :2])
-    sides = np.maximum(np.minimum(boxes[..., 2:], others[..., 2:]) - low, 0.0)
-    both = sides[..., 0] * sides[..., 1]
-    own, other = (np.prod(some[..., 2:] - some[..., :2], axis=-1) for some in (boxes, others))
+    x0, y0, x1, y1 = (boxes[..., i] for i in range(4))
+    left, top, right, bottom = (others[..., i] for i in range(4))
+    width = np.maximum(np.minimum(x1, right) - np.maximum(x0, left), 0.0)
+    both = width * np.maximum(np.minimum(y1, bottom) - np.maximum(y0, top), 0.0)
+    own, other = (x1 - x0) * (y1 - y0), (right - left) * (bottom - top)
     return np.asarray(both / np.maximum(own + other - both, 1e-12), np.float64)
 
 

@@ -101,8 +101,9 @@ def _numbers(pixels: NDArray[np.uint8], want: Input, corner: Size, size_px: Size
     for i, plane in enumerate(reversed(planes) if want.colour == "rgb" else planes):
         around = numbers[i]
         inside = around[top : top + height, left : left + width]
-        if inside.shape != around.shape:
-            around[:] = want.pad
+        for strip in (around[:top], around[top + height :], around[:, :left]):
+            strip[:] = want.pad
+        around[:, left + width :] = want.pad
         inside[:] = plane
         if want.dtype == "float32":
             # Scalars of NumPy types prevent a second conversion of the plane.

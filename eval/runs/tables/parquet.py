@@ -27,7 +27,7 @@ GROUP_ROWS: Final = 8192
 def arrow_column(values: Any, kind: pa.DataType) -> pa.Array:
     """Return values, None where one is missing, as a column of Arrow.
 
-    Numbers, texts and bytes are not left to ``pa.array``: it imports pandas where that is installed,
+    Numbers, texts and bytes are not left to ``pa.array``: where pandas is installed, it imports it,
     which takes as long as a short replay.
     """
     import pyarrow as pa
