@@ -11,6 +11,8 @@ import pytest
 import crosscue
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
+from crosscue.eval.logs.log import _views
+from crosscue.replay.columns import Messages
 from support.every_format import EVERY_FORMAT
 
 
@@ -48,6 +50,19 @@ def test_each_format_yields_tables_or_frames(name: str, tmp_path: Path) -> None:
             assert table.column_names[0] == "log_t_ns"
             rows += len(table)
     assert rows or warned
+
+
+@pytest.mark.parametrize("sizes", [(0, 1, 4, 11, 12, 13, 40), (13, 20), (12,), ()])
+def test_pictures_of_any_size_are_views_of_their_bytes(sizes: tuple[int, ...]) -> None:
+    buffer = np.arange(100, dtype=np.uint8)
+    start = np.arange(len(sizes), dtype=np.int64) * 7 + 3
+    messages = Messages(buffer, start, start + np.array(sizes, np.int64))
+
+    views = _views(messages)
+
+    assert views.to_pylist() == [
+        buffer[i : i + n].tobytes() for i, n in zip(start, sizes, strict=True)
+    ]
 
 
 @pytest.mark.filterwarnings("ignore::crosscue.LossWarning")
