@@ -2,15 +2,13 @@
 
 import hashlib
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Final
 
 import pyarrow.parquet as pq
 import pytest
 
+from support.child import python
 from support.gap_drive import Clock, write_drive
 from support.onnx_models import bright_box_model
 
@@ -61,15 +59,7 @@ def run_without(
     modules: tuple[str, ...], code: str, *arguments: str, folder: Path | None = None
 ) -> str:
     """Run code that fails on any attempt to import ``modules``, and return its output."""
-    done = subprocess.run(
-        [sys.executable, "-c", BLOCKED_RUN + code, ",".join(modules), *arguments],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        check=False,
-    )
+    done = python(BLOCKED_RUN + code, ",".join(modules), *arguments, timeout=300, cwd=folder)
     assert done.returncode == 0, f"{arguments}: {done.stderr[-2000:]}"
     return done.stdout
 

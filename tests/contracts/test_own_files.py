@@ -9,14 +9,15 @@ import resource
 import shlex
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import pytest
 
 from crosscue.eval import cli
+from support.child import python
 from support.empty_inputs import empty_inputs
 
 MAIN: Final = "from crosscue.eval.cli import main; main()"
@@ -129,6 +130,13 @@ PLANTED: Final[dict[str, tuple[Callable[[Path], None], str, str]]] = {
 }
 
 
+def _limited(code: str, *words: object) -> subprocess.CompletedProcess[str]:
+    """Run code with little address space, for a minute at most."""
+    one = {"OPENBLAS_NUM_THREADS": "1", "ARROW_NUM_THREADS": "1"}
+    limit = partial(resource.setrlimit, resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    return python(code, *words, env={**os.environ, **one}, preexec_fn=limit, timeout=60)
+
+
 @pytest.mark.parametrize("case", PLANTED)
 def test_planted_file_is_refused_in_bounded_time_and_memory(
     case: str, names: dict[str, Path]
@@ -136,18 +144,7 @@ def test_planted_file_is_refused_in_bounded_time_and_memory(
     plant, place, line = PLANTED[case]
     plant(names["run"].parent / place.format(**names))
 
-    def limited() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
-
-    done = subprocess.run(
-        [sys.executable, "-c", MAIN, *shlex.split(line.format(**names))],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        preexec_fn=limited,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "ARROW_NUM_THREADS": "1"},
-        check=False,
-    )
+    done = _limited(MAIN, *shlex.split(line.format(**names)))
 
     assert "Traceback" not in done.stderr
     assert "memory" not in done.stderr
@@ -245,16 +242,6 @@ print(len(door.read(path, 4 << 30)), len(read_at_most(path, 4 << 30)))
 def test_small_file_is_read_with_a_limit_larger_than_the_memory(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_bytes(bytes(3 << 20))
 
-    def limited() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
-
-    done = subprocess.run(
-        [sys.executable, "-c", READS, str(tmp_path / "manifest.json")],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        preexec_fn=limited,
-        check=False,
-    )
+    done = _limited(READS, tmp_path / "manifest.json")
 
     assert (done.stdout, done.stderr) == (f"{3 << 20} {3 << 20}\n", "")

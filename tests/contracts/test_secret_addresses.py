@@ -2,8 +2,6 @@
 
 import argparse
 import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -18,6 +16,7 @@ from crosscue.eval.cli import COMMANDS, parser_of
 from crosscue.eval.cli import run as crosscue
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.remote import ranges as remote_ranges
+from support.child import python
 from support.gap_drive import Clock, write_drive
 from support.range_server import Served, serving
 from support.street_map import write_crossing
@@ -249,11 +248,7 @@ def test_messages_of_libraries_on_standard_error_lose_secrets() -> None:
         "cli.run = run\n"
         "cli.main([])\n"
     )
-    environment = {**os.environ, "PYTHONWARNINGS": "default"}
-
-    ended = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment
-    )
+    ended = python(code, env={**os.environ, "PYTHONWARNINGS": "default"})
 
     assert ended.stderr.count("http://h/a") == 3
     assert SECRET not in ended.stderr

@@ -2,8 +2,6 @@
 
 import copy
 import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
@@ -31,6 +29,7 @@ from crosscue.detectors.networks.mask_rcnn.detector import (
 )
 from crosscue.detectors.networks.mask_rcnn.network import build_network
 from crosscue.detectors.networks.mask_rcnn.parts import TorchParts, as_input
+from support.child import python
 from support.mask_rcnn import CPU, noise_frame, plan_of, random_checkpoint
 
 BACKENDS = ("torch", "openvino")
@@ -253,14 +252,7 @@ def test_openvino_sends_no_telemetry_and_writes_no_home_files(tmp_path: Path) ->
     hidden = {"CI", "TF_BUILD", "JENKINS_URL"}
     around = {k: v for k, v in os.environ.items() if k not in hidden}
 
-    done = subprocess.run(
-        [sys.executable, "-c", _WATCHED],
-        env={**around, "HOME": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = python(_WATCHED, env={**around, "HOME": str(tmp_path)})
 
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "intel").exists()

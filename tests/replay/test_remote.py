@@ -1,7 +1,5 @@
 """Remote logs are fetched once, until they change or their store stalls."""
 
-import subprocess
-import sys
 import uuid
 from collections.abc import Iterator
 from importlib import import_module
@@ -19,6 +17,7 @@ from crosscue.replay.remote import ranges as remote_ranges
 from crosscue.replay.remote import waiting
 from crosscue.replay.remote.logs import Store, fetch_log
 from support.can_files import candump, random_frames
+from support.child import python
 from support.every_format import EVERY_FORMAT
 from support.range_server import Served
 
@@ -185,13 +184,7 @@ def test_stalled_server_is_reported_then_given_up(
         "main(sys.argv[1:])\n"
     )
 
-    ended = subprocess.run(
-        [sys.executable, "-c", code, "info", f"{web.base}/{name}"],
-        capture_output=True,
-        text=True,
-        timeout=40,
-        check=False,
-    )
+    ended = python(code, "info", f"{web.base}/{name}", timeout=40)
 
     assert ended.returncode == 4
     log = f"crosscue: {web.base}/{name}: no answer to a request for"

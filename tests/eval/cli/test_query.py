@@ -2,7 +2,6 @@
 
 import csv
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import crosscue
 from crosscue.eval import cli
 from crosscue.replay.errors import UsageError
 from support.catalog_runs import runs_below
+from support.child import python
 from support.refusals import refusal
 from support.trees import tree
 
@@ -142,13 +142,7 @@ def test_result_that_exceeds_memory_is_refused_in_one_line(runs: Path) -> None:
         "resource.setrlimit(resource.RLIMIT_AS, (used + (2 << 30), used + (2 << 30)))\n"
         "sys.exit(cli.run(['query', sys.argv[1], 'select * from range(300000000)']))\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(runs)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    done = python(script, runs)
 
     assert "query: the result does not fit in memory; select fewer rows" in done.stderr
     assert done.stderr.count("\n") == 1

@@ -21,6 +21,7 @@ from crosscue.localization.landmarks.database import (
 )
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogError, LogFormatError, OutputError
+from support.child import python
 from support.landmark_files import database_of, place_at, some_features
 
 
@@ -32,14 +33,7 @@ def _in_child(
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
             resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, max_bytes))
 
-    return subprocess.run(
-        [sys.executable, "-c", WRITE_MANY, str(path), str(count), *more],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        preexec_fn=limit,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return python(WRITE_MANY, path, count, *more, preexec_fn=limit)
 
 
 GRID = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0)), axis=-1).reshape(-1, 2) * 50.0
