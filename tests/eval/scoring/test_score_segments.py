@@ -31,7 +31,7 @@ def test_rows_with_repeated_log_time_are_counted_in_all_scores(tmp_path: Path) -
     frames, belief, ranges = (_ambiguous_rows(run, name) for name in ("frames", "belief", "range"))
     assert min(frames, belief, ranges) > 0
 
-    scored = ScoringSettings(tmp_path / "truth.json", rpe_m=(10.0,))(run.path)
+    scored = ScoringSettings(tmp_path / "truth.json")(run.path)
 
     metrics = json.loads(run.file("score/metrics.json").read_text())
     assert metrics["coverage"]["frames"] == run.table("frames").num_rows
