@@ -35,7 +35,7 @@ from support.memory_log import MAGNETOMETER
         ("version = 2", r":1: version: .*1, got 2"),
         ("version = 1\n[can.yaw_rate]\nsignal = 'YAW'", r":3: can.yaw_rate.signal"),
         ("version = 1\nversion = 1", r"not TOML: .*"),
-        ("version = 1\n[radar]\nx = 1", r":2: radar: no such key; there are: .*topics"),
+        ("version = 1\n[hitch]\nx = 1", r":2: hitch: no such key; there are: .*topics"),
     ],
 )
 def test_invalid_setting_is_refused_with_line_number(text: str, message: str) -> None:
