@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from crosscue.eval.scoring.consistency import mean_band
-from crosscue.localization.angles import wrap, wrap_all
+from crosscue.localization.angles import wrap_all
 from crosscue.localization.constants import (
     EFFECTS,
     TURN_PARAMETERS,
@@ -33,7 +33,7 @@ from crosscue.localization.pose_track import (
 from crosscue.localization.position_updates import PositionUpdates
 from crosscue.replay.columns import Floats
 from support.beliefs import with_position
-from support.simulated_drive import BASE_M, TRACK_M, Truth, compass, drive, gyro, wheels
+from support.simulated_drive import BASE_M, TRACK_M, Truth, compass, drive, gyro, nees_of, wheels
 
 CAR = OdometrySettings(
     track_width_m=TRACK_M,
@@ -243,16 +243,6 @@ def track(
     return done, truth
 
 
-def nees(done: Advance, truth: Truth) -> float:
-    """NEES of the last pose."""
-    poses = done.poses
-    apart = np.array([poses.x_m[-1], poses.y_m[-1], poses.heading_rad[-1]]) - truth.xyh[-1]
-    apart[2] = wrap(apart[2])
-    xx, xy, xh, yy, yh, hh = poses.cov_xyh[-1]
-    cov = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
-    return float(apart @ np.linalg.solve(cov, apart))
-
-
 @pytest.mark.parametrize("with_fixes", [False, True])
 def test_nees_of_pose_and_parameters_is_in_its_band(with_fixes: bool) -> None:
     """60 drives whose scale, bias and gyro scale are off by as much as stated (seeds 0 to 59)."""
@@ -262,10 +252,10 @@ def test_nees_of_pose_and_parameters_is_in_its_band(with_fixes: bool) -> None:
     ]
 
     low, high = mean_band(3, 60)
-    assert low < np.mean([nees(done, truth) for done, truth in runs]) < high
+    assert low < np.mean([nees_of(done.poses, truth, -1) for done, truth in runs]) < high
     if not with_fixes:
         ignored = [track(seed, np.zeros((3, 3)), off) for seed, off in enumerate(offs[:20])]
-        assert np.mean([nees(done, truth) for done, truth in ignored]) > 3.0 * high
+        assert np.mean([nees_of(done.poses, truth, -1) for done, truth in ignored]) > 3.0 * high
     of_parameters = []
     for (done, _), off in zip(runs, offs, strict=True):
         assert done.state.constants is not None

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.eval.scoring.consistency import mean_band
-from crosscue.localization.angles import wrap_all
 from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.odometry import (
     Increments,
@@ -26,7 +25,6 @@ from crosscue.localization.pose_track import (
     NO_HEADINGS,
     Advance,
     Headings,
-    PoseColumns,
     TrackCounts,
     TrackSettings,
     TrackState,
@@ -35,7 +33,7 @@ from crosscue.localization.pose_track import (
 )
 from crosscue.replay.columns import Floats, Int64s
 from support.beliefs import driven, with_heading, with_speed
-from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
+from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, nees_of, wheels
 
 ODOMETRY = OdometrySettings(
     track_width_m=TRACK_M,
@@ -51,15 +49,6 @@ def draw_start(truth: Truth, rng: np.random.Generator, heading_sd: float = 0.05)
     x, y, heading = truth.xyh[0] + rng.normal(0.0, [1.0, 1.0, heading_sd])
     speed = truth.speed_mps[0] + rng.normal(0.0, 1.0)
     return start_belief(int(truth.t_ns[0]), x, y, heading, speed, 1.0, heading_sd, 1.0)
-
-
-def nees_of(poses: PoseColumns, truth: Truth, row: int) -> float:
-    estimate = np.array([poses.x_m[row], poses.y_m[row], poses.heading_rad[row]])
-    error = estimate - truth.xyh[np.searchsorted(truth.t_ns, poses.t_ns[row])]
-    error[2] = wrap_all(error[2:])[0]
-    xx, xy, xh, yy, yh, hh = poses.cov_xyh[row]
-    cov = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
-    return float(error @ np.linalg.solve(cov, error))
 
 
 def run(seed: int, settings: TrackSettings, persists_s: float = 0.0) -> tuple[Advance, Truth]:

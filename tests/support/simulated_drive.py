@@ -6,7 +6,7 @@ import numpy as np
 
 from crosscue.localization.angles import wrap_all
 from crosscue.localization.odometry import OdometrySettings, TurnSignal, WheelSamples
-from crosscue.localization.pose_track import Headings
+from crosscue.localization.pose_track import Headings, PoseColumns
 from crosscue.replay.columns import Floats, Int64s
 
 TRACK_M = 1.6
@@ -89,3 +89,13 @@ def compass(
             error[i] = fraction * error[i - 1] + np.sqrt(1.0 - fraction**2) * error[i]
     heading = wrap_all(truth.xyh[1::every, 2] + error)
     return Headings(t_ns, heading, np.full(len(t_ns), sd_rad**2))
+
+
+def nees_of(poses: PoseColumns, truth: Truth, row: int) -> float:
+    """Normalised squared error of one pose, with three degrees of freedom."""
+    estimate = np.array([poses.x_m[row], poses.y_m[row], poses.heading_rad[row]])
+    error = estimate - truth.xyh[np.searchsorted(truth.t_ns, poses.t_ns[row])]
+    error[2] = wrap_all(error[2:])[0]
+    xx, xy, xh, yy, yh, hh = poses.cov_xyh[row]
+    cov = np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]])
+    return float(error @ np.linalg.solve(cov, error))

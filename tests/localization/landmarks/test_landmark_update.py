@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.eval.scoring.consistency import mean_band
-from crosscue.localization.angles import wrap_all
 from crosscue.localization.ekf import PoseBelief, update_point
 from crosscue.localization.landmarks.database import (
     LandmarkDatabase,
@@ -34,7 +33,7 @@ from support.beliefs import joseph
 from support.data import shared
 from support.landmark_drive import PlaceMeasurements, features_at, landmarks_along, search_in
 from support.landmark_files import seen_from, some_features, wall
-from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, wheels
+from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, nees_of, wheels
 
 ODOMETRY = OdometrySettings(
     track_width_m=TRACK_M, wheel_step_mps=0.01, slip_per_sqrt_m=0.2, gyro_noise_rad_per_sqrt_s=0.02
@@ -120,16 +119,6 @@ def run(
     return done, truth, measurements
 
 
-def nees(done: Advance, truth: Truth) -> float:
-    poses = done.poses
-    error = np.array([poses.x_m[-1], poses.y_m[-1], poses.heading_rad[-1]]) - truth.xyh[-1]
-    error[2] = wrap_all(error[2:])[0]
-    xx, xy, xh, yy, yh, hh = poses.cov_xyh[-1]
-    return float(
-        error @ np.linalg.solve(np.array([[xx, xy, xh], [xy, yy, yh], [xh, yh, hh]]), error)
-    )
-
-
 SEEDS = 24
 
 
@@ -139,7 +128,7 @@ def test_simulated_nees_and_nis_are_in_their_bands(tmp_path: Path) -> None:
     runs = [run(tmp_path, seed) for seed in range(SEEDS)]
 
     low, high = mean_band(3, SEEDS)
-    assert low < np.mean([nees(done, truth) for done, truth, _ in runs]) < high
+    assert low < np.mean([nees_of(done.poses, truth, -1) for done, truth, _ in runs]) < high
     nis = np.array([s.nis for _, _, measurements in runs for s in measurements.search.sightings])
     low, high = mean_band(2, len(nis))
     assert len(nis) > 3 * SEEDS
