@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -391,17 +392,7 @@ def test_previously_trained_mask_head_keeps_its_masks(tmp_path: Path) -> None:
     first = crosscue.train_mask_rcnn(masked, tmp_path / "first.safetensors")
     bare = write_bars(tmp_path / "b", 2)
     _without_masks(bare)
-    later = MaskRcnnTrainingSettings(
-        data=bare,
-        images=tmp_path / "b" / "images",
-        init=first.path,
-        classes=["car"],
-        steps=1,
-        batch=1,
-        width_px=128,
-        window_px=(96, 64),
-        device="cpu",
-    )
+    later = replace(masked, data=bare, images=tmp_path / "b" / "images", init=first.path)
 
     second = crosscue.train_mask_rcnn(later, tmp_path / "second.safetensors")
 
