@@ -3,7 +3,7 @@
 Each drive is cut into parts. `fit odometry` is fitted to each part, and the filter, with the fit's
 constant errors as states, predicts the next part (and the part before) from the last 15 s of known
 positions. The table has the mean NEES of x and y by horizon: 2 is expected, and less means that the
-filter is too cautious. Its interval covers what many such drives would give, in 95 % or more of
+filter is too cautious. Its interval covers what many such drives would give, in 94 % or more of
 simulated repetitions, also where the windows of a part share most of their error (``interval``).
 
     python benchmarks/pose_nees.py --data ../shared/data [--simulated 20] [--json nees.json]
