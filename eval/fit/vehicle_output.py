@@ -78,6 +78,7 @@ class Fitted(Result):
             "section": self.toml,
             "belongs_in": self.belongs_in,
             "losses": losses,
+            "is_whole": getattr(self, "is_whole", True),
         }
         write_page(Path(path), "fit.html.j2", content)
 

@@ -7,6 +7,7 @@ import hashlib
 import html
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -191,4 +192,18 @@ def test_page_names_what_was_dropped(
     text = html.unescape(page.read_text())
     assert losses
     assert all(f"<li>{one}</li>" in text for one in losses)
+    assert "Nothing was dropped" not in text
+
+
+def test_page_of_fit_to_runs_with_drops_does_not_say_that_nothing_was_dropped(
+    named: tuple[Path, dict[str, list[str]]], tmp_path: Path
+) -> None:
+    folder, _ = named
+    found = crosscue.fit_detector(
+        folder / "lights/run", folder / "lights/labels", precision=0.6, calibration="none"
+    )
+    replace(found, is_whole=False).write_page(tmp_path / "fit.html")
+
+    text = (tmp_path / "fit.html").read_text()
+    assert "dropped when the runs were made" in text
     assert "Nothing was dropped" not in text
