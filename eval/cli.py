@@ -275,8 +275,13 @@ def _guarded(
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
         with watched(args):
-            found = _with_page(call, args, losses)
+            page = getattr(args, "page_of_result", None)
+            if page is not None and page.exists() and not getattr(args, args.name_of_overwrite):
+                raise OutputError(f"{page}: exists; give another name or --overwrite")
+            found: Any = call(args)
             status = print_found(found, args)
+            if page is not None:
+                found.write_page(page, losses)
         sys.stdout.flush()
         return status
     except CrosscueError as error:
@@ -311,18 +316,6 @@ def _guarded(
         return _complain(RuntimeError(text), 1, args)
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def _with_page(call: Call, args: argparse.Namespace, losses: list[str]) -> Any:
-    """Call a verb, and write the page of its result if it was asked for."""
-    page = getattr(args, "page_of_result", None)
-    if page is None:
-        return call(args)
-    if page.exists() and not getattr(args, args.name_of_overwrite):
-        raise OutputError(f"{page}: exists; give another name or --overwrite")
-    found: Any = call(args)
-    found.write_page(page, losses)
-    return found
 
 
 class _TerminatedError(BaseException):

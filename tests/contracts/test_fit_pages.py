@@ -207,3 +207,19 @@ def test_page_of_fit_to_runs_with_drops_does_not_say_that_nothing_was_dropped(
     text = (tmp_path / "fit.html").read_text()
     assert "dropped when the runs were made" in text
     assert "Nothing was dropped" not in text
+
+
+def test_result_is_printed_where_its_page_cannot_be_written(
+    named: tuple[Path, dict[str, list[str]]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, _ = named
+    (tmp_path / "file").write_text("")
+    page = tmp_path / "file" / "fit.html"
+    line = ["fit", "ranges", str(folder / "heights.csv"), "--cue", "stop_sign"]
+
+    assert cli.run([*line, "--page", str(page)]) == 1
+
+    printed = capsys.readouterr()
+    assert "[ranges.stop_sign]" in printed.out
+    assert str(page) in printed.err
+    assert printed.err.count("\n") == 1
