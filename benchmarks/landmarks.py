@@ -34,7 +34,7 @@ from crosscue.localization.landmarks.database import (
 )
 from crosscue.localization.landmarks.features import Keypoints
 from crosscue.localization.landmarks.images import grey_of, read_encoded
-from crosscue.localization.landmarks.matcher import OrbMatcher, OrbSettings
+from crosscue.localization.landmarks.matcher import OrbMatcher
 from crosscue.localization.landmarks.update import best_candidate
 from crosscue.replay.columns import Floats
 from support.landmark_files import seen_from, some_features, wall
@@ -43,7 +43,7 @@ SPACING_M = 10.0
 SD_M = 10.0
 FRAMES = 200
 ROUNDS = 5
-ORB = OrbMatcher(OrbSettings())
+ORB = OrbMatcher()
 
 
 def build(path: Path, count: int) -> float:
@@ -204,7 +204,7 @@ def real_days(data: Path) -> None:
     folder = data / "place_recognition"
     if not folder.is_dir():
         return
-    orb = OrbMatcher(OrbSettings(features=1000))
+    orb = OrbMatcher(features=1000)
     seen = {p.stem: orb.describe(grey_of(read_encoded(p))) for p in folder.rglob("*.jpg")}
     same = {
         ("gmb_q1", "gmb_db2"),

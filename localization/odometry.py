@@ -112,22 +112,13 @@ class WheelSamples:
         t_ns: Shape (N,), int64.
         wheels_mps: Shape (N, 2) rear left, rear right; or (N, 4) front left, front right, rear
             left, rear right. Signed if the sensor measures the direction.
-        is_reverse: Shape (N,), bool: True while the car reverses, for speeds without a sign; or
-            None.
     """
 
     t_ns: Int64s
     wheels_mps: Floats
-    is_reverse: Bools | None = None
 
     def __len__(self) -> int:
         return len(self.t_ns)
-
-    def signed_mps(self) -> Floats:
-        """Wheel speeds with the sign of the direction of travel."""
-        if self.is_reverse is None:
-            return self.wheels_mps
-        return np.where(self.is_reverse[:, None], -np.abs(self.wheels_mps), self.wheels_mps)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -320,7 +311,7 @@ def _check_geometry(settings: OdometrySettings, turn: TurnSignal | None) -> None
 
 def _at_rear_axle(wheels: WheelSamples, settings: OdometrySettings) -> tuple[Floats, Floats]:
     """Speed of the rear axle's centre, and yaw rate by the difference of left and right wheels."""
-    speeds = wheels.signed_mps() * settings.wheel_scales[-wheels.wheels_mps.shape[1] :]
+    speeds = wheels.wheels_mps * settings.wheel_scales[-wheels.wheels_mps.shape[1] :]
     left, right = speeds[:, -2], speeds[:, -1]
     if settings.use_front_wheels and speeds.shape[1] == 4 and settings.wheelbase_m is not None:
         front_sideways_mps = (right - left) / settings.track_width_m * settings.wheelbase_m

@@ -7,7 +7,6 @@ position error of a few per cent comes from the public description of the protoc
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -30,29 +29,13 @@ SOLID, ROAD_EDGE, DOUBLE = 1, 3, 4
 STANDING, MOVING, ONCOMING, PARKED = 1, 3, 4, 5
 
 
-@dataclass(frozen=True, slots=True)
-class DeviceFaults:
-    """Performance of the device.
-
-    Attributes:
-        half_view_rad: Half of the field of view.
-        reach_m: Max distance of a vehicle.
-        min_visible: Min visible fraction of a vehicle.
-        hit: Probability that a vehicle on the ego road is reported; states last about a second.
-        hit_crossing: Probability for a vehicle seen from the side.
-        hit_off_road: Probability for a vehicle in a lot or driveway.
-        place_fraction: Relative error of distance.
-        side_m: Lateral error.
-    """
-
-    half_view_rad: float = 0.33
-    reach_m: float = 95.0
-    min_visible: float = 0.35
-    hit: float = 0.9
-    hit_crossing: float = 0.12
-    hit_off_road: float = 0.18
-    place_fraction: float = 0.03
-    side_m: float = 0.15
+# Half of the device's field of view, and bounds on the vehicles that it reports.
+HALF_VIEW_RAD: Final = 0.33
+_REACH_M, _MIN_VISIBLE = 95.0, 0.35
+# Probability that a vehicle is reported: on the ego road, seen from the side, in a lot or driveway.
+_HIT, _HIT_CROSSING, _HIT_OFF_ROAD = 0.9, 0.12, 0.18
+# Errors of distance (relative) and of lateral position.
+_PLACE_FRACTION, _SIDE_M = 0.03, 0.15
 
 
 class Device:
@@ -62,7 +45,6 @@ class Device:
         """Begin without tracks."""
         self._world = world
         self._rng = rng
-        self._faults = DeviceFaults()
         self._reports: dict[int, bool] = {}
         self._scale: dict[int, float] = {}
         self._age: dict[int, int] = {}
@@ -100,17 +82,17 @@ class Device:
         return rows
 
     def _is_reported(self, seen: RenderedObject, ahead: float, left: float) -> bool:
-        faults, number = self._faults, seen.thing.number
+        number = seen.thing.number
         front = ahead - FRONT_M
-        if front < 1.0 or front > faults.reach_m or seen.visible < faults.min_visible:
+        if front < 1.0 or front > _REACH_M or seen.visible < _MIN_VISIBLE:
             return False
-        if abs(np.arctan2(left, front)) > faults.half_view_rad:
+        if abs(np.arctan2(left, front)) > HALF_VIEW_RAD:
             return False
-        chance = faults.hit
+        chance = _HIT
         if seen.thing.role in ("cross", "parked_cross"):
-            chance = faults.hit_crossing
+            chance = _HIT_CROSSING
         elif abs(seen.thing.at[1]) > self._world.layout.half_width_m:
-            chance = faults.hit_off_road
+            chance = _HIT_OFF_ROAD
         chance *= 1.0 - 0.15 * self._world.conditions.rain
         # A state is drawn about once a second, so that hits and misses occur in runs.
         if number not in self._reports or self._rng.random() < 0.1:
@@ -120,10 +102,9 @@ class Device:
     def _row(
         self, t_ns: int, seen: RenderedObject, picture: RenderedFrame, ahead: float, left: float
     ) -> dict[str, float]:
-        thing, faults = seen.thing, self._faults
-        number = thing.number
+        thing, number = seen.thing, seen.thing.number
         if number not in self._scale:
-            self._scale[number] = float(self._rng.normal(1.0, faults.place_fraction))
+            self._scale[number] = float(self._rng.normal(1.0, _PLACE_FRACTION))
         self._age[number] = min(self._age.get(number, 0) + 1, 254)
         heading = picture.view.rear_axle[2]
         vx = thing.velocity[0] * np.cos(heading) + thing.velocity[1] * np.sin(heading)
@@ -135,7 +116,7 @@ class Device:
             "t_ns": t_ns,
             "obstacle_id": number % 200 + 1,
             "x_m": max(near + self._rng.normal(0, 0.1), FRONT_M),
-            "y_m": left + self._rng.normal(0, faults.side_m),
+            "y_m": left + self._rng.normal(0, _SIDE_M),
             "vx_mps": vx - picture.view.speed_mps + self._rng.normal(0, 0.2),
             "type": 1 if thing.size[0] > 5.3 else 0,
             "status": status,

@@ -36,6 +36,10 @@ _BIN_DEG: Final = 10
 _BIN_READINGS: Final = 3
 # Maximum scatter of a ring, as a fraction of its radius; an unstructured cloud has about 0.5.
 _RING: Final = 0.2
+# Minimum coverage of headings in degrees to fit hard and soft iron, and minimum number of readings.
+HARD_IRON_DEG: Final = 180.0
+SOFT_IRON_DEG: Final = 300.0
+MIN_READINGS: Final = 20
 
 
 class NotObservable(NamedTuple):
@@ -43,21 +47,6 @@ class NotObservable(NamedTuple):
 
     parameter: str
     reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class FitSettings:
-    """Requirements on a drive.
-
-    Attributes:
-        hard_iron_deg: Minimum coverage of headings, in degrees of the circle, to fit hard iron.
-        soft_iron_deg: Minimum coverage of headings to fit soft iron.
-        min_readings: Minimum number of readings with a reference.
-    """
-
-    hard_iron_deg: float = 180.0
-    soft_iron_deg: float = 300.0
-    min_readings: int = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +95,6 @@ def fit_compass(
     field_t: Floats,
     reference_rad: Floats | None,
     given: CompassSettings,
-    settings: FitSettings | None = None,
 ) -> CompassFit:
     """Fit the observable parameters of hard iron, soft iron and mounting.
 
@@ -116,14 +104,12 @@ def fit_compass(
         reference_rad: Shape (N,): heading of the car, counter-clockwise from east, such as the GNSS
             course of ``course_at``; NaN where unknown. None without a reference.
         given: Mounting rotation and declination, and default values of the other parameters.
-        settings: Requirements on the drive.
 
     Raises:
         VehicleError: There are too few readings, the axes are mirrored, or the readings are not
             correlated with the headings.
         ValueError: Columns differ in length.
     """
-    settings = settings or FitSettings()
     if field_t.shape != (len(t_ns), 3):
         raise ValueError(f"field_t: expected ({len(t_ns)}, 3), got {field_t.shape}")
     if reference_rad is not None and reference_rad.shape != t_ns.shape:
@@ -132,14 +118,14 @@ def fit_compass(
     if reference_rad is not None:
         usable &= np.isfinite(reference_rad)
     n = int(usable.sum())
-    if n < settings.min_readings:
+    if n < MIN_READINGS:
         raise VehicleError(
             f"compass: {n} of {len(t_ns)} readings are finite and have a reference heading, "
-            f"{settings.min_readings} are required; use a longer drive"
+            f"{MIN_READINGS} are required; use a longer drive"
         )
     if reference_rad is None:
-        return _fit_alone(field_t, usable, given, settings)
-    return _fit_to(t_ns[usable], field_t[usable], reference_rad[usable], given, settings, len(t_ns))
+        return _fit_alone(field_t, usable, given)
+    return _fit_to(t_ns[usable], field_t[usable], reference_rad[usable], given, len(t_ns))
 
 
 def coverage_deg(directions_rad: Floats) -> int:
@@ -154,16 +140,15 @@ def _fit_to(
     field_t: Floats,
     reference_rad: Floats,
     given: CompassSettings,
-    settings: FitSettings,
     readings: int,
 ) -> CompassFit:
     covered = coverage_deg(reference_rad)
     north = np.exp(1j * (math.pi / 2 - given.declination_rad - reference_rad))
     observable: tuple[str, ...] = (MOUNTING,)
-    if covered >= settings.soft_iron_deg:
+    if covered >= SOFT_IRON_DEG:
         observable = (MOUNTING, HARD_IRON, SOFT_IRON)
         fitted = _fitted_ellipse(field_t, north, given)
-    elif covered >= settings.hard_iron_deg:
+    elif covered >= HARD_IRON_DEG:
         observable = (MOUNTING, HARD_IRON)
         fitted = _fitted_circle(field_t, north, given)
     else:
@@ -177,8 +162,8 @@ def _fit_to(
         observable=observable,
         not_observable=_missing(
             observable,
-            _short(covered, settings.hard_iron_deg),
-            _short(covered, settings.soft_iron_deg),
+            _short(covered, HARD_IRON_DEG),
+            _short(covered, SOFT_IRON_DEG),
         ),
         readings=readings,
         readings_used=len(t_ns),
@@ -191,9 +176,7 @@ def _fit_to(
     )
 
 
-def _fit_alone(
-    field_t: Floats, usable: NDArray[np.bool_], given: CompassSettings, settings: FitSettings
-) -> CompassFit:
+def _fit_alone(field_t: Floats, usable: NDArray[np.bool_], given: CompassSettings) -> CompassFit:
     """Fit without a reference, if the readings cover an ellipse."""
     base = replace(given, hard_iron_t=(0.0, 0.0, 0.0), soft_iron=IDENTITY)
     level = level_field(field_t[usable], base)[:, :2]
@@ -204,8 +187,8 @@ def _fit_alone(
     if shape is not None:
         north = np.linalg.solve(shape.bend, (level - shape.hard).T)
         covered = coverage_deg(np.arctan2(north[1], north[0]))
-        short = _short(covered, settings.soft_iron_deg)
-    if shape is not None and covered >= settings.soft_iron_deg:
+        short = _short(covered, SOFT_IRON_DEG)
+    if shape is not None and covered >= SOFT_IRON_DEG:
         observable = (HARD_IRON, SOFT_IRON)
         fitted = _corrected(base, shape)
     return CompassFit(

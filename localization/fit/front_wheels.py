@@ -41,7 +41,7 @@ def front_wheels(
         settings: Fitted settings.
         span_ns: First and last time of the part that is fitted.
     """
-    speeds = wheels.signed_mps()
+    speeds = wheels.wheels_mps
     if speeds.shape[1] != 4 or settings.wheelbase_m is None:
         return ()
     kept = np.isfinite(speeds).all(axis=1)

@@ -9,7 +9,6 @@ consistent points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -23,23 +22,12 @@ from .features import CameraGeometry, Keypoints, Match
 _MIN_SIDE_PX: Final = 32
 # Minimum number of pairs for a homography, which four points always fit.
 _MIN_PAIRS: Final = 6
-
-
-@dataclass(frozen=True, slots=True)
-class OrbSettings:
-    """Settings of ORB features and their comparison.
-
-    Attributes:
-        features: Maximum number of points per picture.
-        side_px: Maximum length of a picture's longer side; larger pictures are scaled down.
-        ratio: Upper bound of the nearest neighbour's distance over the second's.
-        tolerance_px: Maximum error of a consistent point.
-    """
-
-    features: int = 500
-    side_px: int = 1280
-    ratio: float = 0.8
-    tolerance_px: float = 4.0
+# Maximum length of a picture's longer side; larger pictures are scaled down.
+_SIDE_PX: Final = 1280
+# Upper bound of the nearest neighbour's distance over the second's.
+_RATIO: Final = 0.8
+# Maximum error of a consistent point.
+_TOLERANCE_PX: Final = 4.0
 
 
 class OrbMatcher:
@@ -47,22 +35,22 @@ class OrbMatcher:
 
     kind: Final = "orb"
 
-    def __init__(self, settings: OrbSettings) -> None:
-        """Create the matcher with these settings."""
-        self.settings: Final = settings
+    def __init__(self, features: int = 500) -> None:
+        """Create the matcher of at most this number of points per picture."""
+        self._features = features
 
     def describe(self, grey: Bytes, /) -> Keypoints:
         """Extract the picture's ORB features; see ``Matcher``."""
         import cv2
 
         height, width = grey.shape
-        scale = min(1.0, self.settings.side_px / max(width, height))
+        scale = min(1.0, _SIDE_PX / max(width, height))
         if scale < 1.0:
             size = (max(round(width * scale), 1), max(round(height * scale), 1))
             grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
         if min(grey.shape) < _MIN_SIDE_PX:
             return Keypoints(width, height, *_nothing())
-        orb_features = cv2.ORB.create(nfeatures=self.settings.features)
+        orb_features = cv2.ORB.create(nfeatures=self._features)
         points, descriptors = orb_features.detectAndCompute(grey, None)
         if descriptors is None or not len(points):
             return Keypoints(width, height, *_nothing())
@@ -90,11 +78,7 @@ class OrbMatcher:
         import cv2
 
         found = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(seen.descriptors, known.descriptors, k=2)
-        good = [
-            first
-            for first, second in found
-            if first.distance < self.settings.ratio * second.distance
-        ]
+        good = [first for first, second in found if first.distance < _RATIO * second.distance]
         # If several points have the same neighbour, only the nearest is kept.
         best: dict[int, tuple[float, int]] = {}
         for one in good:
@@ -110,7 +94,7 @@ class OrbMatcher:
         params.randomGeneratorState = 5
         params.confidence = 0.999
         params.maxIterations = 2000
-        params.threshold = self.settings.tolerance_px
+        params.threshold = _TOLERANCE_PX
         try:
             _, mask = cv2.findHomography(here, there, params)
         except cv2.error:
@@ -125,4 +109,4 @@ def _nothing() -> tuple[NDArray[np.float32], Bytes]:
 
 def orb(camera: CameraGeometry) -> OrbMatcher:
     """Build a matcher of ORB features; it needs nothing of the camera."""
-    return OrbMatcher(OrbSettings())
+    return OrbMatcher()

@@ -6,10 +6,10 @@ time between images exactly, modulo 256 ms. The log records approximately when e
     log time = image time + latency,    image time = counter + 256 ms * k + (device - log offset).
 
 **Limits.** The device's clock has no known relation to the log's, so the latency is known only up
-to a constant. The fastest frame has the latency ``min_latency_ns`` (0 unless it is known), and the
-others have their additional delay. The latency is also known only modulo 256 ms: a frame that the
-host delayed by at least 240 ms more than the fastest frame has an image time that is 256 ms late. A
-notice reports this where it is visible (the next image would be earlier), or if a counter restarts.
+to a constant. The fastest frame is taken to have none, and the others have their additional delay.
+The latency is also known only modulo 256 ms: a frame that the host delayed by at least 240 ms more
+than the fastest frame has an image time that is 256 ms late. A notice reports this where it is
+visible (the next image would be earlier), or if a counter restarts.
 
 The offset follows the fastest frames: downwards as fast as the order of images allows, and upwards
 by at most the drift of a crystal.
@@ -47,9 +47,7 @@ OUT_OF_ORDER: Final = (
 class CounterClock:
     """Times at which images were grabbed, however the frames are divided into pieces."""
 
-    def __init__(self, min_latency_ns: int = 0) -> None:
-        """Start with the latency of the fastest frame."""
-        self._min_ns = min_latency_ns
+    def __init__(self) -> None:
         self._offset_ns = 0
         self._frames = 0
         self._log_ns = 0
@@ -64,7 +62,7 @@ class CounterClock:
         They are never after the frame's log time, and never decrease unless the log times do.
         """
         pairs = zip(counter_ms.tolist(), log_ns.tolist(), strict=True)
-        return np.array([self._next(c * MS, t) for c, t in pairs], dtype=np.int64) - self._min_ns
+        return np.array([self._next(c * MS, t) for c, t in pairs], dtype=np.int64)
 
     @property
     def notices(self) -> tuple[str, ...]:

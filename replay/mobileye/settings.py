@@ -28,8 +28,6 @@ class MobileyeSettings:
             lane to its second half. It must be below the shortest time between two images.
         repeat_within_ns: Max time between two equal status frames of which the second is a
             repetition, not a new image.
-        min_latency_ns: Latency of the fastest frame from image to log, which cannot be determined
-            from the log alone.
         is_shared_bus: True if another decoder reads the same bus and accounts for frames of other
             devices.
         ros_lane_sign: Positive direction of lanes in ROS messages; ``auto`` determines it from the
@@ -42,7 +40,6 @@ class MobileyeSettings:
     mounting: DevicePosition | None = None
     within_ns: int = 50_000_000
     repeat_within_ns: int = 20_000_000
-    min_latency_ns: int = 0
     is_shared_bus: bool = False
     ros_lane_sign: LaneSign = "auto"
 

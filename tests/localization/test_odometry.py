@@ -92,16 +92,6 @@ def test_steering_of_a_car_that_understeers_yields_its_circle_at_any_speed() -> 
         assert made.turn_rad.sum() == pytest.approx(2.0 * speed / 100.0)
 
 
-def test_reverse_flag_negates_wheel_speeds() -> None:
-    forward = on_circle(10.0, 2.0, 51)
-    flagged = WheelSamples(forward.t_ns, forward.wheels_mps, np.ones(51, np.bool_))
-    signed = WheelSamples(forward.t_ns, -forward.wheels_mps)
-
-    ours, theirs = integrate(flagged, CAR).increments, integrate(signed, CAR).increments
-    np.testing.assert_array_equal(ours.distance_m, theirs.distance_m)
-    np.testing.assert_array_equal(ours.turn_rad, theirs.turn_rad)
-
-
 def test_gyro_is_integrated_between_wheel_rows() -> None:
     """A pulse of the yaw rate between two wheel rows counts towards the turn."""
     pulse = np.zeros(11)

@@ -218,7 +218,7 @@ class MobileyeDecoder:
         self._ledger = ledger
         self._settings = settings
         self._admit = Admission(bus, ledger, settings)
-        self._clock = CounterClock(settings.min_latency_ns)
+        self._clock = CounterClock()
         self._family = FamilyEvidence(bus, settings.family)
         self._statuses = Statuses(bus, ledger, settings, self._clock)
         self._open = no_parts()

@@ -131,7 +131,7 @@ class RosMobileye:
         topics = {name: topic for topic, name in self._types.items()}
         self._bursts = RosBursts(topics.get("ObstacleData", ""), ledger, settings)
         self._bursts.has_status = "ObstacleStatus" in topics
-        self._clock = CounterClock(settings.min_latency_ns)
+        self._clock = CounterClock()
         self._votes = {name: LaneSignVotes(label, settings.ros_lane_sign) for name, label in _SIDED}
         self._waiting: dict[str, list[Block]] = {name: [] for name, _ in _SIDED}
         self._mounting = device_mounting(settings, bus, ledger)

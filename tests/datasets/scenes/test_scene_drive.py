@@ -17,7 +17,7 @@ from crosscue.datasets.scenes.drive import (
     SceneFiles,
     write_scene,
 )
-from crosscue.datasets.scenes.mobileye import SETTINGS, DeviceFaults
+from crosscue.datasets.scenes.mobileye import HALF_VIEW_RAD, SETTINGS
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.datasets.truth.truth import read_truth
@@ -155,7 +155,7 @@ def test_mobileye_obstacles_match_true_vehicles(files: SceneFiles) -> None:
         ):
             middle_m = x_m + long_m / 2
             # The field of view refers to the vehicle's centre, the position to its near end.
-            assert abs(np.arctan2(y_m, middle_m - 3.75)) < DeviceFaults().half_view_rad + 0.15
+            assert abs(np.arctan2(y_m, middle_m - 3.75)) < HALF_VIEW_RAD + 0.15
             true_m = cars[int(grabbed[np.argmin(np.abs(grabbed - t_ns))])].get(number - 1)
             # Vehicles with too few pixels at this picture size have no annotation.
             if true_m is not None:

@@ -17,7 +17,7 @@ from crosscue.localization.landmarks.database import (
 )
 from crosscue.localization.landmarks.features import CameraGeometry, make_matcher
 from crosscue.localization.landmarks.images import grey_of, read_encoded
-from crosscue.localization.landmarks.matcher import OrbMatcher, OrbSettings
+from crosscue.localization.landmarks.matcher import OrbMatcher
 from crosscue.localization.landmarks.update import LandmarkSettings
 from crosscue.localization.odometry import OdometrySettings, integrate
 from crosscue.localization.pose_track import (
@@ -231,7 +231,7 @@ def test_landmark_relocates_a_lost_car(tmp_path: Path) -> None:
 
 
 CAMERA = CameraGeometry(500.0)
-ORB = OrbMatcher(OrbSettings())
+ORB = OrbMatcher()
 
 
 def test_wall_matches_itself_and_no_other_wall() -> None:
