@@ -146,7 +146,7 @@ if __name__ == "__main__":
     # Tests started in the background of a shell ignore this signal.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     args = argparse.Namespace(verbose=False, quiet=True, json=False)
-    sys.exit(_guarded(run, args, argparse.ArgumentParser()))
+    sys.exit(_guarded(run, args, argparse.ArgumentParser(), []))
 """
 
 
