@@ -3,7 +3,8 @@
 Run it as ``python -m benchmarks.camera_steps``. The pictures of real drives on straight road
 (``$CROSSCUE_DATA`` or ``../shared/data``) and of simulated approaches are warped from a moment on
 as by a camera that turns by half a degree. Pictures later than ten seconds after the step are left
-out. No signal of the car is used.
+out. Where the speed is known, pictures of a car that brakes or accelerates do not count, as in
+``crosscue check``.
 """
 
 from __future__ import annotations
@@ -21,10 +22,17 @@ import numpy as np
 import crosscue
 from benchmarks.real_roads import DATA, DRIVES
 from crosscue.datasets.simulate import Approaches, simulate_approaches
-from crosscue.eval.vehicle.picture_pass import Follower, reduced
-from crosscue.localization.camera_watch import MIN_MEASURED, MountingStep, steps_of
+from crosscue.eval.quality.drive import QualityDrive
+from crosscue.eval.vehicle.check import read_samples
+from crosscue.eval.vehicle.mounting import watch_mounting
+from crosscue.eval.vehicle.picture_pass import Follower, PicturePass, reduced
+from crosscue.localization.camera_watch import MIN_MEASURED, MountingStep
+from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Bytes
+from crosscue.replay.signals.kinds import Signal
+from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.camera import Camera
+from crosscue.replay.vehicle.drafting.series import Series
 from crosscue.replay.vehicle.vehicle import load, parse
 
 REAL: Final = ("kitti_t_junction", "pandaset_002")
@@ -41,6 +49,7 @@ class Drive(NamedTuple):
     name: str
     camera: Camera
     pictures: Sequence[tuple[int, Bytes]]
+    speed: Series | None = None
 
 
 def real(name: str) -> Drive:
@@ -55,15 +64,19 @@ def real(name: str) -> Drive:
 
 def simulated(folder: Path) -> Iterator[Drive]:
     """Simulate one approach to each intersection."""
-    simulate_approaches(Approaches(SIMULATED, width_px=640), folder)
+    simulate_approaches(Approaches(SIMULATED, width_px=960), folder)
     for place in sorted(folder.iterdir()):
+        vehicle = load(place / "vehicle.toml")
         with crosscue.open(place / "drive.mcap") as log:
             topic = next(one for one in log.topics if "image" in one)
             pictures = [
                 (frame.t_ns, np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8))
                 for frame in log[topic].frames()
             ]
-        yield Drive(f"simulated {place.name}", load(place / "vehicle.toml").camera, pictures)
+            planned = plan([(0, topic) for topic in log.logs[0].topics], vehicle)
+            samples = read_samples(log.logs, vehicle, planned, EVERYTHING)
+        speed = QualityDrive(vehicle, (), samples, planned).series(Signal.WHEEL_SPEEDS)
+        yield Drive(f"simulated {place.name}", vehicle.camera, pictures, speed)
 
 
 def turned(grey: Bytes, camera: Camera, axis: str, by_deg: float) -> Bytes:
@@ -89,7 +102,7 @@ def watched(
     drive: Drive, axis: str = "", by_deg: float = 0.0, at_ns: int = 0
 ) -> tuple[list[MountingStep], list[int]]:
     """Return the steps that are found, and the times of the directions of travel."""
-    follower = None
+    follower, followed = None, []
     for t_ns, grey in drive.pictures:
         if axis and t_ns > at_ns + WITHIN_S * 1e9:
             break
@@ -97,12 +110,16 @@ def watched(
         small = reduced(moved)
         size_px = (grey.shape[1], grey.shape[0])
         follower = follower or Follower(drive.camera, size_px, small)
-        follower.follow(t_ns, small)
+        step = follower.follow(t_ns, small)
+        followed += [] if step is None else [step]
     assert follower is not None
-    travel_ns = np.array(follower.travel_ns, np.int64)
-    pitch = np.array([one.below_rad for one in follower.travel])
-    yaw = np.array([one.left_rad for one in follower.travel])
-    steps = [*steps_of("pitch", travel_ns, pitch), *steps_of("yaw", travel_ns, yaw)]
+    nothing = np.empty(0)
+    seen = PicturePass(
+        nothing.astype(np.int64), nothing, nothing, nothing.astype(np.int64), None,
+        follower.camera, follower.scale, tuple(followed), nothing,
+        np.array(follower.travel_ns, np.int64), tuple(follower.travel),
+    )  # fmt: skip
+    steps = [one for one in watch_mounting(seen, drive.speed).steps if one.value != "height"]
     return steps, follower.travel_ns
 
 
