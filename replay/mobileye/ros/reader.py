@@ -79,7 +79,7 @@ class LaneSignVotes:
         if 2 * against > total:
             return [
                 f"{self._label} are read as positive to the {side}, but most of them are then on "
-                "the wrong side; check ros_lane_sign"
+                "the wrong side; their sign may change within the log: replay its parts alone"
             ]
         if self._was_set or not self.is_left_positive:
             return []
