@@ -614,8 +614,9 @@ def _views(messages: Messages) -> pa.Array:
     views[:, 0] = length
     views[:, 3] = np.where(length > 12, messages.start, 0)
     inline = views.view(np.uint8)[:, 4:]
+    short = np.flatnonzero(length <= 12)
     for k in range(12):
-        has = np.flatnonzero((length > k) & ((length <= 12) | (k < 4)))
+        has = np.flatnonzero(length > k) if k < 4 else short[length[short] > k]
         inline[has, k] = messages.buffer[messages.start[has] + k]
     buffers = [None, pa.py_buffer(views), pa.py_buffer(messages.buffer)]
     return pa.Array.from_buffers(pa.binary_view(), len(messages), buffers)
