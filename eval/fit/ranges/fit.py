@@ -29,6 +29,7 @@ from crosscue.replay.files import door
 from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.limits import MIB
+from crosscue.replay.safe_text import counted
 from crosscue.results import HIDDEN
 from crosscue.verb import Option, keywords
 
@@ -123,8 +124,8 @@ class FittedRanges(Fitted):
 
 
 def _pairs_text(fit: RangeFit) -> str:
-    left_out = f" ({fit.outliers} outliers left out)" if fit.outliers else ""
-    return f"{fit.pairs} pairs{left_out}"
+    left_out = f" ({counted(fit.outliers, 'outlier')} left out)" if fit.outliers else ""
+    return f"{counted(fit.pairs, 'pair')}{left_out}"
 
 
 def _bins(bins: tuple[Bin, ...]) -> list[str]:
