@@ -20,6 +20,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.moments import frame_times
 from crosscue.replay.columns import ColumnSet, Floats, Int64s
 from crosscue.replay.errors import AnnotationError
+from crosscue.replay.vehicle.cue_table import CUES
 
 from .columns import NONE
 from .places import places_of
@@ -263,6 +264,8 @@ def true_marks(truth: Path, run: RunFolder, wanted: Collection[int]) -> Mapping[
     log_ns = np.array([*times], np.int64)
     counts: dict[int, dict[str, int]] = {}
     for cue in dict.fromkeys(one.cue for one in found.cues):
+        if cue in CUES and CUES[cue].observed_by == "map":
+            continue  # its legs are those of the road cues, and no picture shows a map
         at = cue_at([one for one in found.cues if one.cue == cue], log_ns)
         for row in np.flatnonzero(at.present == 1).tolist():
             number = max(int(at.count[row]), 1)

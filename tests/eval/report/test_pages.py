@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import crosscue
-from crosscue.datasets.truth.truth import read_truth, save
+from crosscue.datasets.truth.truth import CueTruth, read_truth, save
 from crosscue.detectors.images import Encoded
 from crosscue.detectors.overlay import NOTHING_TRUE, TrueMarks, draw_frame
 from crosscue.eval import cli
@@ -20,6 +20,7 @@ from crosscue.eval.report.frame_pictures import draw_pictures
 from crosscue.eval.report.html import page_style, template_text
 from crosscue.eval.report.page import write_report_without_truth
 from crosscue.eval.runs.folder import open_run
+from crosscue.eval.scoring.truth import true_marks
 from crosscue.replay import colours
 from crosscue.replay.files.tree_text import strict_json
 from support.scene_run import SIZE, scene_run
@@ -83,6 +84,17 @@ def test_truth_and_detections_have_two_colours_with_one_meaning(tmp_path: Path) 
     assert "blue what was found or estimated, green the truth" in COLOURS[0]
     meanings = [colours.TRUTH, colours.FOUND, colours.WRONG, *colours.FEATURES.values()]
     assert len(set(meanings)) == len(meanings)
+
+
+def test_truth_on_a_picture_names_no_cue_of_a_map(tmp_path: Path) -> None:
+    run, truth = scene_run(tmp_path / "run"), truth_folder(tmp_path / "truth")
+    there = {"road_left": 1, "map_left": 1}
+    cues = [
+        CueTruth(start_ns=at(0), end_ns=at(40), cue=cue, present=True, count=count)
+        for cue, count in there.items()
+    ]
+    save(read_truth(truth).model_copy(update={"cues": tuple(cues)}), truth.parent)
+    assert true_marks(truth, run, [at(21)])[at(21)].counts == {"road_left": 1}
 
 
 def _commands(page: Path) -> list[list[str]]:
