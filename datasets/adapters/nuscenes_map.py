@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from crosscue.datasets.truth.lanes import Lane, cross, lane_graph
+from crosscue.datasets.truth.lanes import MAX_POINTS, Lane, cross, lane_graph, step_count
 from crosscue.datasets.truth.road_map import Control, RoadMap
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogFormatError
@@ -51,7 +51,7 @@ def read_expansion(path: Path) -> RoadMap:
         return lane_graph(lanes, dict(_controls(tree, areas, lanes)))
     except OSError as error:
         raise LogFormatError(f"{path}: {error.strerror}; expected a map expansion") from None
-    except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         why = f"{type(error).__name__} {str(error)[:80]!r}"
         raise LogFormatError(f"{path}: {why}: not a map expansion of nuScenes, 1.3") from None
 
@@ -73,8 +73,15 @@ def _lanes(tree: Mapping[str, Any]) -> dict[str, Lane]:
         return last(before) if before and token not in plain else f"{token}<"
 
     found = {}
+    points = 0
     for token in sorted(all_lanes & tree["arcline_path_3"].keys()):
-        middle = np.concatenate([_line(piece) for piece in tree["arcline_path_3"][token]])
+        pieces = []
+        for piece in tree["arcline_path_3"][token]:
+            pieces.append(_line(piece))
+            points += len(pieces[-1])
+            if points > MAX_POINTS:
+                raise ValueError(f"lanes of over {MAX_POINTS * STEP_M / 1e3:.0f} km")
+        middle = np.concatenate(pieces)
         middle = middle[np.r_[True, np.hypot(*np.diff(middle, axis=0).T) > 0.01]]
         if len(middle) > 1:
             found[token] = Lane((first(token), last(token)), middle, LANE_M)
@@ -86,9 +93,11 @@ def _line(piece: Mapping[str, Any]) -> Floats:
     x, y, yaw = (float(one) for one in piece["start_pose"])
     points = [(x, y)]
     for letter, length in zip(piece["shape"], piece["segment_length"], strict=True):
-        count = max(int(float(length) / STEP_M), 1)
+        count = step_count(float(length), STEP_M)
         turn = {"L": 1.0, "S": 0.0, "R": -1.0}[letter] / float(piece["radius"])
         step_m, turn_rad = float(length) / count, turn * float(length) / count
+        if not np.isfinite([x, y, yaw, step_m, turn_rad]).all():
+            raise ValueError("a lane without an end")
         for _ in range(count):
             chord_m = step_m * np.sinc(turn_rad / (2.0 * np.pi))
             x += chord_m * np.cos(yaw + 0.5 * turn_rad)

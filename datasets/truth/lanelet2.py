@@ -22,7 +22,7 @@ from crosscue.replay.columns import Floats
 from crosscue.replay.errors import AnnotationError
 
 from .label_xml import parse_xml
-from .lanes import Lane, lane_graph
+from .lanes import MAX_POINTS, Lane, lane_graph, step_count
 from .openstreetmap import MAX_BYTES, MapExtract, MapReader
 from .road_map import Control, RoadMap
 
@@ -31,6 +31,7 @@ CARS: Final = ("participant:vehicle", "participant:vehicle:car", "participant:ca
 # Subtypes of a stop sign: Lanelet2's country and number, and Autoware's name.
 STOP_SIGNS: Final = ("de206", "usR1-1", "stop_sign")
 STEP_M: Final = 4.0
+MAX_HEIGHT_M: Final = 1e5
 
 
 class _Lanelet(NamedTuple):
@@ -46,11 +47,13 @@ class LaneMap:
     """Contents of a Lanelet2 map.
 
     Attributes:
+        where: Name of the file.
         points: Latitude, longitude, degrees, and height of each point.
         lanelets: Lanelets for cars.
         controls: Control by regulatory element and lanelet; by element alone, for each lanelet.
     """
 
+    where: str
     points: Mapping[str, tuple[float, float, float]]
     lanelets: Sequence[_Lanelet]
     controls: Mapping[tuple[str, str], Control]
@@ -60,12 +63,24 @@ class LaneMap:
 
         Args:
             origin: Latitude and longitude, degrees, and height of the frame's origin.
+
+        Raises:
+            AnnotationError: The lanes are too long together.
         """
         used = sorted({at for one in self.lanelets for at in (*one.left, *one.right)})
         lat, lon, height_m = np.array([self.points[at] for at in used]).T
         flat_m = geodetic_to_enu(lat, lon, np.full(len(used), origin[2]), origin)[:, :2]
         xyz_m = dict(zip(used, np.column_stack([flat_m, height_m]), strict=True))
-        lanes = {one.key: _lane(one, xyz_m) for one in self.lanelets}
+        lanes: dict[str, Lane] = {}
+        points = 0
+        for one in self.lanelets:
+            lanes[one.key] = _lane(one, xyz_m)
+            points += len(lanes[one.key].middle_m)
+            if points > MAX_POINTS:
+                raise AnnotationError(
+                    f"{self.where}: lanes of over {MAX_POINTS * STEP_M / 1e3:.0f} km; "
+                    "cut the map to the drive"
+                )
         two_way = {one.key for one in self.lanelets if one.tags.get("one_way") in ("no", "false")}
         turns = {one.key for one in self.lanelets if "turn_direction" in one.tags}
         return lane_graph(lanes, self._controls(lanes), two_way=two_way, turns=turns)
@@ -97,7 +112,7 @@ def _lane(lanelet: _Lanelet, xyz_m: Mapping[str, Floats]) -> Lane:
         # The bounds are drawn against the lane's direction, in which left is on the left.
         left, right, names = left[::-1], right[::-1], [name[::-1] for name in names]
     length_m = max(np.linalg.norm(np.diff(one, axis=0), axis=1).sum() for one in (left, right))
-    count = max(int(length_m / STEP_M), 1) + 1
+    count = step_count(float(length_m), STEP_M) + 1
     left, right = _resampled(left, count), _resampled(right, count)
     middle = 0.5 * (left + right)
     first, last = ("/".join(sorted((names[0][end], names[1][end]))) for end in (0, 1))
@@ -123,7 +138,7 @@ def read_map(path: Path) -> MapExtract | LaneMap:
     if reader.lanelets:
         heights = reader.heights_m
         points = {at: (*where, heights.get(at, 0.0)) for at, where in reader.points.items()}
-        return LaneMap(points, reader.lanelets, reader.stated())
+        return LaneMap(reader.where, points, reader.lanelets, reader.stated())
     return reader.extract()
 
 
@@ -149,11 +164,14 @@ class _Reader(MapReader):
         kind = tags.get("type")
         if tag == "node" and "ele" in tags:
             try:
-                self.heights_m[self._key] = float(tags["ele"])
+                height_m = float(tags["ele"])
             except ValueError:
+                height_m = np.nan
+            if not abs(height_m) < MAX_HEIGHT_M:
                 raise AnnotationError(
                     f"{self.where}: node {self._key}: ele {tags['ele'][:40]!r}: expected metres"
-                ) from None
+                )
+            self.heights_m[self._key] = height_m
         elif tag == "way":
             # Points outside of an extract have no position.
             self._bounds[self._key] = [at for at in self._nodes if at in self.points]

@@ -17,6 +17,9 @@ from .road_map import SIDE_RAD, Control, Road, RoadMap
 TURN_M: Final = 50.0
 # Lanes that cross at another height do not meet.
 BRIDGE_M: Final = 3.0
+# Most steps along a piece of a lane, whatever length a file states, and most points of a map.
+MAX_STEPS: Final = 500
+MAX_POINTS: Final = 1_000_000
 
 
 class Lane(NamedTuple):
@@ -74,6 +77,11 @@ def lane_graph(
         for some in (*inside, *_crossings(linked))
     ]
     return RoadMap(points_m, list(roads.values()), controls, met, min_leg_m=0.0)
+
+
+def step_count(length_m: float, step_m: float) -> int:
+    """Return how many steps of ``step_m``, or of more if it is long, a piece of a lane has."""
+    return int(min(max(length_m / step_m, 1.0), MAX_STEPS))
 
 
 def _nodes(roads: Mapping[tuple[str, str], Road], a: str, b: str) -> tuple[str, ...]:

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from crosscue.datasets.truth.lanelet2 import read_map
+from crosscue.datasets.truth.lanes import MAX_STEPS
 from crosscue.datasets.truth.road_map import Ahead, RoadMap
+from crosscue.replay.errors import AnnotationError
 from support.street_map import (
     LANE_M,
     MIDDLE,
@@ -168,3 +170,26 @@ def test_a_crossing_for_people_is_no_intersection(tmp_path: Path, tags: str) -> 
     roads = _around(write_lanelets(tmp_path / "a.osm", lanelets))
 
     assert _ahead(roads, -10.0) is None
+
+
+@pytest.mark.parametrize("height", ["nan", "inf", "1e300", "high"])
+def test_height_that_is_none_is_refused_in_one_line(tmp_path: Path, height: str) -> None:
+    path = write_lanelets(tmp_path / "a.osm", crossing_lanes())
+    path.write_text(path.read_text().replace("v='0.0'", f"v='{height}'"))
+    with pytest.raises(AnnotationError, match=r"a.osm: node \d+: ele .*expected metres"):
+        read_map(path)
+
+
+def test_a_lane_around_the_earth_takes_no_more_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far = {"far": (*straight_lane((0.0, 0.0), (5e6, 0.0)), "")}
+    path = write_lanelets(tmp_path / "a.osm", far)
+    (road,) = _around(path).roads
+    assert len(road.nodes) == MAX_STEPS + 1
+
+    monkeypatch.setattr("crosscue.datasets.truth.lanelet2.MAX_POINTS", 100)
+    with pytest.raises(
+        AnnotationError, match=r"a.osm: lanes of over .* km; cut the map to the drive"
+    ):
+        _around(path)

@@ -10,6 +10,7 @@ import crosscue
 from crosscue.datasets.adapters.nuscenes_map import read_expansion
 from crosscue.datasets.adapters.nuscenes_truth import write_nuscenes_truth
 from crosscue.datasets.truth.coco import read_coco
+from crosscue.datasets.truth.lanes import MAX_STEPS
 from crosscue.datasets.truth.truth import read_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
 from crosscue.replay.columns import Floats, Table
@@ -145,6 +146,35 @@ def test_unusable_map_expansion_is_refused_in_one_line(tmp_path: Path, text: str
         crosscue.write_truth(drive, tmp_path / "truth")
 
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"radius": 0.0}, {"segment_length": [1e999, 1.0, 1.0]}, {"start_pose": [1e999, 0.0, 0.0]}],
+)
+def test_lane_without_end_is_refused_in_one_line(tmp_path: Path, wrong: dict[str, object]) -> None:
+    place = write_expansion(nuscenes_drive(tmp_path / "root"))
+    tree = json.loads(place.read_text())
+    tree["arcline_path_3"]["w-n"][0] |= wrong
+    place.write_text(json.dumps(tree).replace("Infinity", "1e999"))
+
+    with pytest.raises(LogFormatError, match="not a map expansion"):
+        read_expansion(place)
+
+
+def test_stated_lengths_do_not_decide_on_the_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = write_expansion(nuscenes_drive(tmp_path / "root"))
+    tree = json.loads(place.read_text())
+    tree["arcline_path_3"]["w-n"][0]["segment_length"] = [1e15, 1e15, 1e15]
+    place.write_text(json.dumps(tree))
+    roads = read_expansion(place)
+    assert max(len(one.nodes) for one in roads.roads) < 4 * MAX_STEPS
+
+    monkeypatch.setattr("crosscue.datasets.adapters.nuscenes_map.MAX_POINTS", 100)
+    with pytest.raises(LogFormatError, match="lanes of over"):
+        read_expansion(place)
 
 
 def test_box_matches_pinhole_projection(tmp_path: Path) -> None:
