@@ -288,7 +288,7 @@ class RoadMap:
         They are where the side roads, and lanes inside of it that cross, meet the way straight on.
 
         Returns:
-            Near and far kerb; None if there is no side road.
+            Near and far kerb; None if no side road meets that way.
         """
         if (before, at) not in self._kerbs:
             heading = self._heading_rad(before, at)
@@ -307,7 +307,8 @@ class RoadMap:
             spans = self._spans(at, heading, [*sides, *inside])
             # All side roads are far off the way straight on, and their lanes end beside it.
             spans = spans or self._spans(at, heading, [(*one[:3], -np.inf, 0.0) for one in sides])
-            near_far = (min(a for a, _ in spans), max(b for _, b in spans)) if sides else None
+            is_met = sides and spans
+            near_far = (min(a for a, _ in spans), max(b for _, b in spans)) if is_met else None
             self._kerbs[before, at] = near_far
         return self._kerbs[before, at]
 

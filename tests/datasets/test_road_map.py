@@ -137,6 +137,19 @@ def test_roundabout_begins_at_its_ring_and_ends_behind_it(tmp_path: Path) -> Non
     assert _sides(road_map, ahead) == {"left", "right", "straight", "back"}
 
 
+def test_a_side_road_that_begins_beyond_the_way_ends_in_no_traceback(tmp_path: Path) -> None:
+    points = {
+        "w": (0.0, 0.0), "p": (60.0, 0.0), "e": (130.0, 0.0),
+        "q": (70.0, -4.0), "n": (70.0, 70.0), "f": (130.0, -30.0),
+    }  # fmt: skip
+    roads = [("wpe", ""), ("pq", ""), ("qn", ""), ("qf", "")]
+    road_map = read_map(write_map(tmp_path / "a.osm", points, roads)).around((*ORIGIN, 0.0))
+
+    ahead = [_ahead(road_map, x, y_m=0.0) for x in (10.0, 40.0, 55.0)]
+
+    assert all(one is None or one.start_m < one.end_m for one in ahead)
+
+
 def test_off_the_roads_there_is_nothing_ahead(tmp_path: Path) -> None:
     roads = _map(tmp_path / "a.osm", STREETS)
 
