@@ -99,7 +99,6 @@ PARTS: Final = {
                 "road",
                 "road_area",
                 "road_by_hand",
-                "road_ground",
                 "road_openings_by_hand",
                 "same_object",
                 "trackers",
@@ -108,7 +107,6 @@ PARTS: Final = {
         (
             "tests/detectors/cues/test_past.py::test_bus_samples_do_not_depend_on_block_boundaries",
             "tests/detectors/cues/test_looked_for.py::test_built_in_detectors_list_their_labels",
-            "tests/detectors/cues/test_road_ground.py::test_wide_ego_road_has_no_side_fraction",
         ),
     ),
     "tracked": Part(

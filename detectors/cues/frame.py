@@ -36,7 +36,6 @@ from .cars import CarCandidates, CarShapes, Pairs, car_shapes, no_pairs, pair_ca
 from .labelled import count_own
 from .observed import NOT_SEEN, FrameCues, FrameDetections, Place, RoadFractions
 from .road import road_fractions
-from .road_ground import ground_fractions
 from .rules import counts_of
 
 
@@ -88,7 +87,7 @@ class CuePass:
             signs = counts_of("signs", frame.boxes, self.vehicle)
             for name, own in self.vehicle.cues.own.items():
                 signs[name] = count_own(frame.boxes, name, own)
-        fractions = self._road(frame.road, place)
+        fractions = self._road(frame.road)
         road = {} if fractions is None else counts_of("road", fractions, self.vehicle)
         found = self._reportable(objects | cars | signs | road, frame.labels)
         counts = {cue: one.number for cue, one in found.items() if one.number is not None}
@@ -112,19 +111,14 @@ class CuePass:
             if not wanted[cue] or not labels.isdisjoint(wanted[cue])
         }
 
-    def _road(
-        self, road: RoadMask | RoadFractions | None, place: Place | None
-    ) -> RoadFractions | None:
+    def _road(self, road: RoadMask | RoadFractions | None) -> RoadFractions | None:
         """Return the fractions of road by region."""
         if not isinstance(road, RoadMask):
             return road
-        regions = self.vehicle.regions
-        if regions.kind == "area":
+        if self.vehicle.regions.kind == "area":
             # Known only from many frames together; the stage that has them passes fractions.
             return NOT_SEEN
-        if regions.kind == "ground":
-            return ground_fractions(road, self.vehicle.camera, regions, place)
-        return road_fractions(road, regions)
+        return road_fractions(road, self.vehicle.regions)
 
     def _take_doubles(self, boxes: Sequence[Detections], counts: Mapping[str, int]) -> None:
         """Account for objects that another detector found with a better score."""

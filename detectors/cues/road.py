@@ -50,6 +50,13 @@ def region_mask(polygon: Polygon, shape: tuple[int, int]) -> NDArray[np.bool_]:
     return inside
 
 
+def outlines(regions: Regions, size_px: tuple[int, int]) -> tuple[NDArray[np.float64], ...]:
+    """Corners of the left, straight and right region in a picture; none unless fixed in it."""
+    if regions.kind != "picture":
+        return ()
+    return tuple(np.array(one) * size_px for one in regions.polygons())
+
+
 def road_fractions(road: RoadMask, regions: Regions) -> RoadFractions:
     """Compute the fraction of road in each region (eq. 13); regions are scaled to the mask.
 

@@ -1,4 +1,4 @@
-"""Overlays anchored to the road: regions on the ground and the motion of cars.
+"""Overlays anchored to the road: its accumulated area, and the motion of cars.
 
 Both need odometry and the estimated place of the intersection. They are therefore computed again
 frame by frame, as in the scene stage.
@@ -12,10 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections, Place
-from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.cues.tracked.judge import along, crossing, is_past, parked
 from crosscue.detectors.cues.tracked.motion import CarMotion
 from crosscue.eval.pipeline.scene.road_picture import opening_lines, plan_lines
@@ -29,7 +27,7 @@ from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.colours import FEATURES, ROAD
 from crosscue.replay.vehicle.vehicle import Camera
 
-from .marks import CROSSING, PARKED, REGION, SIDES, Overlays
+from .marks import CROSSING, PARKED, Overlays
 
 ALONG: Final = (235, 235, 235)
 ARROW_S: Final = 1.0
@@ -40,7 +38,7 @@ NOSE: Final = 0.04
 
 @dataclass(slots=True)
 class Anchored:
-    """Tracking of cars and regions over the frames, drawn into the marks of the same frame.
+    """Tracking of cars and road over the frames, drawn into the marks of the same frame.
 
     Attributes:
         run: A run with odometry and ranges.
@@ -88,13 +86,6 @@ class Anchored:
         self.marks.add(frame, found.objects)
         if self._roads is not None:
             self._draw_roads(self._roads)
-        if vehicle.regions.kind == "ground" and isinstance(frame.road, RoadMask):
-            fractions = found.road
-            polygons = outlines(vehicle.camera, vehicle.regions, place, frame.size_px)
-            for side, corners in zip(SIDES, polygons, strict=True):
-                fraction = float("nan") if fractions is None else getattr(fractions, side)
-                if corners is not None:
-                    self._region(side, corners, fraction, frame.size_px)
         if vehicle.cars.kind == "tracks":
             for car in self._cues.followed():
                 self._car(car, frame.size_px, place)
@@ -105,14 +96,6 @@ class Anchored:
             self.marks.area.add(line, ROAD)
         for line, text in () if roads.seen is None else opening_lines(roads.seen):
             self.marks.openings.add(line, ROAD, text)
-
-    def _region(
-        self, side: str, corners: NDArray[np.float64], fraction: float, size_px: tuple[int, int]
-    ) -> None:
-        is_road = fraction > self.manifest.settings.cues.road_fraction
-        text = "not seen" if np.isnan(fraction) else f"{100.0 * fraction:.0f} %"
-        colour = ROAD if is_road else REGION
-        self.marks.region(corners, colour, f"{side} {text}", size_px)
 
     def _car(self, car: CarMotion, size_px: tuple[int, int], place: Place | None) -> None:
         cars, camera = self.manifest.settings.cars, self.manifest.settings.camera

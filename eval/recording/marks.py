@@ -25,7 +25,7 @@ from crosscue.detectors.cues.cars import (
     parked_cars,
 )
 from crosscue.detectors.cues.observed import FrameDetections, RoadFractions
-from crosscue.detectors.cues.road import road_fractions
+from crosscue.detectors.cues.road import outlines, road_fractions
 from crosscue.detectors.overlay import TrueMarks
 from crosscue.replay.colours import FOUND, QUIET, ROAD, TRUTH, Colour
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -203,8 +203,8 @@ class Overlays:
             road_fractions(road, self.vehicle.regions) if isinstance(road, RoadMask) else road
         )
         positive = fractions.positive(self.vehicle.cues.road_fraction)
-        for side, is_road in zip(SIDES, positive, strict=True):
-            corners = np.array(getattr(self.vehicle.regions, side)) * size_px
+        shown = outlines(self.vehicle.regions, size_px)
+        for side, is_road, corners in zip(SIDES, positive, shown, strict=True):
             colour = ROAD if is_road else REGION
             fraction = 100.0 * getattr(fractions, side)
             self.region(corners, colour, f"{side} {fraction:.0f} %", size_px)

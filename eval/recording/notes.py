@@ -14,8 +14,7 @@ from crosscue.replay.safe_text import visible
 COLOURS: Final = (
     "- everywhere: blue what was found or estimated, green the truth, orange 2 sigma, grey what is "
     "too uncertain to be a cue",
-    "- camera: road hatched in teal, regions of interest teal while they hold road (on the ground "
-    "only where a detector looks for road; grey ones hold none or are not seen); arrows: orange "
+    "- camera: road hatched in teal, regions of interest teal while they hold road; arrows: orange "
     "cars cross, violet ones are parked and point to their front, white ones go along the road, "
     "pink ones beyond the intersection; an arrow on the road is the way of one second, with the "
     "ego vehicle's own motion removed",

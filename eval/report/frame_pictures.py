@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -12,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors.base import Detections, Found
-from crosscue.detectors.cues.observed import FrameDetections, Place
-from crosscue.detectors.cues.road_ground import outlines
+from crosscue.detectors.cues.observed import FrameDetections
+from crosscue.detectors.cues.road import outlines
 from crosscue.detectors.images import Encoded
 from crosscue.detectors.overlay import NOTHING_TRUE, draw_frame
 from crosscue.eval.pipeline.scene.road_picture import plans_of
@@ -63,12 +62,11 @@ def draw_pictures(
         if camera is None:
             return "the run has no camera, or several"
         found, vehicle = _found(run, wanted), run.drive_manifest().settings
-        places, cues = _places(run, wanted), _cues(run, wanted)
-        plans = plans_of(run, wanted)
+        cues, plans = _cues(run, wanted), plans_of(run, wanted)
+        regions = partial(outlines, vehicle.regions)
         true = {} if truth is None else true_marks(truth, run, wanted)
 
         def on_picture(t_ns: int, picture: Encoded) -> None:
-            regions = partial(outlines, vehicle.camera, vehicle.regions, places.get(t_ns))
             frame = found.get(t_ns)
             results = () if frame is None else frame.found
             counts = cues.get(t_ns, {})
@@ -106,25 +104,6 @@ def _found(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, FrameDetectio
         return {}
     frames = stored_frames(run, manifest.detected, manifest.settings, with_road_masks=True)
     return {one.t_ns: one for one in frames if one.t_ns in wanted}
-
-
-def _places(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, Place]:
-    """Return the estimated place of the intersection by time, which fixes the ground regions."""
-    if not run.file("range.parquet").exists():
-        return {}
-    length_m = run.drive_manifest().settings.fusion.length_m
-    ends: dict[int, dict[str, float]] = {}
-    for row in run.table("range", ["t_ns", "reference", "range_m"]).to_pylist():
-        if row["t_ns"] in wanted and row["range_m"] is not None:
-            ends.setdefault(row["t_ns"], {})[row["reference"]] = row["range_m"]
-    return {
-        t_ns: Place(
-            known.get("start", known.get("end", math.nan) - length_m),
-            known.get("end", known.get("start", math.nan) + length_m),
-            0.0,
-        )
-        for t_ns, known in ends.items()
-    }
 
 
 def _cues(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, dict[str, int]]:

@@ -27,7 +27,7 @@ from .account import Account, SummedAccount
 from .candidates import CandidateRow
 from .record import Record
 
-FORMAT_VERSION: Final = 7
+FORMAT_VERSION: Final = 8
 # Max characters of a printed field.
 LINE: Final = 100
 # Notice of a run whose poses are in its own frame, rotated against any other.
@@ -214,7 +214,7 @@ class SceneSummary(Record):
 
 
 class _Versioned(Record):
-    format_version: Literal[7] = FORMAT_VERSION
+    format_version: Literal[8] = FORMAT_VERSION
     versions: dict[str, str]
     """Versions of crosscue, Python and the libraries that results depend on."""
     settings: Settings
@@ -320,7 +320,7 @@ class MergedDrive(Record):
 class MergedManifest(Record):
     """Many drives as one folder of tables."""
 
-    format_version: Literal[7] = FORMAT_VERSION
+    format_version: Literal[8] = FORMAT_VERSION
     stage: Literal["merged"] = "merged"
     tables: tuple[str, ...]
     drives: tuple[MergedDrive, ...]

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.cues.observed import Place
-from crosscue.detectors.cues.road_ground import outlines
+from crosscue.detectors.cues.road import outlines
 from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.eval.logs.log import Log, UnopenedLog, opened
 from crosscue.eval.report.html import write_page
@@ -31,8 +30,6 @@ AHEAD_M: Final = (5, 10, 15, 20, 30, 50, 80)
 ASIDE_M: Final = (-15, -10, -5, 0, 5, 10, 15)
 # Distance ahead of the camera at which the grid begins.
 NEAREST_M: Final = 0.5
-# Assumed intersection for which regions are drawn.
-ASSUMED: Final = Place(30.0, 50.0, 0.0)
 YELLOW, WHITE, GREEN, BLACK = (0, 230, 255), (255, 255, 255), (80, 230, 80), (0, 0, 0)
 
 
@@ -62,10 +59,8 @@ def draw_ground(pixels: NDArray[np.uint8], vehicle: Vehicle) -> NDArray[np.uint8
             x, below = points[0].tolist()
             if text and below < size_px[1]:
                 _write(canvas, text, (x + 4.0, below - 4.0), WHITE, scale)
-    regions = outlines(camera, vehicle.regions, ASSUMED, size_px)
-    for name, polygon in zip(("left", "straight", "right"), regions, strict=True):
-        if polygon is None:
-            continue
+    regions = outlines(vehicle.regions, size_px)
+    for name, polygon in zip(("left", "straight", "right"), regions, strict=False):
         _line(canvas, np.vstack([polygon, polygon[:1]]), GREEN, scale)
         middle = polygon.mean(axis=0)
         _write(canvas, name, (float(middle[0]), float(middle[1])), GREEN, scale)
@@ -193,12 +188,7 @@ def _in_words(vehicle: Vehicle) -> str:
     )
     if vehicle.regions.kind == "picture":
         return f"{grid} Green: the regions in which road is detected."
-    if vehicle.regions.kind == "area":
-        return grid
-    return (
-        f"{grid} Green: the regions in which road would be detected if an intersection began "
-        f"{ASSUMED.start_m:g} m ahead and ended at {ASSUMED.end_m:g} m."
-    )
+    return grid
 
 
 HEAD = ("signal", "read from", "readings", "rate_hz", "lowest", "highest", "unit")

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
 
 from crosscue.replay.errors import VehicleError
@@ -164,40 +164,21 @@ class Compass(Section):
 
 
 class Regions(Section):
-    """Regions in which road is searched (eq. 13): in the image, as published, or on the ground."""
+    """Where road is searched: in regions of the image (eq. 13), as published, or on the ground."""
 
-    kind: Literal["picture", "ground", "area"] | None = None
-    """``picture``: the polygons below. ``ground``: rectangles on the road, anchored to the
-    estimated intersection; needs a range. ``area``: road accumulated on the ground along the path,
-    whose openings are roads and give ranges themselves. The last two need ``camera.focal_px`` and
-    ``z_m``. Default: ``area``, but ``picture`` in a simulated vehicle's file and where a polygon is
-    specified."""
+    kind: Literal["picture", "area"] | None = None
+    """``picture``: the polygons below. ``area``: road accumulated on the ground along the path,
+    whose openings are roads and give ranges themselves; needs ``camera.focal_px`` and ``z_m``,
+    without which the shape of the mask tells roads, but no range. Default: ``area``, but
+    ``picture`` in a simulated vehicle's file and where a polygon is specified."""
     left: Polygon = ((0.0, 0.55), (0.2, 0.55), (0.2, 0.7), (0.0, 0.7))
     """Polygon of (x, y) in fractions of the image's width and height; likewise the other two."""
     straight: Polygon = ((0.44, 0.52), (0.56, 0.52), (0.6, 0.62), (0.4, 0.62))
     right: Polygon = ((0.8, 0.55), (1.0, 0.55), (1.0, 0.7), (0.8, 0.7))
-    aside_m: tuple[Positive, Positive] = (12.0, 20.0)
-    """On the ground: lateral range in which side roads are searched. It starts beyond three lanes
-    next to the ego lane and ends where a camera no longer sees the ground nearby."""
-    beyond_m: tuple[Positive, Positive] = (6.0, 26.0)
-    """On the ground: range beyond the intersection's end in which the road ahead is searched."""
-    half_width_m: Positive = 2.0
-    """Half the width of the region ahead, which is centered on the ego vehicle's path."""
-    min_rows: Positive = 6.0
-    """Minimum number of rows of the segmentation that a visible region spans. Where a road ends,
-    the embedded network's mask extends up to five rows too far."""
 
     def polygons(self) -> tuple[Polygon, Polygon, Polygon]:
         """Return the polygons of the image, from left to right."""
         return self.left, self.straight, self.right
-
-    @model_validator(mode="after")
-    def _near_before_far(self) -> Self:
-        for name in ("aside_m", "beyond_m"):
-            near_m, far_m = getattr(self, name)
-            if near_m >= far_m:
-                raise PydanticCustomError("regions", f"{name}: expected the nearer end first")
-        return self
 
 
 class OwnCue(Section):

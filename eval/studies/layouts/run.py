@@ -72,10 +72,10 @@ KINDS: Final = (
 # The belief over time, also outside approaches, where the other kinds have no belief.
 EVERYWHERE: Final = "temporal, every picture"
 # The rules for real roads, by section of the vehicle file.
-REAL_ROADS: Final = {"regions": "ground", "cars": "tracks", "fusion": "persistent"}
+REAL_ROADS: Final = {"regions": "area", "cars": "tracks", "fusion": "persistent"}
 # Section of each rule, and its kind without the rule.
 RULES: Final[dict[str, dict[str, str]]] = {
-    "range-anchored regions": {"regions": "picture"},
+    "accumulated road": {"regions": "picture"},
     "motion-compensated trackers": {"cars": "pairs"},
     "persistence": {"fusion": "source"},
 }
@@ -327,13 +327,13 @@ class LayoutDrive:
     parts: Sequence[AnnotatedDrive]
 
     def settings(self, changes: Mapping[str, Mapping[str, Any]]) -> Vehicle:
-        """Return the run's settings with changes by section."""
+        """Return the run's settings with changes by section, as a vehicle file with them has."""
         vehicle = self.run.drive_manifest().settings
         changed = {
             name: getattr(vehicle, name).model_copy(update=dict(values))
             for name, values in changes.items()
         }
-        return vehicle.model_copy(update=changed)
+        return Vehicle.model_validate(vehicle.model_copy(update=changed).model_dump())
 
     def believed(
         self, start_m: Floats, probabilities: Floats, established: Flags, is_silent: Flags

@@ -75,8 +75,8 @@ MEASURE: Final = {
 }
 
 AFTER_CAMERA: Final = """\
-# [regions]  # where road is searched: on the ground, which needs camera.focal_px, z_m and a range
-# kind = "ground"  # or "picture", with a polygon for each side, drawn on an image from:
+# [regions]  # where road is searched: on the ground, which needs camera.focal_px and z_m
+# kind = "area"  # or "picture", with a polygon for each side, drawn on an image from:
 # crosscue detect LOG --draw 1
 
 # [ranges]  # default: from motion, where camera.focal_px and odometry are known

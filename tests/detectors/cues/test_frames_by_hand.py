@@ -338,22 +338,20 @@ def test_only_cues_whose_labels_can_be_reported_are_counted() -> None:
     }
 
 
-def test_road_on_the_ground_needs_a_place() -> None:
-    """Everything is road, but only with a place are there regions to search."""
-    ground = VEHICLE.model_copy(
-        update={"regions": Regions(kind="ground", min_rows=1.0), "camera": CAMERA}
-    )
-    cues, tally = _cues(ground)
+def test_an_unseen_road_is_no_count_and_one_picture_alone_shows_no_road_area() -> None:
+    """The straight region is not seen; the accumulated road takes many frames together."""
+    cues, tally = _cues()
 
-    unknown = cues(FrameDetections(0, road=road()))
-    known = cues(FrameDetections(1, road=road()), None, Place(10.0, 26.0, 0.0))
+    unknown = cues(FrameDetections(0, road=RoadFractions(1.0, math.nan, 0.0)))
+    area, _ = _cues(VEHICLE.model_copy(update={"regions": Regions(kind="area")}))
+    alone = area(FrameDetections(0, road=road()))
 
-    assert unknown.road is not None
-    assert math.isnan(unknown.road.left)
-    assert unknown.counts == {}
-    assert known.counts["road_straight"] == 1
+    assert unknown.counts == {"road_left": 1, "road_right": 0}
     assert tally["road_straight"].skipped == {REGION_NOT_SEEN: 1}
-    assert (tally["road_straight"].seen, tally["road_straight"].used) == (2, 1)
+    assert (tally["road_straight"].seen, tally["road_straight"].used) == (1, 0)
+    assert alone.road is not None
+    assert math.isnan(alone.road.left)
+    assert alone.counts == {}
 
 
 def test_cars_are_paired_with_the_previous_frame_until_restarted() -> None:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.observed import RoadFractions
-from crosscue.detectors.cues.road import region_mask, road_fractions
+from crosscue.detectors.cues.road import outlines, region_mask, road_fractions
 from crosscue.replay.errors import VehicleError
-from crosscue.replay.vehicle.vehicle import Regions, parse
+from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Regions, Vehicle, parse
 
 
 def _mask(road: NDArray[np.bool_]) -> RoadMask:
@@ -73,8 +73,29 @@ def test_square_region_contains_exactly_its_pixels() -> None:
         ("left = [[0.0, 0.5], [0.2, 0.5]]", "regions.left"),
         ("left = [[0.0, 0.5], [0.2, 1.5], [0.2, 0.9]]", "less than or equal to 1"),
         ("lefd = [[0.0, 0.5], [0.2, 0.5], [0.2, 0.9]]", "did you mean left?"),
+        ('kind = "ground"', "regions.kind: input should be 'picture' or 'area', got 'ground'"),
+        ("aside_m = [12.0, 20.0]", "regions.aside_m: no such key; there are: kind, left"),
     ],
 )
 def test_invalid_region_is_refused(text: str, message: str) -> None:
     with pytest.raises(VehicleError, match=message.replace("?", r"\?")):
         parse(f"version = 1\n[regions]\n{text}\n", "v.toml")
+
+
+def test_regions_default_to_the_road_area_unless_drawn_or_simulated() -> None:
+    drawn = "[regions]\nleft = [[0.0, 0.5], [0.2, 0.5], [0.2, 0.6]]\n"
+
+    assert parse("version = 1", "a.toml").regions.kind == "area"
+    assert parse("version = 1\n" + drawn, "a.toml").regions.kind == "picture"
+    assert Vehicle(version=1, name=SIMULATED_CAR).regions.kind == "picture"
+
+
+def test_outlines_are_the_polygons_in_pixels_and_none_of_the_accumulated_road() -> None:
+    left = ((0.0, 0.5), (0.25, 0.5), (0.25, 0.75))
+    regions = Regions(kind="picture", left=left)
+
+    found = outlines(regions, (400, 200))
+
+    np.testing.assert_array_equal(found[0], [(0.0, 100.0), (100.0, 100.0), (100.0, 150.0)])
+    assert len(found) == 3
+    assert outlines(regions.model_copy(update={"kind": "area"}), (400, 200)) == ()

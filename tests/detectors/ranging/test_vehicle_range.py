@@ -147,6 +147,14 @@ def plane(yaw_rad: float = 0.0, pitch_rad: float = 0.0, roll_rad: float = 0.0) -
     return GroundPlane.of(camera, SIZE_PLANE)
 
 
+@given(ahead_m=st.floats(3.0, 80.0), left_m=st.floats(-30.0, 30.0))
+def test_ground_point_is_projected_by_the_pinhole_model(ahead_m: float, left_m: float) -> None:
+    ((x, y),) = plane().project(np.array([[ahead_m + 1.7, left_m + 0.3]])).tolist()
+
+    assert x == pytest.approx(640.0 - 900.0 * left_m / ahead_m)
+    assert y == pytest.approx(340.0 + 900.0 * 1.5 / ahead_m)
+
+
 @given(angles, angles, angles, st.floats(5.0, 80.0), st.floats(-0.5, 0.5))
 def test_unprojection_inverts_projection(
     yaw: float, pitch: float, roll: float, ahead_m: float, slope: float

@@ -88,9 +88,9 @@ def test_merged_run_is_not_counted_again(tmp_path: Path) -> None:
 def test_unreadable_runs_are_left_out_and_reported(tmp_path: Path) -> None:
     add_run(tmp_path / "good", "good")
     manifest = add_run(tmp_path / "other", "other").file(MANIFEST)
-    manifest.write_text(manifest.read_text().replace('"format_version": 7', '"format_version": 6'))
+    manifest.write_text(manifest.read_text().replace('"format_version": 8', '"format_version": 7'))
     add_run(tmp_path / "half", "half").file(MANIFEST).unlink()
-    add_run(tmp_path / "torn", "torn").file(MANIFEST).write_text('{"format_version": 7, "stage"')
+    add_run(tmp_path / "torn", "torn").file(MANIFEST).write_text('{"format_version": 8, "stage"')
 
     found = crosscue.catalog(tmp_path)
 

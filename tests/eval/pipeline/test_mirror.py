@@ -162,7 +162,7 @@ CHANGES: Final[dict[str, dict[str, Any]]] = {
         "cues": {"kind": "tracks"},
         "fusion": {"kind": "persistent"},
     },
-    "road on the ground": {"regions": {"kind": "ground"}, "ranges": {"kind": "motion"}},
+    "ranges from motion": {"ranges": {"kind": "motion"}},
     "accumulated road": {"regions": {"kind": "area"}, "fusion": {"kind": "persistent"}},
 }
 

@@ -101,10 +101,10 @@ def test_an_opening_supports_the_intersection_unless_the_method_or_the_file_says
     usual = Vehicle(version=1).fusion.cues["road_left"]
     assert usual.supports == ("left", "intersection")
     simulated = Vehicle(version=1, name=SIMULATED_CAR).fusion.cues["road_left"]
-    ground = parse('version = 1\n[regions]\nkind = "ground"\n', "a").fusion.cues["road_left"]
+    drawn = parse('version = 1\n[regions]\nkind = "picture"\n', "a").fusion.cues["road_left"]
     published = parse('version = 1\n[fusion]\nkind = "source"\n', "a").fusion.cues["road_left"]
-    assert {one.supports for one in (simulated, ground, published)} == {("left",)}
-    assert {one.precision for one in (simulated, ground, published)} == {0.77}
+    assert {one.supports for one in (simulated, drawn, published)} == {("left",)}
+    assert {one.precision for one in (simulated, drawn, published)} == {0.77}
     own = parse("version = 1\n[fusion.cues]\nroad_left = { precision = 0.8 }\n", "a")
     assert own.fusion.cues["road_left"].precision == 0.8
     assert own.fusion.cues["road_left"].supports == ("left",)

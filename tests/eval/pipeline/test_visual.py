@@ -160,7 +160,7 @@ def test_pictures_are_also_compared_for_the_pitch_where_road_is_accumulated() ->
     for more, finds_road, expected in (
         ("", True, True),
         ('[odometry]\nkind = "wheels"\n', True, False),
-        ('[regions]\nkind = "ground"\n[odometry]\nkind = "wheels"\n', False, False),
+        ('[regions]\nkind = "picture"\n[odometry]\nkind = "wheels"\n', False, False),
         ('[odometry]\nkind = "visual"\n', False, True),
     ):
         drive = Drive((), parse(SETUP + more, "here"))

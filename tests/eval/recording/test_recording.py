@@ -19,8 +19,6 @@ from rerun.chunk import RrdReader
 
 import crosscue
 from crosscue.detectors import rle
-from crosscue.detectors.cues.observed import Place
-from crosscue.detectors.cues.road_ground import outlines
 from crosscue.detectors.cues.tracked.motion import CarMotion
 from crosscue.detectors.images import Encoded
 from crosscue.eval.recording import save_rrd
@@ -34,7 +32,7 @@ from crosscue.eval.runs.moments import run_between
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.replay.colours import QUIET, TRUTH
 from crosscue.replay.errors import LogError, UsageError
-from crosscue.replay.vehicle.vehicle import Camera, Regions, Vehicle
+from crosscue.replay.vehicle.vehicle import Camera, Vehicle
 from support.refusals import refusal
 from support.scene_run import FRAMES, LABEL, scene_run
 from support.scoring import at, good_truth, truth_folder
@@ -307,19 +305,6 @@ def test_oncoming_car_moves_from_the_optical_axis_and_outgoing_towards_it() -> N
 
 def test_arrow_of_crossing_car_equals_pinhole_projection() -> None:
     np.testing.assert_allclose(motion_px(car(8.0, 0.0), CAMERA, SIZE), [700.0 * 8.0 / 40.0, 0.0])
-
-
-def test_regions_are_below_the_horizon_and_symmetric() -> None:
-    left, straight, right = outlines(CAMERA, Regions(kind="ground"), Place(20.0, 36.0, 0.5), SIZE)
-
-    assert left is not None
-    assert straight is not None
-    assert right is not None
-    for corners in (left, straight, right):
-        assert (corners[:, 1] > 360.0).all()
-    mirrored = np.sort(1280.0 - right[:, 0])
-    np.testing.assert_allclose(np.sort(left[:, 0]), mirrored)
-    assert left[:, 0].max() < straight[:, 0].min() < straight[:, 0].max() < right[:, 0].min()
 
 
 def test_boxes_at_one_place_get_one_label_and_the_surest_keeps_it(tmp_path: Path) -> None:

@@ -16,7 +16,13 @@ from crosscue.eval.scoring.intervals import Mean
 from crosscue.eval.scoring.truth import FEATURES
 from crosscue.eval.studies import simulated_drives
 from crosscue.eval.studies.layouts import run as layout_run
-from crosscue.eval.studies.layouts.run import study_tables, verdict, write_layout_study
+from crosscue.eval.studies.layouts.run import (
+    REAL_ROADS,
+    LayoutDrive,
+    study_tables,
+    verdict,
+    write_layout_study,
+)
 from crosscue.eval.studies.layouts.score import (
     DriveBelief,
     LayoutScores,
@@ -26,6 +32,7 @@ from crosscue.eval.studies.layouts.score import (
 from crosscue.eval.studies.layouts.settings import LayoutStudy
 from crosscue.eval.studies.simulated_drives import MADE_BY, Work
 from crosscue.replay.errors import UsageError
+from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle, parse
 
 STUDY = LayoutStudy()
 TRUTH = {"intersection": True, "left": True, "right": False, "straight": True}
@@ -111,6 +118,19 @@ def belief(
 
 
 CONFIDENT = {"intersection": 0.99, "left": 0.99, "right": 0.01, "straight": 0.99}
+
+
+def test_rules_for_real_roads_are_those_of_a_real_car() -> None:
+    run = MagicMock()
+    run.drive_manifest.return_value.settings = Vehicle(version=1, name=SIMULATED_CAR)
+    drive = LayoutDrive("M0-01", "M0", 0, TRUTH, run, MagicMock(), (), ())
+
+    changed = drive.settings({name: {"kind": kind} for name, kind in REAL_ROADS.items()})
+
+    real = parse("version = 1", "car.toml")
+    assert {name: getattr(real, name).kind for name in REAL_ROADS} == REAL_ROADS
+    assert changed.fusion.cues == real.fusion.cues
+    assert changed.regions == real.regions
 
 
 def test_road_established_before_intersection_is_counted() -> None:
