@@ -49,7 +49,7 @@ class _Manifest(BaseModel):
     Validating the settings takes ten times as long, and there may be 100,000 runs.
     """
 
-    format_version: Literal[7]
+    format_version: Literal[8]
     stage: Literal["detect", "estimate"]
     versions: dict[str, str]
     logs: tuple[LogRow, ...]

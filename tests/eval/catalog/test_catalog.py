@@ -96,7 +96,7 @@ def test_unreadable_runs_are_left_out_and_reported(tmp_path: Path) -> None:
 
     assert [path.name for path in found.runs] == ["good"]
     assert found.left_out.keys() == {"other", "half", "torn"}
-    assert "format 6, this crosscue reads 7; replay again" in found.left_out["other"]
+    assert "format 7, this crosscue reads 8; replay again" in found.left_out["other"]
     assert "cut short" in found.left_out["half"]
     assert "unreadable" in found.left_out["torn"]
     listed = found.query("select run, reason from left_out").to_pylist()
