@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from crosscue.datasets.truth.box_labels import BoxLabels, boxes_inside, read_box_labels
+from crosscue.datasets.truth.box_labels import boxes_inside, read_box_labels
 from crosscue.replay.errors import AnnotationError, UsageError
 
 BOX = (10.0, 20.0, 50.0, 60.0)
@@ -54,13 +54,9 @@ def kitti(folder: Path) -> Path:
 FORMATS = {"coco": coco, "yolo": yolo, "voc": voc, "kitti": kitti}
 
 
-def read(path: Path) -> BoxLabels:
-    return read_box_labels(path)
-
-
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_yields_same_box(name: str, tmp_path: Path) -> None:
-    found = read(FORMATS[name](tmp_path))
+    found = read_box_labels(FORMATS[name](tmp_path))
 
     (picture,) = found.pictures
     car, *regions = boxes_inside(picture, SIZE, Counter())
@@ -103,7 +99,7 @@ def test_unreadable_labels_are_refused_in_one_line(
 
     error = UsageError if message.startswith("--") else AnnotationError
     with pytest.raises(error) as raised:
-        read(tmp_path)
+        read_box_labels(tmp_path)
 
     assert message in str(raised.value)
     assert "\n" not in str(raised.value)

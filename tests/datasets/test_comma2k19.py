@@ -11,14 +11,12 @@ from crosscue.datasets.adapters.comma2k19 import STREAMS, read_column
 from crosscue.datasets.adapters.comma2k19_truth import write_comma_truth
 from crosscue.eval import cli
 from crosscue.replay.base import Selection
-from crosscue.replay.columns import Table
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.vehicle import load
-from support.accounted import read
+from support.accounted import column, read
 from support.data import shared
 
 SEGMENT = ("comma2k19", "Example_1", "b0c9d2329ad1606b_2018-08-02--08-34-47", "40")
@@ -32,13 +30,11 @@ def _save(path: Path, rows: NDArray[np.generic]) -> Path:
 
 
 def test_every_row_of_the_real_segment_is_accounted_for() -> None:
-    with open_log(shared(*SEGMENT)) as log:
-        ledger = Ledger(str(log.path))
-        rows = sum(len(block) for block in log.read(ledger))
+    blocks, ledger = read(shared(*SEGMENT))
 
     accounts = ledger.accounts
     assert sum(accounts[f"can/{bus}"].used for bus in (0, 1, 128, 129)) == 135_468
-    assert rows == sum(account.found for account in accounts.values())
+    assert sum(map(len, blocks)) == sum(account.found for account in accounts.values())
     # One array of the published example is truncated; the rest is complete.
     damaged = {name: a.dropped.total() for name, a in accounts.items() if not a.is_whole}
     assert damaged == {"imu/magnetometer_uncalibrated": 64}
@@ -47,13 +43,9 @@ def test_every_row_of_the_real_segment_is_accounted_for() -> None:
 def test_gyro_axes_are_converted_to_forward_left_up() -> None:
     path = shared(*SEGMENT)
     raw = np.load(path / "processed_log/IMU/gyro/value", allow_pickle=False)
-    with open_log(path) as log:
-        blocks = log.read(Ledger(""), Selection(frozenset({"imu/gyro"})))
-        tables = [block.rows for block in blocks]
+    blocks, _ = read(path, Selection(frozenset({"imu/gyro"})))
 
-    assert all(isinstance(table, Table) for table in tables)
-    yaw = np.concatenate([t["gyro_z_radps"] for t in tables if isinstance(t, Table)])
-    np.testing.assert_array_equal(yaw, -raw[:, 2])
+    np.testing.assert_array_equal(column(blocks, "gyro_z_radps"), -raw[:, 2])
 
 
 @pytest.mark.parametrize("order", ["C", "F"])

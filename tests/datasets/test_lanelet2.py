@@ -16,8 +16,10 @@ from support.street_map import (
     LANE_M,
     MIDDLE,
     Bound,
+    ahead_of,
     crossing_lanes,
     joined_lane,
+    roads_of,
     straight_lane,
     write_lanelets,
 )
@@ -36,16 +38,11 @@ def _turned(
 
 def _ahead(roads: RoadMap, x_m: float, y_m: float = -1.75, turn_rad: float = 0.0) -> Ahead | None:
     c, s = np.cos(turn_rad), np.sin(turn_rad)
-    at = np.array([[c * x_m - s * y_m, s * x_m + c * y_m]])
-    return roads.along(at, np.array([turn_rad]))[0]
+    return ahead_of(roads, c * x_m - s * y_m, s * x_m + c * y_m, turn_rad)
 
 
 def _sides(roads: RoadMap, ahead: Ahead) -> set[str]:
     return {side for side, legs in roads.legs(ahead).items() if any(leg.is_out for leg in legs)}
-
-
-def _around(path: Path) -> RoadMap:
-    return read_map(path).around((49.0, 8.4, 0.0))
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 37.0, 215.0])
@@ -55,7 +52,7 @@ def test_distances_are_those_to_the_kerbs_of_the_crossroad(
 ) -> None:
     turn_rad = np.radians(turn_deg)
     lanelets = _turned(crossing_lanes(), turn_rad)
-    roads = _around(write_lanelets(tmp_path / "a.osm", lanelets, reversed_bounds=reversed_bounds))
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", lanelets, reversed_bounds=reversed_bounds))
 
     ahead = _ahead(roads, 10.0, turn_rad=turn_rad)
 
@@ -65,7 +62,7 @@ def test_distances_are_those_to_the_kerbs_of_the_crossroad(
 
 
 def test_an_approach_goes_on_past_the_stop_line_to_the_kerb(tmp_path: Path) -> None:
-    roads = _around(write_lanelets(tmp_path / "a.osm", crossing_lanes()))
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", crossing_lanes()))
     x_m = np.arange(40.25, 70.0, 0.5)
 
     found = roads.along(np.column_stack([x_m, np.full(len(x_m), -1.75)]), np.zeros(len(x_m)))
@@ -76,7 +73,7 @@ def test_an_approach_goes_on_past_the_stop_line_to_the_kerb(tmp_path: Path) -> N
 
 def test_an_arm_counts_where_the_map_ends_at_its_mouth(tmp_path: Path) -> None:
     cut = {key: lane for key, lane in crossing_lanes().items() if not key.startswith("n-")}
-    roads = _around(write_lanelets(tmp_path / "a.osm", cut))
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", cut))
 
     ahead = _ahead(roads, 10.0)
 
@@ -87,11 +84,11 @@ def test_an_arm_counts_where_the_map_ends_at_its_mouth(tmp_path: Path) -> None:
 
 def test_control_is_that_of_the_lane(tmp_path: Path) -> None:
     rules = {"light": ("traffic_light", "w-in"), "sign": ("stop", "e-in")}
-    roads = _around(write_lanelets(tmp_path / "a.osm", crossing_lanes(), rules))
-    west, east = _ahead(roads, 30.0), roads.along(np.array([[100.0, 1.75]]), np.array([np.pi]))[0]
-    south = roads.along(np.array([[MIDDLE + 1.75, -40.0]]), np.array([np.pi / 2.0]))[0]
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", crossing_lanes(), rules))
+    east = ahead_of(roads, 100.0, 1.75, np.pi)
+    south = ahead_of(roads, MIDDLE + 1.75, -40.0, np.pi / 2.0)
 
-    controls = [one.control for one in (west, east, south) if one is not None]
+    controls = [one.control for one in (_ahead(roads, 30.0), east, south) if one is not None]
 
     assert controls == ["traffic_light", "stop_sign", None]
 
@@ -105,7 +102,7 @@ def test_lanes_with_a_turn_direction_are_inside_and_their_rules_count_before(
         if k not in ("s-n", "n-s")
     }
     rules = {"light": ("traffic_light", "w-e")}
-    roads = _around(write_lanelets(tmp_path / "a.osm", turns, rules))
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", turns, rules))
 
     ahead = _ahead(roads, 30.0)
 
@@ -132,42 +129,40 @@ def test_one_wide_lane_each_way_has_its_side_road_where_it_meets(tmp_path: Path)
     # From the north to the east the bounds change sides.
     lanelets["n-e"] = [north[1][0], east[0][0]], [north[0][0], east[1][0]]
     told = {key: (*bounds, "one_way=no") for key, bounds in lanelets.items()}
-    roads = _around(write_lanelets(tmp_path / "a.osm", told))
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", told))
 
     ahead = _ahead(roads, 0.0, y_m=0.0)
 
     assert ahead is not None
     assert [ahead.start_m, ahead.end_m] == pytest.approx([60.0, 67.0], abs=0.3)
     assert _sides(roads, ahead) == {"left", "straight", "back"}
-    westward = roads.along(np.array([[120.0, 0.0]]), np.array([np.pi]))[0]
+    westward = ahead_of(roads, 120.0, 0.0, np.pi)
     assert westward is not None
     assert _sides(roads, westward) == {"right", "straight", "back"}
 
 
+STREET = {
+    f"w{part}": (*straight_lane((-80.0 + 80.0 * part, 0.0), (80.0 * part, 0.0)), "")
+    for part in range(3)
+}
+
+
 @pytest.mark.parametrize("height_m", [0.0, 6.0])
 def test_a_bridge_is_no_intersection(tmp_path: Path, height_m: float) -> None:
-    roads_under = {
-        f"w{part}": (*straight_lane((-80.0 + 80.0 * part, 0.0), (80.0 * part, 0.0)), "")
-        for part in range(3)
-    }
     over = {
         f"s{part}": (*straight_lane((20.0, -120.0 + 80.0 * part), (20.0, -40.0 + 80.0 * part)), "")
         for part in range(3)
     }
     heights_m = dict.fromkeys(over, height_m)
-    path = write_lanelets(tmp_path / "a.osm", {**roads_under, **over}, heights_m=heights_m)
+    path = write_lanelets(tmp_path / "a.osm", {**STREET, **over}, heights_m=heights_m)
 
-    assert (_ahead(_around(path), -30.0) is None) is (height_m > 0.0)
+    assert (_ahead(roads_of(path), -30.0) is None) is (height_m > 0.0)
 
 
 @pytest.mark.parametrize("tags", ["", "subtype=walkway", "participant:bicycle=yes"])
 def test_a_crossing_for_people_is_no_intersection(tmp_path: Path, tags: str) -> None:
-    lanelets = {
-        f"w{part}": (*straight_lane((-80.0 + 80.0 * part, 0.0), (80.0 * part, 0.0)), "")
-        for part in range(3)
-    }
-    lanelets["over"] = (*straight_lane((30.0, -9.0), (30.0, 9.0)), tags)
-    roads = _around(write_lanelets(tmp_path / "a.osm", lanelets))
+    over = {"over": (*straight_lane((30.0, -9.0), (30.0, 9.0)), tags)}
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", STREET | over))
 
     assert _ahead(roads, -10.0) is None
 
@@ -185,11 +180,11 @@ def test_a_lane_around_the_earth_takes_no_more_memory(
 ) -> None:
     far = {"far": (*straight_lane((0.0, 0.0), (5e6, 0.0)), "")}
     path = write_lanelets(tmp_path / "a.osm", far)
-    (road,) = _around(path).roads
+    (road,) = roads_of(path).roads
     assert len(road.nodes) == MAX_STEPS + 1
 
     monkeypatch.setattr("crosscue.datasets.truth.lanelet2.MAX_POINTS", 100)
     with pytest.raises(
         AnnotationError, match=r"a.osm: lanes of over .* km; cut the map to the drive"
     ):
-        _around(path)
+        roads_of(path)

@@ -13,10 +13,9 @@ from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.lanes import MAX_STEPS
 from crosscue.datasets.truth.truth import read_truth
 from crosscue.datasets.truth.tum import heading_rad, read_tum
-from crosscue.replay.columns import Floats, Table
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
+from support.accounted import column, read_topics, times
 from support.nuscenes_drive import (
     FIRST_US,
     FOCAL_PX,
@@ -28,30 +27,17 @@ from support.nuscenes_drive import (
 )
 
 
-def columns(path: Path, topic: str) -> tuple[dict[str, Floats], Ledger]:
-    ledger = Ledger(str(path))
-    found: dict[str, list[Floats]] = {}
-    with open_log(path) as log:
-        for block in log.read(ledger):
-            if block.topic == topic and isinstance(block.rows, Table):
-                for name, values in block.rows.columns.items():
-                    found.setdefault(name, []).append(np.asarray(values, np.float64))
-    return {name: np.concatenate(parts) for name, parts in found.items()}, ledger
-
-
 def test_wheels_steering_and_imu_report_left_turn_in_si_units(tmp_path: Path) -> None:
     drive = nuscenes_drive(tmp_path / "root")
 
-    wheels, _ = columns(drive, "can/wheel_speed")
-    steering, _ = columns(drive, "can/steering")
-    imu, _ = columns(drive, "can/imu")
+    found, _ = read_topics(drive)
 
-    rear = 0.5 * (wheels["rear_left_mps"] + wheels["rear_right_mps"])
-    np.testing.assert_allclose(rear, SPEED_MPS, rtol=1e-9)
-    assert (wheels["rear_right_mps"] > wheels["rear_left_mps"]).all()
+    left, right = (column(found["can/wheel_speed"], f"rear_{on}_mps") for on in ("left", "right"))
+    np.testing.assert_allclose(0.5 * (left + right), SPEED_MPS, rtol=1e-9)
+    assert (right > left).all()
     # Published as positive to the right.
-    np.testing.assert_allclose(steering["steering_rad"], 0.7)
-    np.testing.assert_allclose(imu["gyro_z_radps"], YAW_RATE_RADPS)
+    np.testing.assert_allclose(column(found["can/steering"], "steering_rad"), 0.7)
+    np.testing.assert_allclose(column(found["can/imu"], "gyro_z_radps"), YAW_RATE_RADPS)
 
 
 def test_scene_is_selected_by_empty_file(tmp_path: Path) -> None:
@@ -139,8 +125,7 @@ def test_truth_says_which_map_is_missing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["{", "[]", '{"lane": 3}', '{"lane": [{"token": 1}]}'])
 def test_unusable_map_expansion_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     drive = nuscenes_drive(tmp_path / "root")
-    place = write_expansion(drive)
-    place.write_text(text)
+    write_expansion(drive).write_text(text)
 
     with pytest.raises(LogFormatError, match=r"boston-seaport.json: .*map expansion") as caught:
         crosscue.write_truth(drive, tmp_path / "truth")
@@ -198,21 +183,13 @@ def test_damaged_table_row_is_dropped_and_counted(tmp_path: Path, what: str) -> 
     drive = nuscenes_drive(tmp_path / "root")
     table = drive / "v1.0-mini" / "sample_data.json"
     text = table.read_text()
-    at = text.index('"token": "d7"')
-    if what == "value":
-        text = text[:at] + "?" + text[at + 1 :]
-    elif what == "opening brace":
-        brace = text.rindex("{", 0, at)
-        text = text[:brace] + "?" + text[brace + 1 :]
-    else:
-        brace = text.index("}", at)
-        text = text[:brace] + "?" + text[brace + 1 :]
-    table.write_text(text)
+    value = text.index('"token": "d7"')
+    braces = {"opening brace": text.rindex("{", 0, value), "closing brace": text.index("}", value)}
+    at = braces.get(what, value)
+    table.write_text(text[:at] + "?" + text[at + 1 :])
 
-    ledger = Ledger("")
-    with open_log(drive) as log:
-        pictures = sum(len(b) for b in log.read(ledger) if b.topic == "CAM_FRONT")
+    found, ledger = read_topics(drive)
 
-    assert pictures == 11
+    assert len(times(found["CAM_FRONT"])) == 11
     assert ledger.topic("").dropped.total() == 1
     assert "sample_data.json" in next(iter(ledger.topic("").dropped))

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 
 from crosscue.datasets.adapters.capnp import MessageError, Struct, messages
 from crosscue.datasets.adapters.openpilot import OTHER
-from crosscue.replay.columns import Block, CanFrames, Table
-from crosscue.replay.ledger import Ledger
+from crosscue.replay.columns import CanFrames, Table
 from crosscue.replay.limits import Limits
-from crosscue.replay.logs.opening import open_log
+from support.accounted import read, read_topics
 from support.openpilot_drive import (
     START_NS,
     at_ns,
@@ -29,17 +28,8 @@ from support.videos import numbers_at_times
 FRAMES = 24
 
 
-def _read(path: Path) -> tuple[dict[str, list[Block]], Ledger]:
-    ledger = Ledger(str(path))
-    found: dict[str, list[Block]] = {}
-    with open_log(path) as log:
-        for block in log.read(ledger):
-            found.setdefault(block.topic, []).append(block)
-    return found, ledger
-
-
 def test_rows_have_the_written_values_in_our_axes_and_units(tmp_path: Path) -> None:
-    found, ledger = _read(openpilot_drive(tmp_path / "segment", FRAMES))
+    found, ledger = read_topics(openpilot_drive(tmp_path / "segment", FRAMES))
 
     def row(topic: str) -> list[float]:
         table = found[topic][0].rows
@@ -72,7 +62,7 @@ def test_rows_have_the_written_values_in_our_axes_and_units(tmp_path: Path) -> N
 
 
 def test_frames_have_the_times_of_the_end_of_their_exposure(tmp_path: Path) -> None:
-    found, _ = _read(openpilot_drive(tmp_path / "segment", FRAMES))
+    found, _ = read_topics(openpilot_drive(tmp_path / "segment", FRAMES))
 
     shown = numbers_at_times(found["qcamera"], "h264")
 
@@ -86,7 +76,7 @@ def test_every_file_name_gives_the_same_rows(name: str, tmp_path: Path) -> None:
         plain = b"".join(drive_messages(FRAMES))
         (segment / name).write_bytes(zstandard.compress(plain))
 
-    found, ledger = _read(segment)
+    found, ledger = read_topics(segment)
 
     assert len(found["can/0"][0]) == FRAMES
     assert any("qlog: the device kept few" in one for one in ledger.notices) == (name == "qlog")
@@ -102,7 +92,7 @@ def test_cut_log_keeps_its_messages_and_reports_the_rest(name: str, tmp_path: Pa
         raw = b"".join(bz2.compress(b"".join(plain[i : i + 30])) for i in range(0, 120, 30))
     (segment / name).write_bytes(raw[: len(raw) * 3 // 4])
 
-    found, ledger = _read(segment)
+    found, ledger = read_topics(segment)
 
     assert 0 < len(found["can/0"][0]) < FRAMES
     assert [(one.reason, one.count) for one in ledger.drops() if not one.topic] == [
@@ -114,17 +104,14 @@ def test_log_larger_than_a_container_may_be_is_cut_there(tmp_path: Path) -> None
     segment = openpilot_drive(tmp_path / "segment", FRAMES)
     bomb = b"".join(drive_messages(FRAMES)) + bytes(1 << 24)
     (segment / "rlog.bz2").write_bytes(bz2.compress(bomb))
-    small = Limits(chunk_bytes=1 << 20)
 
-    ledger = Ledger("x")
-    with open_log(segment, small) as log:
-        rows = sum(len(block) for block in log.read(ledger))
+    blocks, ledger = read(segment, limits=Limits(chunk_bytes=1 << 20))
 
-    assert rows > FRAMES
+    assert sum(map(len, blocks)) > FRAMES
     assert "raise --max-chunk" in next(one.detail for one in ledger.drops())
 
 
-def test_message_in_several_segments_is_read(tmp_path: Path) -> None:
+def test_message_in_several_segments_isread_topics(tmp_path: Path) -> None:
     """The library begins a new segment when the first is full, and points there."""
     large = [{"address": i, "dat": bytes([i % 256] * 8), "src": 1} for i in range(5000)]
     built = event_type().new_message(logMonoTime=START_NS)
@@ -137,7 +124,7 @@ def test_message_in_several_segments_is_read(tmp_path: Path) -> None:
     segment.mkdir()
     (segment / "rlog").write_bytes(coded)
 
-    found, _ = _read(segment)
+    found, _ = read_topics(segment)
 
     rows = found["can/1"][0].rows
     assert isinstance(rows, CanFrames)

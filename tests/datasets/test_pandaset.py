@@ -9,26 +9,19 @@ from crosscue.datasets.adapters.pandaset import read_pandaset_poses
 from crosscue.datasets.real.label_pandaset import write_labels
 from crosscue.datasets.truth.truth import read_truth, write_carried
 from crosscue.datasets.truth.tum import heading_rad, read_tum
-from crosscue.replay.base import Selection
 from crosscue.replay.columns import Table
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.logs.opening import open_log
+from support.accounted import read_topics
 from support.data import shared
 from support.pandaset_drive import COUNT, SPEED_MPS, START_S, YAW_RATE_RADPS, pandaset_drive
 
 CAMERA = Path("camera") / "front_camera"
 
 
-def rows(path: Path, selection: Selection | None = None) -> tuple[dict[str, int], Ledger]:
-    ledger = Ledger("pandaset")
-    found: dict[str, int] = {}
-    with open_log(path) as log:
-        chosen = Selection() if selection is None else selection
-        for block in ledger.handing_on(log.read(ledger, chosen)):
-            found[block.topic] = found.get(block.topic, 0) + len(block)
-    ledger.check(found)
-    return found, ledger
+def rows(path: Path) -> tuple[dict[str, int], Ledger]:
+    found, ledger = read_topics(path)
+    return {topic: sum(map(len, blocks)) for topic, blocks in found.items()}, ledger
 
 
 def test_odometry_matches_simulated_motion(tmp_path: Path) -> None:

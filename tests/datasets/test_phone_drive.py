@@ -3,42 +3,31 @@
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from crosscue.replay.columns import Table
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
+from support.accounted import column, read, read_topics, times
 from support.phone_drive import LATE_S, START_S, YAW_RATE_RADPS, phone_drive
 
 ZONE_S = -5 * 3600
 
 
-def tables_of(path: Path) -> dict[str, tuple[np.ndarray, Table]]:
-    found = {}
-    with open_log(path) as log:
-        for block in log.read(Ledger(str(path))):
-            assert isinstance(block.rows, Table)
-            found[block.topic] = block.log_ns, block.rows
-    return found
-
-
 def test_yaw_rate_is_about_vertical_for_tilted_phone(tmp_path: Path) -> None:
-    _, rows = tables_of(phone_drive(tmp_path / "drive"))["phone/gyro"]
+    found, _ = read_topics(phone_drive(tmp_path / "drive"))
 
-    np.testing.assert_allclose(rows["yaw_rate_radps"][-1], YAW_RATE_RADPS, atol=1e-8)
-    assert rows["yaw_rate_radps"][0] == 0.0
+    first, *_, last = column(found["phone/gyro"], "yaw_rate_radps")
+    assert (first, last) == (0.0, pytest.approx(YAW_RATE_RADPS, abs=1e-8))
 
 
 def test_position_time_is_time_of_fix_on_wall_clock(tmp_path: Path) -> None:
-    found = tables_of(phone_drive(tmp_path / "drive"))
-    t_ns, rows = found["phone/gnss"]
+    found, _ = read_topics(phone_drive(tmp_path / "drive"))
+    t_ns = times(found["phone/gnss"])
 
     assert len(t_ns) == 6
     assert t_ns[0] * 1e-9 == pytest.approx(START_S + ZONE_S - LATE_S)
-    assert found["car/speed"][0][0] * 1e-9 == pytest.approx(START_S + ZONE_S, abs=0.1)
-    assert rows["course_rad"][0] == pytest.approx(-math.pi / 2)
+    assert times(found["car/speed"])[0] * 1e-9 == pytest.approx(START_S + ZONE_S, abs=0.1)
+    assert column(found["phone/gnss"], "course_rad")[0] == pytest.approx(-math.pi / 2)
 
 
 def test_damaged_phone_line_is_dropped_from_each_of_its_topics(tmp_path: Path) -> None:
@@ -47,11 +36,10 @@ def test_damaged_phone_line_is_dropped_from_each_of_its_topics(tmp_path: Path) -
     lines = file.read_text(encoding="utf-8").splitlines()
     lines[10] = "rubbish"
     file.write_text("\n".join(lines), encoding="utf-8")
-    ledger = Ledger(str(drive))
-    with open_log(drive) as log:
-        rows = sum(len(block) for block in log.read(ledger))
 
-    assert rows == 3 * 60 + 2 * 59 + 6
+    blocks, ledger = read(drive)
+
+    assert sum(map(len, blocks)) == 3 * 60 + 2 * 59 + 6
     assert ledger.topic("phone/gyro").dropped.total() == 1
     assert ledger.topic("phone/magnetometer").dropped.total() == 1
     # The line may or may not have contained a new position.

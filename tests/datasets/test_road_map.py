@@ -10,7 +10,8 @@ import pytest
 from crosscue.datasets.truth.lanelet2 import read_map
 from crosscue.datasets.truth.road_map import Ahead, RoadMap, approaches_along
 from crosscue.replay.errors import AnnotationError
-from support.street_map import ORIGIN, write_map
+from support.street_map import ahead_of, roads_of, write_map
+from support.trees import written
 
 # A street to the east with a crossing at 60 m; a T junction follows, with its arm on the left.
 POINTS = {
@@ -20,12 +21,8 @@ POINTS = {
 STREETS = [("abc", "lanes=2"), ("cf", "lanes=2"), ("ebd", "lanes=4"), ("cg", "")]
 
 
-def _map(path: Path, roads: list[tuple[str, str]], tags: dict[str, str] | None = None) -> RoadMap:
-    return read_map(write_map(path, POINTS, roads, tags)).around((*ORIGIN, 0.0))
-
-
 def _ahead(roads: RoadMap, x_m: float, y_m: float = -2.0, heading_rad: float = 0.0) -> Ahead | None:
-    return roads.along(np.array([[x_m, y_m]]), np.array([heading_rad]))[0]
+    return ahead_of(roads, x_m, y_m, heading_rad)
 
 
 def _sides(roads: RoadMap, ahead: Ahead) -> set[str]:
@@ -33,7 +30,7 @@ def _sides(roads: RoadMap, ahead: Ahead) -> set[str]:
 
 
 def test_distances_are_those_to_the_kerbs_of_the_crossroad(tmp_path: Path) -> None:
-    roads = _map(tmp_path / "a.osm", STREETS)
+    roads = roads_of(write_map(tmp_path / "a.osm", POINTS, STREETS))
 
     ahead = _ahead(roads, 10.0)
 
@@ -44,7 +41,7 @@ def test_distances_are_those_to_the_kerbs_of_the_crossroad(tmp_path: Path) -> No
 
 
 def test_next_intersection_of_a_drive_begins_after_the_last(tmp_path: Path) -> None:
-    roads = _map(tmp_path / "a.osm", STREETS)
+    roads = roads_of(write_map(tmp_path / "a.osm", POINTS, STREETS))
     x_m = np.arange(-60.0, 155.0, 1.0)
 
     found = roads.along(np.column_stack([x_m, np.full(len(x_m), -2.0)]), np.zeros(len(x_m)))
@@ -67,8 +64,7 @@ def test_a_turned_or_mirrored_map_gives_the_same_distances_and_turned_legs(
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     sign = -1.0 if mirrored else 1.0
     turned = {k: (c * x - s * sign * y, s * x + c * sign * y) for k, (x, y) in POINTS.items()}
-    path = write_map(tmp_path / "a.osm", turned, STREETS)
-    roads = read_map(path).around((*ORIGIN, 0.0))
+    roads = roads_of(write_map(tmp_path / "a.osm", turned, STREETS))
 
     ahead = _ahead(roads, c * 130.0, s * 130.0, np.radians(turn_deg))
 
@@ -88,8 +84,7 @@ def test_control_counts_for_its_direction(tmp_path: Path) -> None:
     found = {}
     for name, tags in said.items():
         at = {"b" if name == "here" else "s": tags}
-        path = write_map(tmp_path / f"{name}.osm", points, roads, at)
-        ahead = _ahead(read_map(path).around((*ORIGIN, 0.0)), 0.0)
+        ahead = _ahead(roads_of(write_map(tmp_path / "a.osm", points, roads, at)), 0.0)
         assert ahead is not None
         found[name] = ahead.control
 
@@ -99,8 +94,8 @@ def test_control_counts_for_its_direction(tmp_path: Path) -> None:
 def test_a_ramp_or_a_driveway_is_no_intersection(tmp_path: Path) -> None:
     points = POINTS | {"r": (200.0, -30.0), "p": (80.0, -40.0)}
     motorway = [("abcf", "highway=motorway"), ("cr", "highway=motorway_link oneway=yes")]
-    path = write_map(tmp_path / "a.osm", points, [*motorway, ("bp", "highway=service")])
-    roads = read_map(path).around((*ORIGIN, 0.0))
+    driveway = ("bp", "highway=service")
+    roads = roads_of(write_map(tmp_path / "a.osm", points, [*motorway, driveway]))
 
     assert _ahead(roads, 30.0) is None
     assert _ahead(roads, 120.0) is None
@@ -109,8 +104,7 @@ def test_a_ramp_or_a_driveway_is_no_intersection(tmp_path: Path) -> None:
 def test_dual_carriageway_is_one_intersection(tmp_path: Path) -> None:
     points = POINTS | {"h": (75.0, 0.0), "i": (75.0, 70.0), "j": (75.0, -70.0)}
     roads = [("abhc", ""), ("dbe", "oneway=yes lanes=2"), ("jhi", "oneway=yes lanes=2")]
-    path = write_map(tmp_path / "a.osm", points, roads)
-    road_map = read_map(path).around((*ORIGIN, 0.0))
+    road_map = roads_of(write_map(tmp_path / "a.osm", points, roads))
 
     ahead = _ahead(road_map, 0.0)
 
@@ -128,7 +122,7 @@ def test_roundabout_begins_at_its_ring_and_ends_behind_it(tmp_path: Path) -> Non
     roads = [("ab", ""), ("cf", ""), ("pqrsbtuvwcp", "junction=roundabout lanes=1")]
     roads += [("qd", ""), ("vg", "")]
     points |= {"d": (67.0, 90.0), "g": (52.0, -90.0)}
-    road_map = read_map(write_map(tmp_path / "a.osm", points, roads)).around((*ORIGIN, 0.0))
+    road_map = roads_of(write_map(tmp_path / "a.osm", points, roads))
 
     ahead = _ahead(road_map, 0.0)
 
@@ -143,7 +137,7 @@ def test_a_side_road_that_begins_beyond_the_way_ends_in_no_traceback(tmp_path: P
         "q": (70.0, -4.0), "n": (70.0, 70.0), "f": (130.0, -30.0),
     }  # fmt: skip
     roads = [("wpe", ""), ("pq", ""), ("qn", ""), ("qf", "")]
-    road_map = read_map(write_map(tmp_path / "a.osm", points, roads)).around((*ORIGIN, 0.0))
+    road_map = roads_of(write_map(tmp_path / "a.osm", points, roads))
 
     ahead = [_ahead(road_map, x, y_m=0.0) for x in (10.0, 40.0, 55.0)]
 
@@ -151,7 +145,7 @@ def test_a_side_road_that_begins_beyond_the_way_ends_in_no_traceback(tmp_path: P
 
 
 def test_off_the_roads_there_is_nothing_ahead(tmp_path: Path) -> None:
-    roads = _map(tmp_path / "a.osm", STREETS)
+    roads = roads_of(write_map(tmp_path / "a.osm", POINTS, STREETS))
 
     assert _ahead(roads, 0.0, y_m=-35.0) is None
     assert _ahead(roads, 0.0, heading_rad=np.pi / 2.0) is None
@@ -169,8 +163,7 @@ def test_off_the_roads_there_is_nothing_ahead(tmp_path: Path) -> None:
     ],
 )
 def test_unusable_map_is_refused_in_one_line(tmp_path: Path, content: str, said: str) -> None:
-    path = tmp_path / "a.osm"
-    path.write_text(content)
+    path = written(tmp_path / "a.osm", content)
 
     with pytest.raises(AnnotationError, match=said) as caught:
         read_map(path)

@@ -24,6 +24,7 @@ from crosscue.datasets.truth.tum import (
     write_tum,
 )
 from crosscue.replay.errors import LogFormatError
+from support.trees import written
 
 POSE = "1.5 1 2 3 0 0 0 1"
 
@@ -100,8 +101,7 @@ def test_comments_blank_lines_commas_and_byte_order_mark_are_accepted(tmp_path: 
     ],
 )
 def test_invalid_line_is_refused_with_its_number(tmp_path: Path, line: str, match: str) -> None:
-    path = tmp_path / "bad.tum"
-    path.write_text(f"# head\n{POSE}\n{line}\n3 1 2 3 0 0 0 1\n")
+    path = written(tmp_path / "bad.tum", f"# head\n{POSE}\n{line}\n3 1 2 3 0 0 0 1\n")
 
     with pytest.raises(LogFormatError, match=match):
         read_tum(path)

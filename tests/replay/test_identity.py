@@ -8,25 +8,20 @@ import pytest
 
 from crosscue.replay.files.identity import SHARE_BYTES, log_identity
 from crosscue.replay.versions import commit
+from support.trees import written
 
 LARGE: int = 3 * SHARE_BYTES
 # Position between the last sample and the tail, where only an index is hashed.
 BEFORE_TAIL: int = LARGE - SHARE_BYTES // 4 - SHARE_BYTES // 64 - 3
 
 
-def _log(path: Path, content: bytes | bytearray = b"rows") -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(content)
-    return path
-
-
 @pytest.mark.parametrize("at", [0, 1, SHARE_BYTES // 3, SHARE_BYTES // 2 + 7, SHARE_BYTES - 1])
 def test_any_byte_of_a_small_log_changes_identity(tmp_path: Path, at: int) -> None:
     content = bytearray(SHARE_BYTES)
-    before = log_identity(_log(tmp_path / "a.mcap", content))
+    before = log_identity(written(tmp_path / "a.mcap", content))
     content[at] ^= 1
 
-    assert log_identity(_log(tmp_path / "a.mcap", content)).digest != before.digest
+    assert log_identity(written(tmp_path / "a.mcap", content)).digest != before.digest
 
 
 @pytest.mark.parametrize(
@@ -34,11 +29,11 @@ def test_any_byte_of_a_small_log_changes_identity(tmp_path: Path, at: int) -> No
 )
 def test_head_tail_and_samples_of_large_log_change_identity(tmp_path: Path, at: int) -> None:
     content = bytearray(LARGE)
-    before = log_identity(_log(tmp_path / "a.mcap", content))
+    before = log_identity(written(tmp_path / "a.mcap", content))
     content[at] ^= 1
 
-    assert log_identity(_log(tmp_path / "a.mcap", content)).digest != before.digest
-    assert log_identity(_log(tmp_path / "a.mcap", content + b"x")).digest != before.digest
+    assert log_identity(written(tmp_path / "a.mcap", content)).digest != before.digest
+    assert log_identity(written(tmp_path / "a.mcap", content + b"x")).digest != before.digest
 
 
 def _with_index(kind: str, start: int) -> bytearray:
@@ -58,29 +53,29 @@ def _with_index(kind: str, start: int) -> bytearray:
 def test_any_index_byte_of_large_log_changes_identity(tmp_path: Path, kind: str) -> None:
     for start, counts in ((BEFORE_TAIL - 10, True), (BEFORE_TAIL + 1, False)):
         content = _with_index(kind, start)
-        before = log_identity(_log(tmp_path / f"a.{kind}", content))
+        before = log_identity(written(tmp_path / f"a.{kind}", content))
         content[BEFORE_TAIL] ^= 1
-        assert (log_identity(_log(tmp_path / f"a.{kind}", content)) != before) is counts
+        assert (log_identity(written(tmp_path / f"a.{kind}", content)) != before) is counts
 
 
 def test_folder_identity_covers_all_files_except_our_own(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "images"
     for i in range(5):
-        _log(folder / f"{i}.png", bytes([i]))
-    _log(folder / "deep" / "x.png")
+        written(folder / f"{i}.png", bytes([i]))
+    written(folder / "deep" / "x.png", "rows")
     before = log_identity(folder)
 
     for name in ("truth.json", "vehicle.toml", ".DS_Store", "x.seal"):
-        _log(folder / name)
+        written(folder / name, "rows")
     assert log_identity(folder) == before
     assert log_identity(shutil.copytree(folder, tmp_path / "b" / "images")) == before
 
     changed = []
     for change in (
-        lambda: _log(folder / "deep" / "x.png", b"other"),
+        lambda: written(folder / "deep" / "x.png", b"other"),
         lambda: (folder / "4.png").rename(folder / "5.png"),
         lambda: (folder / "3.png").unlink(),
-        lambda: _log(folder.with_name("images.csv"), b"0.1"),
+        lambda: written(folder.with_name("images.csv"), b"0.1"),
     ):
         change()
         changed.append(log_identity(folder).digest)

@@ -42,15 +42,12 @@ def _child_process(code: str) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def _begin_partial_file(folder: Path) -> str:
-    return (
-        "from pathlib import Path\nfrom crosscue.replay.files.partial_file import PartialFile\n"
-        f"held = PartialFile(Path({str(folder)!r}, 'a.txt'))"
-    )
-
-
 def test_only_partial_files_of_dead_processes_are_swept(tmp_path: Path) -> None:
-    with _child_process(_begin_partial_file(tmp_path)) as process:
+    code = (
+        "from pathlib import Path\nfrom crosscue.replay.files.partial_file import PartialFile\n"
+        f"held = PartialFile(Path({str(tmp_path)!r}, 'a.txt'))"
+    )
+    with _child_process(code) as process:
         sweep(tmp_path, again=True)
         write_text(tmp_path / "b.txt", "b")
         assert len(_partials(tmp_path)) == 1

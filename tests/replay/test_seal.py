@@ -12,9 +12,8 @@ import pytest
 from crosscue.eval.cli import run
 from crosscue.replay.base import Selection
 from crosscue.replay.errors import LogError
-from crosscue.replay.ledger import CHANGED, DIFFERS, Ledger
+from crosscue.replay.ledger import CHANGED, DIFFERS
 from crosscue.replay.limits import MIB
-from crosscue.replay.logs.opening import open_log
 from crosscue.replay.seal import seal as sealing
 from crosscue.replay.seal.seal import digests_of, read_seal, seal_path
 from support.accounted import read
@@ -23,6 +22,7 @@ from support.every_format import EVERY_FORMAT
 from support.pictures import picture_folder
 from support.refusals import refusal
 from support.rosbag_files import rows_of, write_bag, write_folder
+from support.trees import written
 
 
 def _sealed(folder: Path, kind: str) -> Path:
@@ -58,8 +58,7 @@ def _losses_text(log: Path) -> str:
 @pytest.fixture
 def long_log(tmp_path: Path) -> Path:
     """Write and seal a candump log of more than three blocks."""
-    log = tmp_path / "can.log"
-    log.write_bytes(candump(random_frames(300)) * 300)
+    log = written(tmp_path / "can.log", candump(random_frames(300)) * 300)
     assert log.stat().st_size > 3 * MIB
     assert run(["seal", str(log)]) == 0
     return log
@@ -143,8 +142,7 @@ def test_journal_of_sqlite_log_is_sealed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], suffix: str
 ) -> None:
     log = EVERY_FORMAT["rosbag2-sqlite3"](tmp_path)
-    journal = log.with_name(log.name + suffix)
-    journal.write_bytes(bytes(100))
+    journal = written(log.with_name(log.name + suffix), bytes(100))
     assert run(["seal", str(log)]) == 0
     assert set(read_seal(seal_path(log)).files) == {".", journal.name}
     _flip(journal, 30)
@@ -297,8 +295,7 @@ def test_missing_and_new_files_are_reported_in_one_line_each(tmp_path: Path) -> 
 def test_log_added_to_sealed_folder_is_not_sealed(tmp_path: Path) -> None:
     place = write_folder(tmp_path / "bag", rows_of(50))
     assert run(["seal", str(place)]) == 0
-    late = place / "can.log"
-    late.write_bytes(candump(random_frames(30)))
+    late = written(place / "can.log", candump(random_frames(30)))
 
     assert read(late)[1].is_whole
     assert "sealed" not in read(late)[1].integrity
@@ -319,10 +316,7 @@ def test_window_of_indexed_log_checks_only_its_blocks(tmp_path: Path, kind: str)
     early = Selection(end_ns=rows[200].log_ns)
 
     def losses(selection: Selection) -> list[str]:
-        ledger = Ledger(str(log))
-        with open_log(log) as opened:
-            for _ in opened.read(ledger, selection):
-                pass
+        ledger = read(log, selection)[1]
         (checked,) = re.findall(r"(\d+) of \d+ blocks|$", ledger.integrity)[:1]
         assert selection != early or 0 < int(checked) < total, ledger.integrity
         return [drop.detail for drop in ledger.drops() if drop.reason == DIFFERS]

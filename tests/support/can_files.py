@@ -63,7 +63,6 @@ def candump_line(frame: Sent) -> str:
 
 
 def candump(frames: Sequence[Sent]) -> bytes:
-    """A candump log."""
     return "".join(candump_line(frame) + "\n" for frame in frames).encode()
 
 
@@ -233,7 +232,6 @@ def _blf_object(frame: Sent, is_old: bool) -> bytes:
 
 
 def python_can_message(frame: Sent) -> can.Message:
-    """Convert a frame for python-can's writers."""
     return can.Message(
         timestamp=frame.t_ns * 1e-9,
         arbitration_id=frame.arbitration_id,
@@ -247,7 +245,6 @@ def python_can_message(frame: Sent) -> can.Message:
 
 
 def frames_of(columns: CanFrames, log_ns: Sequence[int], bus: str) -> Iterator[Sent]:
-    """Yield the rows of a block as frames."""
     for k, t_ns in enumerate(log_ns):
         yield Sent(
             int(t_ns),
@@ -307,19 +304,30 @@ def damaged(intact: bytes, seed: int) -> bytes:
 
 
 def assert_equal_to_python_can(
-    path: Path, peer: Iterable[can.Message], bus: str = "{}", within_ns: int = 300, missing: int = 0
+    path: Path,
+    peer: Iterable[can.Message],
+    within_ns: int = 300,
+    missing: int = 0,
+    *,
+    by_id: bool = False,
 ) -> None:
-    """Compare our frames with python-can's, whose times are floats in seconds."""
+    """Compare our frames with python-can's, whose times are floats in seconds.
+
+    With ``by_id``, the order of frames with different identifiers does not matter.
+    """
     found, ledger = read_back(path)
     theirs: dict[str, list[can.Message]] = {}
     for message in peer:
-        theirs.setdefault(bus.format(message.channel), []).append(message)
+        theirs.setdefault(f"can/{message.channel}", []).append(message)
     assert ledger.topic("").dropped.total() == missing
     assert missing or ledger.is_whole
     assert {name: len(frames) for name, frames in found.items()} == {
         name: len(messages) for name, messages in theirs.items()
     }
     for name, frames in found.items():
+        if by_id:
+            frames.sort(key=lambda one: one.arbitration_id)
+            theirs[name].sort(key=lambda one: one.arbitration_id)
         for ours, message in zip(frames, theirs[name], strict=True):
             assert ours.arbitration_id == message.arbitration_id
             assert ours.payload == bytes(message.data)

@@ -89,7 +89,6 @@ class Verdict:
 
 
 def judge(kind: Kind, frames: Sequence[Sent], intact: bytes, copy: bytes, path: Path) -> Verdict:
-    """Read ``copy``, a truncated or damaged ``intact``, and compare it with ``frames``."""
     path.write_bytes(copy)
     try:
         open_log(path).close()

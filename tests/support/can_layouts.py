@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from crosscue.replay.can.layout import CanMessage, CanSignal
-from crosscue.replay.columns import Block, CanFrames
+from crosscue.replay.columns import DATA, Block, CanFrames
 
 from .data import shared
 
@@ -58,23 +60,27 @@ def ford_frames() -> Block:
 
 def frames_of(
     payload: NDArray[np.uint8],
-    arbitration_id: NDArray[np.uint32] | int,
-    is_extended: NDArray[np.bool_] | bool = False,
-    length: NDArray[np.uint8] | None = None,
+    arbitration_id: ArrayLike,
+    is_extended: ArrayLike = False,
+    length: ArrayLike | None = None,
+    kind: ArrayLike = DATA,
+    is_fd: ArrayLike | None = None,
 ) -> CanFrames:
     """Frames with the given payloads; CAN FD if longer than 8 bytes."""
     n, carried = payload.shape
-    width = 8 if carried <= 8 else 64
-    data = np.zeros((n, width), dtype=np.uint8)
+    data = np.zeros((n, 8 if carried <= 8 else 64), dtype=np.uint8)
     data[:, :carried] = payload
-    lengths = np.full(n, carried, dtype=np.uint8) if length is None else length
+
+    def column(values: ArrayLike, kind: type[np.generic]) -> NDArray[Any]:
+        return np.broadcast_to(np.asarray(values, kind), n).copy()
+
     return CanFrames(
-        arbitration_id=np.broadcast_to(np.uint32(arbitration_id), n).copy(),
-        is_extended=np.broadcast_to(np.bool_(is_extended), n).copy(),
-        kind=np.zeros(n, dtype=np.uint8),
-        length=lengths,
+        arbitration_id=column(arbitration_id, np.uint32),
+        is_extended=column(is_extended, np.bool_),
+        kind=column(kind, np.uint8),
+        length=column(carried if length is None else length, np.uint8),
         data=data,
-        is_fd=np.full(n, carried > 8),
+        is_fd=column(carried > 8 if is_fd is None else is_fd, np.bool_),
     )
 
 
@@ -83,8 +89,15 @@ def block_of(frames: CanFrames, topic: str = "can0") -> Block:
     return Block(topic, np.arange(len(frames), dtype=np.int64) * 1_000_000, frames)
 
 
+def join(blocks: Sequence[Block]) -> Block:
+    """Concatenate blocks of frames."""
+    rows = [b.rows for b in blocks if isinstance(b.rows, CanFrames)]
+    columns = ("arbitration_id", "is_extended", "kind", "length", "data", "is_fd")
+    joined = CanFrames(*(np.concatenate([getattr(r, name) for r in rows]) for name in columns))
+    return Block(blocks[0].topic, np.concatenate([b.log_ns for b in blocks]), joined)
+
+
 def dbc_text(messages: list[CanMessage]) -> str:
-    """A DBC file that defines ``messages``."""
     lines = ['VERSION ""', "NS_ :", "BS_:", "BU_: ECU"]
     tail = []
     for message in messages:

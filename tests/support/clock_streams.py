@@ -68,5 +68,4 @@ def watch(block: Block, rows_per_block: int = 700) -> ClockReport:
 
 
 def watch_stream(stream: Stream, rows_per_block: int = 700) -> ClockReport:
-    """Return the clock report on a simulated stream with log times and header stamps."""
     return watch(table_of("/s", stream.log_ns(), stream.header_ns()), rows_per_block)

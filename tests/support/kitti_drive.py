@@ -31,7 +31,6 @@ def true_path(count: int) -> tuple[Floats, Floats]:
 
 
 def packet_lines(count: int) -> list[str]:
-    """OXTS packets of the path."""
     east_north, yaw = true_path(count)
     enu = np.column_stack([east_north, np.zeros(count)])
     matrix = ecef_to_enu_matrix(np.radians(ORIGIN[0]), np.radians(ORIGIN[1]))
@@ -51,7 +50,6 @@ def packet_lines(count: int) -> list[str]:
 
 
 def raw_drive(path: Path, count: int = 30, cameras: tuple[str, ...] = ("image_02",)) -> Path:
-    """Write the folder of a raw drive."""
     (path / "oxts" / "data").mkdir(parents=True)
     (path / "oxts" / "timestamps.txt").write_text(dates(count))
     for i, line in enumerate(packet_lines(count)):

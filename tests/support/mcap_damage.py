@@ -25,7 +25,7 @@ UNCOVERED = ("no checksum covers", "checksum is wrong", "has no checksums")
 TOPICS = ("/imu", "/can", "/camera")
 
 
-def sound_parts(compression: str, is_chunked: bool, per_chunk: int = 25) -> list[bytes | ChunkOf]:
+def sound_parts(compression: str, is_chunked: bool) -> list[bytes | ChunkOf]:
     """Six hundred messages on three topics, in chunks or as records without chunks."""
     rng = np.random.default_rng(7)
     defined = [schema(1)] + [channel(i + 1, 1, name) for i, name in enumerate(TOPICS)]
@@ -36,7 +36,7 @@ def sound_parts(compression: str, is_chunked: bool, per_chunk: int = 25) -> list
     ]
     if not is_chunked:
         return [*defined, *messages]
-    first, *rest = [messages[i : i + per_chunk] for i in range(0, len(messages), per_chunk)]
+    first, *rest = [messages[i : i + 25] for i in range(0, len(messages), 25)]
     return [ChunkOf([*defined, *first], compression), *(ChunkOf(m, compression) for m in rest)]
 
 
@@ -128,7 +128,6 @@ def _are_changed(
 
 
 def cut(coded: bytes, rng: np.random.Generator) -> bytes:
-    """Truncate a file at a random byte."""
     return coded[: int(rng.integers(0, len(coded)))]
 
 

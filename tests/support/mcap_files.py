@@ -22,7 +22,6 @@ Message: TypeAlias = tuple[int, int, bytes]
 
 
 def record(opcode: int, content: bytes) -> bytes:
-    """One record."""
     return struct.pack("<BQ", opcode, len(content)) + content
 
 
@@ -37,27 +36,23 @@ def mapping(pairs: Iterable[bytes]) -> bytes:
     return text(b"".join(pairs))
 
 
-def header(profile: str = "", library: str = "") -> bytes:
-    """A Header record."""
-    return record(1, text(profile) + text(library))
+def header(profile: str = "") -> bytes:
+    return record(1, text(profile) + text(""))
 
 
 def schema(
     number: int, name: str | bytes = "a/B", encoding: str = "ros2msg", body: bytes = b"int32 x"
 ) -> bytes:
-    """A Schema record."""
     return record(3, struct.pack("<H", number) + text(name) + text(encoding) + text(body))
 
 
 def channel(number: int, schema_id: int, topic: str | bytes, encoding: str = "cdr") -> bytes:
-    """A Channel record."""
     return record(
         4, struct.pack("<HH", number, schema_id) + text(topic) + text(encoding) + mapping([])
     )
 
 
 def message(number: int, log: int, payload: bytes = b"", publish: int | None = None) -> bytes:
-    """A Message record."""
     stamps = struct.pack("<HIQQ", number, 0, log, log if publish is None else publish)
     return record(5, stamps + payload)
 
@@ -73,6 +68,12 @@ def attachment(name: str, body: bytes, crc: int | None = None) -> bytes:
     content = struct.pack("<QQ", 0, 0) + text(name) + text("x/y") + struct.pack("<Q", len(body))
     content += body
     return record(9, content + struct.pack("<I", zlib.crc32(content) if crc is None else crc))
+
+
+def stored_chunk(body: bytes, size: int, compression: str, length: int | None = None) -> bytes:
+    """A Chunk record of a compressed body, which declares the size and length given here."""
+    fixed = struct.pack("<QQQI", 1, 1, size, 0) + text(compression)
+    return record(6, fixed + struct.pack("<Q", len(body) if length is None else length) + body)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,19 +135,15 @@ class McapFile:
     Attributes:
         parts: Encoded records or chunks of the data section, in order.
         data_crc: Write the checksum of the data section.
-        summary: Write a summary section with the three parts below.
-        repeats: Repeat the schemas and channels in the summary.
-        statistics: Write the statistics record.
-        chunk_index: Write an index of the chunks.
+        summary: Write a summary with schemas, channels and an index of the chunks.
+        statistics: Write the statistics record in it.
         summary_crc: Write the checksum of the summary.
     """
 
     parts: Sequence[bytes | ChunkOf] = field(default_factory=list)
     data_crc: bool = False
     summary: bool = True
-    repeats: bool = True
     statistics: bool = True
-    chunk_index: bool = True
     summary_crc: bool = True
 
     def coded(self) -> bytes:
@@ -178,12 +175,10 @@ class McapFile:
                     logs.append(log)
         out += record(15, struct.pack("<I", zlib.crc32(out) if self.data_crc else 0))
         summary = bytearray()
-        if self.summary and self.repeats:
+        if self.summary:
             again: list[bytes] = sorted(definitions, key=lambda one: one[0])
             summary += b"".join(again)
-        if self.summary and self.statistics:
-            summary += _statistics(counts, logs, len(indexes))
-        if self.summary and self.chunk_index:
+            summary += _statistics(counts, logs, len(indexes)) if self.statistics else b""
             summary += b"".join(indexes)
         footer = struct.pack("<BQQQ", 2, 20, len(out) if summary else 0, 0)
         crc = zlib.crc32(bytes(summary) + footer) if self.summary_crc else 0
@@ -250,3 +245,15 @@ def read_back(
                 )
             )
     return Reading(messages, ledger, names)
+
+
+def read_coded(
+    folder: Path,
+    coded: bytes | bytearray | McapFile,
+    selection: Selection = EVERYTHING,
+    limits: Limits = DEFAULT_LIMITS,
+) -> Reading:
+    """Read the file with these bytes, which remains in the folder as ``log.mcap``."""
+    path = folder / "log.mcap"
+    path.write_bytes(coded.coded() if isinstance(coded, McapFile) else coded)
+    return read_back(path, selection, limits)

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -41,12 +40,7 @@ class MemoryLog:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
@@ -58,6 +52,5 @@ def wheel_block(t_ns: Sequence[int], speed_mps: Sequence[float]) -> Block:
 
 
 def gyro_block(t_ns: Sequence[int], yaw_rate_radps: Sequence[float]) -> Block:
-    """Yaw rates of a gyro."""
     column: Floats = np.asarray(yaw_rate_radps, np.float64)
     return Block("gyro", np.asarray(t_ns, np.int64), Table({"gyro_z_radps": column}))

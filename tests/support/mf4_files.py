@@ -10,16 +10,16 @@ from crosscue.replay.columns import DATA, ERROR, REMOTE
 from .can_files import FD_LENGTHS, START_NS, Sent
 
 KINDS = {DATA: "CAN_DataFrame", REMOTE: "CAN_RemoteFrame", ERROR: "CAN_ErrorFrame"}
-VALUE, VARIABLE, MASTER, VIRTUAL_MASTER, MAX_LENGTH, VIRTUAL = 0, 1, 2, 3, 5, 6
+VALUE, VARIABLE, MASTER, VIRTUAL = 0, 1, 2, 6
 UNSIGNED, REAL, BYTES = 0, 4, 10
 
 
 class Blocks:
     """A file under construction, in which children precede their parents."""
 
-    def __init__(self, *, is_finalized: bool, flags: int, version: bytes = b"4.11    ") -> None:
+    def __init__(self, *, is_finalized: bool, flags: int) -> None:
         name = b"MDF     " if is_finalized else b"UnFinMF "
-        head = name + version + b"test    " + bytes(4) + struct.pack("<H", 411) + bytes(30)
+        head = name + b"4.11    test    " + bytes(4) + struct.pack("<H", 411) + bytes(30)
         self.content = bytearray(head + struct.pack("<HH", flags, 0))
         self.add(b"##HD", [0] * 6, struct.pack("<QhhBBBxdd", START_NS, 0, 0, 0, 0, 0, 0.0, 0.0))
 
@@ -45,10 +45,6 @@ class Blocks:
         raw = text.encode() + b"\0"
         return self.add(b"##TX", [], raw + bytes(-len(raw) % 8))
 
-    def linear(self, offset: float, factor: float) -> int:
-        """Write a linear conversion."""
-        return self.conversion(1, (offset, factor))
-
     def conversion(self, type_: int, values: Sequence[float]) -> int:
         """Write a conversion of any type without texts."""
         body = struct.pack("<BBHHHdd", type_, 0, 0, 0, len(values), 0.0, 0.0)
@@ -67,7 +63,6 @@ class Field:
     data_type: int = UNSIGNED
     conversion: tuple[int, tuple[float, ...]] | None = None
     data: int = 0
-    invalid_bit: int | None = None
 
 
 def constant(name: str, value: float) -> Field:
@@ -86,7 +81,6 @@ class Made:
         encode: Function from a frame and the offset of its payload to its record.
         identifier: Record identifier in unsorted data.
         values: Identifier of the group with its payloads, None without one.
-        invalid_bytes: Number of invalidation bytes at the end of each record.
     """
 
     name: str
@@ -95,7 +89,6 @@ class Made:
     encode: Callable[[Sent, int], bytes]
     identifier: int = 0
     values: int | None = None
-    invalid_bytes: int = 0
     count: int = field(default=0, init=False)
     stored: int = field(default=0, init=False)
 
@@ -110,25 +103,15 @@ def channels(blocks: Blocks, fields: Sequence[Field]) -> int:
     for one in reversed(fields):
         conversion = blocks.conversion(*one.conversion) if one.conversion else 0
         name = blocks.text(one.name)
-        is_master = one.type in (MASTER, VIRTUAL_MASTER)
-        flags, invalid = (0, 0) if one.invalid_bit is None else (2, one.invalid_bit)
         body = struct.pack(
-            "<BBBBLLLLBBHdddddd",
-            one.type,
-            int(is_master),
-            one.data_type,
-            one.bit,
-            one.byte,
-            one.bits,
-            flags,
-            invalid,
-            *[0] * 9,
+            "<BBBBLL60x",
+            *(one.type, int(one.type == MASTER), one.data_type, one.bit, one.byte, one.bits),
         )
         following = blocks.add(b"##CN", [following, 0, name, 0, conversion, one.data, 0, 0], body)
     return following
 
 
-def one_group(id_bytes_of_offset: int = 8) -> Made:
+def one_group() -> Made:
     """The group of older CANedge firmware, with payloads of variable length."""
     prefix = "CAN_DataFrame."
 
@@ -137,7 +120,7 @@ def one_group(id_bytes_of_offset: int = 8) -> Made:
         word = int(frame.is_extended) | int(frame.bus) << 1 | frame.arbitration_id << 3
         code = FD_LENGTHS.index(len(frame.payload))
         rest = len(frame.payload) << 1 | code << 12 | int(frame.is_fd) << 8
-        return struct.pack("<dLHQ", ticks, word, rest, offset)[: 14 + id_bytes_of_offset]
+        return struct.pack("<dLHQ", ticks, word, rest, offset)
 
     fields = [
         Field("Timestamp", 0, 64, type=MASTER, data_type=REAL, conversion=(1, (0.0, 1e-9))),
@@ -147,11 +130,11 @@ def one_group(id_bytes_of_offset: int = 8) -> Made:
         Field(prefix + "IDE", 8, 1, 0),
         Field(prefix + "DLC", 13, 4, 4),
         Field(prefix + "DataLength", 12, 7, 1),
-        Field(prefix + "DataBytes", 14, 8 * id_bytes_of_offset, type=VARIABLE, data_type=BYTES),
+        Field(prefix + "DataBytes", 14, 64, type=VARIABLE, data_type=BYTES),
         Field(prefix + "Dir", 12, 1, 0),
         Field(prefix + "EDL", 13, 1, 0),
     ]
-    return Made("CAN_DataFrame", 14 + id_bytes_of_offset, fields, encode)
+    return Made("CAN_DataFrame", 22, fields, encode)
 
 
 def virtual_group(bus: int, kind: int, *, is_extended: bool, is_fd: bool, is_long: bool) -> Made:
@@ -323,7 +306,7 @@ def _channel_group(
     name = blocks.text(group.name)
     source = blocks.add(b"##SI", [name, 0, 0], struct.pack("<BBB5x", 2, 2, 0))
     count = group.count if is_finalized else 0
-    body = struct.pack("<QQHH4xLL", group.identifier, count, 6, 0, group.size, group.invalid_bytes)
+    body = struct.pack("<QQHH4xLL", group.identifier, count, 6, 0, group.size, 0)
     return blocks.add(b"##CG", [following, first, name, source, 0, 0], body)
 
 
@@ -357,9 +340,9 @@ def _store(
     return at or listed
 
 
-def deflated(part: bytes, coding: int, columns: int = 20) -> bytes:
-    """The body of a compressed block."""
-    original = part
+def deflated(part: bytes, coding: int) -> bytes:
+    """The body of a compressed block; transposition is of 20 columns."""
+    original, columns = part, 20
     if coding == 1:
         rows = len(part) // columns
         transposed = b"".join(part[c : rows * columns : columns] for c in range(columns))

@@ -1,12 +1,13 @@
 """Mobileye frames from hexadecimal text, or random ones within the ranges of the layout table."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from crosscue.replay.columns import DATA, Block, CanFrames, Floats, Int64s, Table
+from crosscue.replay.columns import DATA, Block, Floats, Int64s, Table
 from crosscue.replay.mobileye.bits import Words, payloads_of, place_bits
 from crosscue.replay.mobileye.layout import BitField, Message, layout
+from support.can_layouts import frames_of, join
 
 MS = 1_000_000
 
@@ -17,37 +18,22 @@ def frames(
     topic: str = "can1",
     kind: int = DATA,
     is_extended: bool = False,
-    is_fd: bool = False,
 ) -> Block:
     """Frames from pairs of identifier and hexadecimal bytes, by default a millisecond apart."""
     payloads = [bytes.fromhex(text) for _, text in sent]
     n = len(sent)
-    data = np.zeros((n, 64 if is_fd else 8), dtype=np.uint8)
+    data = np.zeros((n, 8), dtype=np.uint8)
     for row, payload in enumerate(payloads):
         data[row, : len(payload)] = list(payload)
     times = list(range(0, n * MS, MS)) if log_ns is None else list(log_ns)
-    rows = CanFrames(
-        np.array([i for i, _ in sent], dtype=np.uint32),
-        np.full(n, is_extended),
-        np.full(n, kind, dtype=np.uint8),
-        np.array([len(p) for p in payloads], dtype=np.uint8),
-        data,
-        np.full(n, is_fd),
-    )
+    lengths = [len(payload) for payload in payloads]
+    rows = frames_of(data, [i for i, _ in sent], is_extended, lengths, kind)
     return Block(topic, np.array(times, dtype=np.int64), rows)
 
 
-def join(blocks: Sequence[Block]) -> Block:
-    """Concatenate blocks of frames."""
-    rows = [b.rows for b in blocks if isinstance(b.rows, CanFrames)]
-    columns = ("arbitration_id", "is_extended", "kind", "length", "data", "is_fd")
-    joined = CanFrames(*(np.concatenate([getattr(r, name) for r in rows]) for name in columns))
-    return Block(blocks[0].topic, np.concatenate([b.log_ns for b in blocks]), joined)
-
-
-def status(count: int, counter_ms: int, tail: str = "00F203", length: int = 6) -> tuple[int, str]:
+def status(count: int, counter_ms: int, length: int = 6) -> tuple[int, str]:
     """A status frame that announces ``count`` obstacles."""
-    text = f"{count:02X}{counter_ms & 0xFF:02X}{tail}"
+    text = f"{count:02X}{counter_ms & 0xFF:02X}00F203"
     return 0x738, text + "00" * (length - len(text) // 2)
 
 
@@ -105,19 +91,9 @@ def _random_raw(f: BitField, n: int, rng: np.random.Generator) -> Int64s:
 def block_of(
     words: Words, ids: Int64s, lengths: Int64s, log_ns: Int64s, topic: str = "can1"
 ) -> Block:
-    """Frames from payload words."""
-    n = len(words)
     data = payloads_of(words)
     data = np.where(np.arange(8) < lengths[:, None], data, 0).astype(np.uint8)
-    rows = CanFrames(
-        ids.astype(np.uint32),
-        np.zeros(n, dtype=np.bool_),
-        np.zeros(n, dtype=np.uint8),
-        lengths.astype(np.uint8),
-        data,
-        np.zeros(n, dtype=np.bool_),
-    )
-    return Block(topic, log_ns, rows)
+    return Block(topic, log_ns, frames_of(data, ids, length=lengths))
 
 
 def random_drive(
@@ -161,6 +137,20 @@ def _burst(
         np.array(lengths, dtype=np.int64),
         log_ns + np.arange(n, dtype=np.int64) * step_ns,
     )
+
+
+def tables_of(blocks: Iterable[Block]) -> dict[str, Table]:
+    """Join the tables of a decoder by the last part of their topics."""
+    parts: dict[str, list[Table]] = {}
+    for block in blocks:
+        assert isinstance(block.rows, Table)
+        parts.setdefault(block.topic.rpartition("/")[2], []).append(block.rows)
+    joined = {}
+    for name, tables in parts.items():
+        columns = list(tables[0].columns)
+        assert all(list(table.columns) == columns for table in tables)
+        joined[name] = Table({c: np.concatenate([t[c] for t in tables]) for c in columns})
+    return joined
 
 
 def values(table: Table, name: str) -> Floats:

@@ -9,6 +9,7 @@ from typing import Any, Final
 from support.pictures import picture
 from support.street_map import Bound, crossing_lanes
 
+COUNT: Final = 12
 FIRST_US: Final = 1_532_402_927_612_460
 SPEED_MPS: Final = 6.0
 YAW_RATE_RADPS: Final = 0.1
@@ -29,7 +30,6 @@ def pose(seconds: float) -> tuple[float, float, float]:
 
 
 def turn_wxyz(yaw: float) -> list[float]:
-    """Quaternion of a rotation about z."""
     return [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
 
 
@@ -39,8 +39,8 @@ def table(folder: Path, name: str, keys: str, rows: Iterable[Sequence[object]]) 
     (folder / f"{name}.json").write_text(json.dumps(content, indent=0))
 
 
-def nuscenes_drive(path: Path, count: int = 12, *, with_can: bool = True, scenes: int = 1) -> Path:
-    """Write a data root with one scene of ``count`` pictures at 10 Hz, every fifth a key frame."""
+def nuscenes_drive(path: Path, scenes: int = 1) -> Path:
+    """Write a data root with one scene of 12 pictures at 10 Hz, every fifth a key frame."""
     tables = path / "v1.0-mini"
     tables.mkdir(parents=True)
     names = [f"scene-{61 + i:04d}" for i in range(scenes)]
@@ -59,8 +59,8 @@ def nuscenes_drive(path: Path, count: int = 12, *, with_can: bool = True, scenes
             ("clid", "lid", [0.9, 0.0, 1.8], [1.0, 0.0, 0.0, 0.0], []),
         ],
     )
-    times_us = [FIRST_US + 100_000 * i for i in range(count)]
-    keys = range(0, count, 5)
+    times_us = [FIRST_US + 100_000 * i for i in range(COUNT)]
+    keys = range(0, COUNT, 5)
     samples = [(f"p{i}", times_us[i], "s0", "", "") for i in keys]
     table(tables, "sample", "token timestamp scene_token prev next", samples)
     data, poses = [], []
@@ -77,8 +77,7 @@ def nuscenes_drive(path: Path, count: int = 12, *, with_can: bool = True, scenes
     table(tables, "sample_data", f"{references} {columns}", data)
     table(tables, "ego_pose", "token timestamp translation rotation", poses)
     _boxes(tables, keys)
-    if with_can:
-        _can(path, count)
+    _can(path)
     return path
 
 
@@ -165,7 +164,7 @@ def _boxes(tables: Path, keys: Iterable[int]) -> None:
     )
 
 
-def _can(path: Path, count: int) -> None:
+def _can(path: Path) -> None:
     """Write CAN messages; steering is positive to the right, wheel speeds are in rpm."""
     folder = path / "can_bus"
     folder.mkdir()
@@ -174,7 +173,7 @@ def _can(path: Path, count: int) -> None:
         (SPEED_MPS + side * 0.75 * YAW_RATE_RADPS) * per_mps
         for side in (-1, 1, -1, 1)  # front left and right, rear left and right
     ]
-    times = [FIRST_US + 10_000 * i for i in range(10 * count)]
+    times = [FIRST_US + 10_000 * i for i in range(10 * COUNT)]
     wheels = "FL_wheel_speed FR_wheel_speed RL_wheel_speed RR_wheel_speed"
     turn, still = [0.0, 0.0, YAW_RATE_RADPS], [1.0, 0.0, 0.0, 0.0]
     for name, keys, row in (

@@ -12,6 +12,7 @@ from support.every_format import EVERY_FORMAT
 from support.mcap_files import McapFile, channel, message, schema
 from support.openpilot_drive import START_NS, TURN, event
 from support.rosbag_files import TOPICS, rows_of, write_bag
+from support.trees import written
 
 
 def _garbled_line(path: Path) -> None:
@@ -59,9 +60,7 @@ def _mcap(folder: Path) -> Path:
     """Write messages without chunks, so that no checksum covers more than one."""
     messages = [message(1, 10 * i, b"%4d" % i) for i in range(20)]
     file = McapFile([schema(1), channel(1, 1, "/a"), *messages], summary=False)
-    path = folder / "log.mcap"
-    path.write_bytes(file.coded())
-    return path
+    return written(folder / "log.mcap", file.coded())
 
 
 def _unknown_channel(path: Path) -> None:

@@ -82,7 +82,6 @@ def event_type() -> Any:
 
 
 def event(t_ns: int, **kind: object) -> bytes:
-    """Return a message of one kind with these fields."""
     coded: bytes = event_type().new_message(logMonoTime=t_ns, **kind).to_bytes()
     return coded
 
@@ -92,7 +91,6 @@ def _index(i: int) -> dict[str, int]:
 
 
 def at_ns(i: int) -> int:
-    """Return the time of a frame."""
     return START_NS + 50_000_000 * i + 12_000_000
 
 
@@ -139,7 +137,6 @@ def drive_messages(frames: int) -> list[bytes]:
 
 
 def openpilot_drive(folder: Path, frames: int = 24, name: str = "rlog.bz2") -> Path:
-    """Write a segment with a log and a video."""
     folder.mkdir(parents=True)
     coded = b"".join(drive_messages(frames))
     (folder / name).write_bytes(bz2.compress(coded) if name.endswith(".bz2") else coded)

@@ -178,7 +178,6 @@ def ros1_topic(name: str, type_name: str, text: str | None = None) -> Topic:
 
 
 def decoder_of(topic: Topic) -> Decoder:
-    """Return the decoder of a topic, which must have one."""
     decoder = decoder_for(topic)
     assert decoder is not None
     return decoder

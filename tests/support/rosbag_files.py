@@ -130,7 +130,6 @@ def read_rows(path: Path, selection: Selection = EVERYTHING) -> Reading:
 
 
 def by_topic(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Group rows by topic, in their order."""
     sorted_rows: dict[str, list[Row]] = {}
     for row in rows:
         sorted_rows.setdefault(row.topic, []).append(row)
@@ -213,19 +212,31 @@ def damaged_copies(intact: bytes, cuts: int, flips: int, seed: int) -> Iterator[
         yield f"{kind} {length} at {at}", bytes(copy)
 
 
+def faults(
+    path: Path,
+    truth: Sequence[Row],
+    seed: int,
+    calm: frozenset[str] = frozenset(),
+    forbidden: tuple[str, ...] = ("SILENT",),
+) -> list[tuple[str, Verdict]]:
+    """Judge 60 cut and 140 damaged copies of a file; return those with a forbidden verdict."""
+    judged = []
+    for how, copy in damaged_copies(path.read_bytes(), cuts=60, flips=140, seed=seed):
+        path.write_bytes(copy)
+        judged.append((how, judge(path, truth, calm)))
+    return [one for one in judged if one[1].startswith(forbidden)]
+
+
 def header_field(name: bytes, value: bytes) -> bytes:
-    """One field of a ROS 1 record header."""
     return struct.pack("<I", len(name) + 1 + len(value)) + name + b"=" + value
 
 
 def record(body: bytes, **fields: bytes) -> bytes:
-    """One ROS 1 record."""
     header = b"".join(header_field(name.encode(), value) for name, value in fields.items())
     return struct.pack("<I", len(header)) + header + struct.pack("<I", len(body)) + body
 
 
 def u32(value: int) -> bytes:
-    """A number of 32 bits."""
     return struct.pack("<I", value)
 
 
@@ -235,7 +246,6 @@ def stamp(t_ns: int) -> bytes:
 
 
 def connection(conn: int, topic: bytes, type_name: bytes = b"std_msgs/String") -> bytes:
-    """A connection record."""
     body = b"".join(
         header_field(name, value)
         for name, value in (
@@ -249,7 +259,6 @@ def connection(conn: int, topic: bytes, type_name: bytes = b"std_msgs/String") -
 
 
 def message(conn: int, t_ns: int, payload: bytes) -> bytes:
-    """A message record."""
     return record(payload, op=b"\x02", conn=u32(conn), time=stamp(t_ns))
 
 

@@ -6,6 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from crosscue.datasets.truth.lanelet2 import read_map
+from crosscue.datasets.truth.road_map import Ahead, RoadMap
+
 # Latitude and longitude of the frame's origin, degrees.
 ORIGIN = (49.0, 8.4)
 
@@ -144,6 +149,15 @@ def write_crossing(path: Path) -> Path:
     """Write a street to the east with a crossing at 60 m."""
     points_m = {"a": (-80.0, 0.0), "b": (60.0, 0.0), "c": (160.0, 0.0), "d": (60.0, 70.0)}
     return write_map(path, points_m, [("abc", ""), ("bd", "")])
+
+
+def roads_of(path: Path) -> RoadMap:
+    return read_map(path).around((*ORIGIN, 0.0))
+
+
+def ahead_of(roads: RoadMap, x_m: float, y_m: float, heading_rad: float = 0.0) -> Ahead | None:
+    """The next intersection from a place."""
+    return roads.along(np.array([[x_m, y_m]]), np.array([heading_rad]))[0]
 
 
 def _tags(text: str) -> str:

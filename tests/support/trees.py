@@ -1,4 +1,4 @@
-"""Contents of folders as values that can be compared."""
+"""Files, and contents of folders as values that can be compared."""
 
 import hashlib
 import json
@@ -8,6 +8,13 @@ from crosscue.eval.runs.folder import TIMINGS
 
 # Files that depend on the time and place of processing.
 NO_RESULTS = {".drives", "failure.log", TIMINGS}
+
+
+def written(path: Path, content: str | bytes | bytearray) -> Path:
+    """Write a file, and return its path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
 
 
 def contents(folder: Path) -> dict[str, bytes]:

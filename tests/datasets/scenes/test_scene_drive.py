@@ -31,7 +31,9 @@ from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
+from support.accounted import read
 from support.refusals import refusal
+from support.trees import written
 
 TINY = SceneCamera(width_px=192, height_px=108)
 
@@ -77,13 +79,9 @@ def test_picture_spacing_does_not_change_times_of_other_sensors(
 def test_every_row_is_read_back_and_pictures_have_their_size(files: SceneFiles) -> None:
     import cv2
 
-    ledger = Ledger(str(files.log))
-    with open_log(files.log) as log:
-        for _ in log.read(ledger):
-            pass
-        declared = {topic.name: topic.declared for topic in log.topics}
+    _, ledger = read(files.log)
     assert ledger.is_whole
-    assert declared[IMAGES] == declared[CALIBRATION] == files.pictures
+    assert {ledger.topic(one).declared for one in (IMAGES, CALIBRATION)} == {files.pictures}
     count = 0
     for block in blocks(files.log, IMAGES):
         assert isinstance(block.rows, Images)
@@ -227,8 +225,7 @@ CUE: dict[str, Any] = {"cue": "stop_sign", "present": True}
     ],
 )
 def test_inconsistent_truth_is_refused(tmp_path: Path, more: dict[str, Any], message: str) -> None:
-    path = tmp_path / "truth.json"
-    path.write_text(json.dumps(MINIMAL_TRUTH | more))
+    path = written(tmp_path / "truth.json", json.dumps(MINIMAL_TRUTH | more))
 
     with pytest.raises(SchemaError, match=message):
         read_truth(path)

@@ -29,15 +29,16 @@ from crosscue.replay.can.layout import (
 )
 from crosscue.replay.columns import DATA, ERROR, LENGTH_UNKNOWN, REMOTE, Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.logs.opening import open_log
 from crosscue.replay.mobileye.can.admit import Admission, all_ids
 from crosscue.replay.mobileye.settings import MobileyeSettings
+from support.accounted import read_topics
 from support.can_layouts import (
     block_of,
     comma2k19_frames,
     dbc_text,
     ford_frames,
     frames_of,
+    join,
     messages,
 )
 from support.data import shared
@@ -265,19 +266,10 @@ IDS = st.sampled_from([0x100, 0x101, 0x200, 0x300, 0x400, 0x500])
 def test_every_frame_is_decoded_or_counted(
     rows: list[tuple[int, bool, int, int, int, bool]], allow_longer: bool
 ) -> None:
-    columns = (
-        [np.array(column) for column in zip(*rows, strict=True)] if rows else [np.zeros(0)] * 6
-    )
+    ids, extended, kinds, lengths, first, fd = np.array(rows, np.int64).reshape(-1, 6).T
     data = np.zeros((len(rows), 64), dtype=np.uint8)
-    data[:, 0] = columns[4]
-    frames = CanFrames(
-        arbitration_id=columns[0].astype(np.uint32),
-        is_extended=columns[1].astype(np.bool_),
-        kind=columns[2].astype(np.uint8),
-        length=columns[3].astype(np.uint8),
-        data=data,
-        is_fd=columns[5].astype(np.bool_),
-    )
+    data[:, 0] = first
+    frames = frames_of(data, ids, extended, lengths, kinds, fd)
     decode, ledger = decoder(allow_longer)
     ledger.find("can0", len(rows))
 
@@ -293,13 +285,7 @@ def test_every_frame_is_decoded_or_counted(
 def canedge_frames() -> Block:
     """Return all frames of the first bus of the real CSS log in one block."""
     path = shared("can", "css_canedge", "3BA199E2", "00000164", "00000001-60FE3F04.MF4")
-    with open_log(path) as log:
-        blocks = [b for b in log.read(Ledger("canedge")) if b.topic == "can/1"]
-    frames = [b.rows for b in blocks if isinstance(b.rows, CanFrames)]
-    assert len(frames) == len(blocks)
-    names = ("arbitration_id", "is_extended", "kind", "length", "data", "is_fd")
-    columns = [np.concatenate([getattr(f, name) for f in frames]) for name in names]
-    return Block("can/1", np.concatenate([b.log_ns for b in blocks]), CanFrames(*columns))
+    return join(read_topics(path)[0]["can/1"])
 
 
 BUSES: dict[str, tuple[tuple[str, ...], Callable[[], Block]]] = {
@@ -417,14 +403,8 @@ def test_each_frame_is_accounted_for_by_exactly_one_decoder(
     frames: list[tuple[int, int, bool, bool, int]],
 ) -> None:
     ids, kinds, extended, fd, lengths = (np.array(column) for column in zip(*frames, strict=True))
-    rows = CanFrames(
-        ids.astype(np.uint32),
-        extended,
-        kinds.astype(np.uint8),
-        lengths.astype(np.uint8),
-        np.zeros((len(frames), 8), np.uint8),
-        fd,
-    )
+    data = np.zeros((len(frames), 8), np.uint8)
+    rows = frames_of(data, ids, extended, lengths, kinds, fd)
     log_ns = np.arange(len(frames), dtype=np.int64)
     ledger = Ledger("made up")
     car = BusDecoder(

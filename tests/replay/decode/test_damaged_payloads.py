@@ -7,16 +7,12 @@ from typing import Any, Final
 
 import numpy as np
 import pytest
-from google.protobuf import (  # type: ignore[import-untyped]
-    descriptor_pb2,
-    descriptor_pool,
-    message_factory,
-)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crosscue.replay.columns import Topic
 from crosscue.replay.ledger import Ledger
+from support.protobuf_types import F, proto_topic
 from support.ros_messages import (
     block_of,
     decoder_of,
@@ -28,7 +24,6 @@ from support.ros_messages import (
 )
 
 PICTURE: Final = b"\xff\xd8" + bytes(range(64))
-F: Final = descriptor_pb2.FieldDescriptorProto
 
 
 def _ros2(rng: np.random.Generator, name: str) -> tuple[Topic, bytes]:
@@ -62,19 +57,8 @@ def _json(rng: np.random.Generator, kind: str) -> tuple[Topic, bytes]:
 
 
 def _protobuf(rng: np.random.Generator, kind: str) -> tuple[Topic, bytes]:
-    files = descriptor_pb2.FileDescriptorSet()
-    file = files.file.add(name="made.proto", package="made", syntax="proto3")
-    thing = file.message_type.add(name="Thing")
-    for number, (name, code) in enumerate(
-        (("value", F.TYPE_DOUBLE), ("text", F.TYPE_STRING)), start=1
-    ):
-        thing.field.add(name=name, number=number, type=code, label=F.LABEL_OPTIONAL)
-    pool = descriptor_pool.DescriptorPool()
-    pool.Add(file)
-    message: Any = message_factory.GetMessageClass(pool.FindMessageTypeByName("made.Thing"))()
-    message.value, message.text = float(rng.random()) + 1.0, "words"
-    topic = Topic("/t", "made.Thing", "protobuf", files.SerializeToString(), "protobuf")
-    return topic, message.SerializeToString()
+    topic, of = proto_topic("Thing", (("value", 1, F.TYPE_DOUBLE), ("text", 2, F.TYPE_STRING)))
+    return topic, of(value=float(rng.random()) + 1.0, text="words").SerializeToString()
 
 
 KINDS: Final[dict[str, tuple[Callable[[np.random.Generator, str], tuple[Topic, bytes]], str]]] = {

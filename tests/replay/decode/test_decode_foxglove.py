@@ -7,12 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from google.protobuf import (  # type: ignore[import-untyped]
-    descriptor_pb2,
-    descriptor_pool,
-    message_factory,
-    timestamp_pb2,
-)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,9 +15,9 @@ from crosscue.replay.decode import decoder_for
 from crosscue.replay.decode.refuse import MISFIT
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
+from support.protobuf_types import F, proto_topic, schema_of
 from support.ros_messages import block_of, decoder_of
 
-F = descriptor_pb2.FieldDescriptorProto
 QUICK = settings(max_examples=60, deadline=None)
 STAMP = ("timestamp", 1, F.TYPE_MESSAGE, ".google.protobuf.Timestamp")
 IMAGE = (
@@ -51,39 +45,6 @@ FIX = (
 )
 
 
-def schema_of(name: str, fields: Any) -> bytes:
-    """Return a FileDescriptorSet that defines ``foxglove.<name>`` and its imports."""
-    file = descriptor_pb2.FileDescriptorProto(
-        name=f"foxglove/{name}.proto",
-        package="foxglove",
-        syntax="proto3",
-        dependency=["google/protobuf/timestamp.proto"],
-    )
-    message = file.message_type.add(name=name)
-    for field_name, number, kind, *rest in fields:
-        each = message.field.add(name=field_name, number=number, type=kind, label=F.LABEL_OPTIONAL)
-        if rest and rest[0]:
-            each.type_name = rest[0]
-        if len(rest) > 1:
-            each.label = F.LABEL_REPEATED
-    stamp = descriptor_pb2.FileDescriptorProto()
-    timestamp_pb2.DESCRIPTOR.CopyToProto(stamp)
-    # The importing file is first on purpose, because the order in a set is undefined.
-    return bytes(descriptor_pb2.FileDescriptorSet(file=[file, stamp]).SerializeToString())
-
-
-def message_class(schema: bytes, name: str) -> Any:
-    pool = descriptor_pool.DescriptorPool()
-    files = descriptor_pb2.FileDescriptorSet.FromString(schema).file
-    for file in reversed(files):
-        pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{name}"))
-
-
-def proto_topic(name: str, fields: Any) -> Topic:
-    return Topic("/t", f"foxglove.{name}", "protobuf", schema_of(name, fields), "protobuf")
-
-
 def stamped(cls: Any, seconds: int, nanos: int) -> Any:
     """Return a message of the class with its timestamp set."""
     message = cls()
@@ -92,8 +53,7 @@ def stamped(cls: Any, seconds: int, nanos: int) -> Any:
 
 
 def test_raw_images_keep_size_and_pixel_format() -> None:
-    topic = proto_topic("RawImage", RAW)
-    cls = message_class(topic.schema, "RawImage")
+    topic, cls = proto_topic("RawImage", RAW)
     message = stamped(cls, 1, 0)
     message.width, message.height, message.step, message.encoding = 4, 2, 12, "rgb8"
     message.data = bytes(24)
@@ -139,7 +99,7 @@ def test_invalid_descriptor_is_refused_in_one_line(schema: bytes, complaint: str
 @given(raw=st.binary(max_size=80), name=st.sampled_from(["CompressedImage", "LocationFix"]))
 @QUICK
 def test_arbitrary_bytes_are_decoded_or_dropped(raw: bytes, name: str) -> None:
-    topic = proto_topic(name, IMAGE if name == "CompressedImage" else FIX)
+    topic, _ = proto_topic(name, IMAGE if name == "CompressedImage" else FIX)
     ledger = Ledger("made")
     ledger.find("/t", 1)
 
@@ -229,8 +189,7 @@ def test_json_values_keep_dtype_and_missing_values_are_nan() -> None:
 
 
 def test_compressed_images_are_byte_ranges_of_payloads() -> None:
-    topic = proto_topic("CompressedImage", IMAGE)
-    cls = message_class(topic.schema, "CompressedImage")
+    topic, cls = proto_topic("CompressedImage", IMAGE)
     pictures = [b"\xff\xd8" + bytes(300), b"\x89PNG\r\n\x1a\n" + bytes(9)]
     payloads = []
     for i, picture in enumerate(pictures):
@@ -259,8 +218,7 @@ def test_unknown_protobuf_type_has_dotted_columns() -> None:
         ("again", 6, F.TYPE_MESSAGE, ".foxglove.Made"),
         ("name", 7, F.TYPE_STRING),
     )
-    topic = proto_topic("Made", fields)
-    cls = message_class(topic.schema, "Made")
+    topic, cls = proto_topic("Made", fields)
     message = stamped(cls, 9, 1)
     message.count, message.gain, message.on = 2**64 - 1, 0.5, True
     message.list.extend([1, 2, 3])

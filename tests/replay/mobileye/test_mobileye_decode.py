@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crosscue.replay.columns import Block, CanFrames, Int64s, Table
+from crosscue.replay.columns import Block, Int64s, Table
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.bits import extract, leading_words, payloads_of, place_bits
@@ -20,7 +20,8 @@ from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.layout import VARIANTS, describe, layout, parse_layout
 from crosscue.replay.mobileye.settings import MobileyeSettings
 from crosscue.replay.mobileye.wire import values_of
-from support.mobileye_frames import MS, frames, random_drive, status, values
+from support.can_layouts import frames_of
+from support.mobileye_frames import MS, frames, random_drive, status, tables_of, values
 
 ORIGIN_MOUNTING = DevicePosition()
 DEVICE_FRAME = MobileyeSettings(mounting=ORIGIN_MOUNTING)
@@ -33,24 +34,13 @@ def decode(
     blocks = [blocks] if isinstance(blocks, Block) else blocks
     ledger = Ledger("log")
     decoder = MobileyeDecoder("can1", ledger, how)
-    decoded_blocks: list[Block] = []
+    decoded: list[Block] = []
     for block in blocks:
         ledger.find("can1", len(block))
-        decoded_blocks += decoder(block)
-    decoded_blocks += decoder.flush()
-    tables: dict[str, list[Table]] = {}
-    for block in decoded_blocks:
-        assert isinstance(block.rows, Table)
-        tables.setdefault(block.topic.removeprefix("can1/mobileye/"), []).append(block.rows)
-    complete = {name: stack(parts) for name, parts in tables.items()}
-    assert ledger.topic("can1").used == frames_in(complete)
-    return complete, ledger
-
-
-def stack(parts: list[Table]) -> Table:
-    names = list(parts[0].columns)
-    assert all(list(part.columns) == names for part in parts)
-    return Table({name: np.concatenate([part[name] for part in parts]) for name in names})
+        decoded += decoder(block)
+    tables = tables_of([*decoded, *decoder.flush()])
+    assert ledger.topic("can1").used == frames_in(tables)
+    return tables, ledger
 
 
 def frames_in(tables: dict[str, Table]) -> int:
@@ -63,16 +53,14 @@ def skipped(ledger: Ledger) -> Counter[str]:
     return ledger.topic("can1").skipped
 
 
-LEFT_LANE = [(0x766, "A13EFE0A80FF7F0A"), (0x767, "0D80801E")]
+LANE = frames([status(0, 0), (0x766, "A13EFE0A80FF7F0A"), (0x767, "0D80801E")])
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.03])
 def test_lane_is_transformed_to_vehicle_frame(yaw_rad: float) -> None:
     mounting = DevicePosition(1.7, -0.2, yaw_rad)
-    in_device_frame, _ = decode(frames([status(0, 0), *LEFT_LANE]))
-    in_vehicle_frame, _ = decode(
-        frames([status(0, 0), *LEFT_LANE]), MobileyeSettings(mounting=mounting)
-    )
+    in_device_frame, _ = decode(LANE)
+    in_vehicle_frame, _ = decode(LANE, MobileyeSettings(mounting=mounting))
 
     for x_m in (0.0, 10.0, 30.0):
         y_m = cubic(in_device_frame["lanes"], x_m)
@@ -136,14 +124,10 @@ def test_arbitrary_frames_are_accounted_for(seed: int) -> None:
     lengths = rng.choice([2, 3, 4, 6, 7, 8, 8, 8, 8], n)
     data = rng.integers(0, 256, (n, 8)) * (np.arange(8) < lengths[:, None])
     steps = rng.choice([0, MS, 70 * MS, -(10**9)], n, p=[0.3, 0.6, 0.08, 0.02])
-    rows = CanFrames(
-        np.where(rng.random(n) < 0.05, 0x123, ids).astype(np.uint32),
-        rng.random(n) < 0.02,
-        rng.choice([0, 0, 0, 0, 0, 0, 1, 2], n).astype(np.uint8),
-        lengths.astype(np.uint8),
-        data.astype(np.uint8),
-        rng.random(n) < 0.02,
-    )
+    ids = np.where(rng.random(n) < 0.05, 0x123, ids)
+    extended, kinds = rng.random(n) < 0.02, rng.choice([0, 0, 0, 0, 0, 0, 1, 2], n)
+    fd = rng.random(n) < 0.02
+    rows = frames_of(data.astype(np.uint8), ids, extended, lengths, kinds, fd)
     cut = n // 2
     block = Block("can1", 10**18 + np.cumsum(steps), rows)
     decode([block.take(np.s_[:cut]), block.take(np.s_[cut:])])  # checks that the ledger adds up

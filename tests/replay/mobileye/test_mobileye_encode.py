@@ -1,5 +1,7 @@
 """Encoding and decoding of Mobileye tables are inverse to each other."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,21 +10,11 @@ from hypothesis import strategies as st
 from crosscue.replay.columns import Block, CanFrames, Table
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
-from crosscue.replay.mobileye.can.encode import LATENCY_NS, bursts_of, encode_tables
+from crosscue.replay.mobileye.can.encode import bursts_of, encode_tables
 from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.layout import Columns, Message, layout
 from crosscue.replay.mobileye.settings import MobileyeSettings
-from support.mobileye_frames import MS, block_of, random_drive, random_words, values
-
-
-def encode_burst(
-    image_ns: int, objects: Table, settings: MobileyeSettings, *, latency_ns: int = LATENCY_NS
-) -> Block:
-    """Return the frames of one image: a status frame, then A, B and C of each sent obstacle."""
-    times = np.array([image_ns], dtype=np.int64)
-    objects = Table({**objects.columns, "t_ns": np.full(len(objects), image_ns, dtype=np.int64)})
-    return encode_tables(bursts_of(times, objects, settings, latency_ns=latency_ns), settings)
-
+from support.mobileye_frames import MS, block_of, random_drive, random_words, tables_of, values
 
 ROTATED = MobileyeSettings(mounting=DevicePosition(1.85, -0.1, 0.02))
 UNROTATED = MobileyeSettings(mounting=DevicePosition(1.85, -0.1))
@@ -36,19 +28,12 @@ def decode(block: Block, how: MobileyeSettings) -> list[Block]:
     return decoded
 
 
-def table(blocks: list[Block], name: str) -> Table:
-    rows = [b.rows for b in blocks if b.topic.endswith(f"/{name}")]
-    tables = [r for r in rows if isinstance(r, Table)]
-    return Table({n: np.concatenate([t[n] for t in tables]) for n in tables[0].columns})
-
-
 def assert_same_frames(actual: Block, expected: Block) -> None:
     assert isinstance(actual.rows, CanFrames)
     assert isinstance(expected.rows, CanFrames)
     np.testing.assert_array_equal(actual.log_ns, expected.log_ns)
-    np.testing.assert_array_equal(actual.rows.arbitration_id, expected.rows.arbitration_id)
-    np.testing.assert_array_equal(actual.rows.length, expected.rows.length)
-    np.testing.assert_array_equal(actual.rows.data, expected.rows.data)
+    for name in ("arbitration_id", "length", "data"):
+        np.testing.assert_array_equal(getattr(actual.rows, name), getattr(expected.rows, name))
 
 
 @pytest.mark.slow
@@ -56,9 +41,7 @@ def assert_same_frames(actual: Block, expected: Block) -> None:
 @pytest.mark.parametrize("how", [ROTATED, UNROTATED])
 @given(seed=st.integers(0, 100_000))
 @settings(max_examples=12)
-def test_encoding_decoded_tables_restores_frames(
-    revision: str, how: MobileyeSettings, seed: int
-) -> None:
+def test_encoding_founds_restores_frames(revision: str, how: MobileyeSettings, seed: int) -> None:
     """Lanes are included only without a mounting angle, because rotating them is not exact."""
     drive = random_drive(5, np.random.default_rng(seed), revision, has_lanes=how is UNROTATED)
     assert_same_frames(encode_tables(decode(drive, how), how, "can1"), drive)
@@ -93,13 +76,9 @@ def test_standalone_messages_round_trip_byte_for_byte(message: Message, variant:
 
 
 def settings_for(variant: str) -> MobileyeSettings:
-    unrotated_mounting = DevicePosition(1.85, -0.1)
-    return {
-        "classic": MobileyeSettings(revision="classic", mounting=unrotated_mounting),
-        "2.32": MobileyeSettings(revision="2.32", mounting=unrotated_mounting),
-        "extended": MobileyeSettings(family="extended", mounting=unrotated_mounting),
-        "tsr": MobileyeSettings(family="tsr", mounting=unrotated_mounting),
-    }.get(variant, MobileyeSettings(mounting=unrotated_mounting))
+    setting = {"classic": "revision", "2.32": "revision", "extended": "family", "tsr": "family"}
+    more = {setting[variant]: variant} if variant in setting else {}
+    return replace(UNROTATED, **more)  # type: ignore[arg-type]
 
 
 def scene(seed: int, n: int) -> tuple[Columns, list[int]]:
@@ -146,18 +125,16 @@ MAX_ERROR = {
 def test_decoded_obstacles_are_within_half_a_step(seed: int, n: int) -> None:
     columns, image_ns = scene(seed, n)
     blocks = bursts_of(np.array(image_ns, dtype=np.int64), Table(columns), UNROTATED)
-    sent = table(blocks, "obstacles")
-    decoded_table = table(decode(encode_tables(blocks, UNROTATED, "can1"), UNROTATED), "obstacles")
+    sent = tables_of(blocks)["obstacles"]
+    found = tables_of(decode(encode_tables(blocks, UNROTATED, "can1"), UNROTATED))["obstacles"]
 
-    assert len(sent) == len(decoded_table)
+    assert len(sent) == len(found)
     for name, max_error in MAX_ERROR.items():
-        np.testing.assert_allclose(
-            values(decoded_table, name), values(sent, name), atol=max_error + 1e-9
-        )
+        np.testing.assert_allclose(values(found, name), values(sent, name), atol=max_error + 1e-9)
     for name in ("obstacle_id", "type", "status", "age_frames", "cipv", "brake_lights", "slot"):
-        np.testing.assert_array_equal(decoded_table[name], sent[name])
+        np.testing.assert_array_equal(found[name], sent[name])
     is_matched = ~np.isnan(values(sent, "radar_x_m"))
-    radar = values(decoded_table, "radar_vx_mps")
+    radar = values(found, "radar_vx_mps")
     np.testing.assert_allclose(
         radar[is_matched], values(sent, "radar_vx_mps")[is_matched], atol=1 / 32
     )
@@ -174,6 +151,7 @@ def test_decoded_obstacles_are_within_half_a_step(seed: int, n: int) -> None:
     ],
 )
 def test_value_out_of_message_range_is_refused(column: str, value: float, message: str) -> None:
-    objects = Table({"x_m": np.array([30.0]), "y_m": np.array([0.0]), column: np.array([value])})
+    t_ns = np.array([10**18])
+    objects = {"x_m": np.array([30.0]), "y_m": np.array([0.0]), column: np.array([value])}
     with pytest.raises(ValueError, match=message):
-        encode_burst(10**18, objects, UNROTATED)
+        encode_tables(bursts_of(t_ns, Table(objects | {"t_ns": t_ns}), UNROTATED), UNROTATED)

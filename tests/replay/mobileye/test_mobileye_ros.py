@@ -15,13 +15,14 @@ from crosscue.replay.mobileye.geometry import DevicePosition
 from crosscue.replay.mobileye.layout import layout
 from crosscue.replay.mobileye.ros.reader import VOTES_WANTED, RosMobileye
 from crosscue.replay.mobileye.settings import MobileyeSettings
+from support.can_layouts import join
 from support.mobileye_frames import (
     MS,
     frames,
-    join,
     random_drive,
     random_words,
     status,
+    tables_of,
     triple,
     values,
 )
@@ -30,17 +31,6 @@ from support.mobileye_ros import TOPIC_TYPES, messages_of
 BUS_SETTINGS = MobileyeSettings(
     mounting=DevicePosition(1.9, 0.1), family="extended", ros_lane_sign="right"
 )
-
-
-def tables_of(blocks: Sequence[Block]) -> dict[str, Table]:
-    parts: dict[str, list[Table]] = {}
-    for block in blocks:
-        assert isinstance(block.rows, Table)
-        parts.setdefault(block.topic.rpartition("/")[2], []).append(block.rows)
-    return {
-        name: Table({c: np.concatenate([t[c] for t in tables]) for c in tables[0].columns})
-        for name, tables in parts.items()
-    }
 
 
 def tables_from_can(block: Block, how: MobileyeSettings = BUS_SETTINGS) -> dict[str, Table]:

@@ -18,10 +18,11 @@ import zstandard
 
 from crosscue.replay.limits import DEFAULT_LIMITS, MIB
 from support.can_files import blf, random_frames
-from support.mcap_files import MAGIC, ChunkOf, channel, header, message, record, schema, text
+from support.mcap_files import MAGIC, ChunkOf, channel, header, message, schema, stored_chunk
 from support.measured import measured
 from support.mf4_files import unsorted
 from support.rosbag_files import bag, chunk, connection, rows_of, write_folder
+from support.trees import written
 
 BOMB_BYTES = 1 << 30
 # Memory limit of a process that refuses a bomb, including Python and its libraries.
@@ -31,8 +32,9 @@ Writer = Callable[[Path], Path]
 
 
 @cache
-def zstd_bomb() -> bytes:
-    packer = zstandard.ZstdCompressor(write_content_size=False).compressobj()
+def zstd_bomb(size: int = -1) -> bytes:
+    """Return a zstd frame that declares its size, unless it is -1."""
+    packer = zstandard.ZstdCompressor(write_content_size=size >= 0).compressobj(size=size)
     return b"".join(packer.compress(PIECE) for _ in range(BOMB_BYTES >> 20)) + packer.flush()
 
 
@@ -50,18 +52,13 @@ def bz2_bomb() -> bytes:
     return b"".join(packer.compress(PIECE) for _ in range(64)) + packer.flush()
 
 
-def mcap(body: bytes, compression: str, declared: int) -> bytes:
-    """Write a recording with a valid chunk and a bomb."""
-    sound = ChunkOf([schema(1), channel(1, 1, "/a"), message(1, 1, b"\0\1\0\0\1\0\0\0")])
-    head = struct.pack("<QQQI", 1, 1, declared, 0) + text(compression)
-    return MAGIC + header() + sound.coded() + record(6, head + struct.pack("<Q", len(body)) + body)
-
-
 def _chunk(suffix: str, coding: str, body: Callable[[], bytes], declared: int) -> Writer:
     def make(folder: Path) -> Path:
         path = folder / f"bomb{suffix}"
         if suffix == ".mcap":
-            path.write_bytes(mcap(body(), coding, declared))
+            parts = [schema(1), channel(1, 1, "/a"), message(1, 1, b"\0\1\0\0\1\0\0\0")]
+            sound = MAGIC + header() + ChunkOf(parts).coded()
+            path.write_bytes(sound + stored_chunk(body(), declared, coding))
         else:
             bag(path, connection(0, b"/a"), chunk(body(), coding.encode(), declared))
         return path
@@ -89,33 +86,29 @@ def _blf(declared: int) -> Writer:
     return make
 
 
-def _in_db3(content: Callable[[], bytes]) -> Writer:
+def _in_db3(size: int) -> Writer:
     def make(folder: Path) -> Path:
         bag = write_folder(folder / "bag", rows_of(40))
         (path,) = bag.glob("*.db3")
         with sqlite3.connect(path) as database:
             database.execute(
                 "UPDATE messages SET data = ? WHERE id = (SELECT max(id) FROM messages)",
-                (content(),),
+                (zstd_bomb(size),),
             )
         return path
 
     return make
 
 
-@cache
-def _zstd_with_declared_size() -> bytes:
-    """Return a zstd frame that declares its size."""
-    packer = zstandard.ZstdCompressor().compressobj(size=BOMB_BYTES)
-    return b"".join(packer.compress(PIECE) for _ in range(BOMB_BYTES >> 20)) + packer.flush()
+def _bag_with_zstd_file(size: int) -> Writer:
+    def make(folder: Path) -> Path:
+        bag = write_folder(folder / "bag", rows_of(40))
+        (plain,) = bag.glob("*.db3")
+        plain.with_name(plain.name + ".zstd").write_bytes(zstd_bomb(size))
+        plain.unlink()
+        return bag
 
-
-def _bag_with_zstd_file(folder: Path) -> Path:
-    bag = write_folder(folder / "bag", rows_of(40))
-    (plain,) = bag.glob("*.db3")
-    plain.with_name(plain.name + ".zstd").write_bytes(zstd_bomb())
-    plain.unlink()
-    return bag
+    return make
 
 
 def _in_wal(folder: Path) -> Path:
@@ -129,7 +122,7 @@ def _in_wal(folder: Path) -> Path:
         database.execute("PRAGMA wal_autocheckpoint = 0")
         database.execute(
             "UPDATE messages SET data = ? WHERE id = (SELECT max(id) FROM messages)",
-            (_zstd_with_declared_size(),),
+            (zstd_bomb(BOMB_BYTES),),
         )
         database.commit()
         for one in bag.glob("*.db3*"):
@@ -151,18 +144,9 @@ def _mf4(size: int, declared: int) -> Writer:
         second = sound.index(b"##DZ", sound.index(b"##DZ") + 1)
         sound += bytes(-len(sound) % 8)
         listed = sound.replace(struct.pack("<Q", second), struct.pack("<Q", len(sound)), 1)
-        path = folder / "bomb.mf4"
-        path.write_bytes(listed + block)
-        return path
+        return written(folder / "bomb.mf4", listed + block)
 
     return make
-
-
-def _bag_with_zstd_file_of_declared_size(folder: Path) -> Path:
-    bag = _bag_with_zstd_file(folder)
-    (packed,) = bag.glob("*.zstd")
-    packed.write_bytes(_zstd_with_declared_size())
-    return bag
 
 
 BYTES, CHUNK, MESSAGE = BOMB_BYTES, DEFAULT_LIMITS.chunk_bytes, DEFAULT_LIMITS.message_bytes
@@ -178,13 +162,13 @@ LOGS: dict[str, tuple[Writer, int, object, object]] = {
     "bag lz4 more than declared": (_chunk(".bag", "lz4", lz4_bomb, 1000), 3, 1000, "more"),
     "BLF over the limit": (_blf(BYTES), 3, BYTES, CHUNK),
     "BLF more than declared": (_blf(1000), 3, "more than 1000", "declares 1000"),
-    "db3 message over the limit": (_in_db3(_zstd_with_declared_size), 3, BYTES, MESSAGE),
-    "db3 message without declared size": (_in_db3(zstd_bomb), 3, f"more than {MESSAGE}", MESSAGE),
+    "db3 message over the limit": (_in_db3(BOMB_BYTES), 3, BYTES, MESSAGE),
+    "db3 message without declared size": (_in_db3(-1), 3, f"more than {MESSAGE}", MESSAGE),
     "MF4 over the limit": (_mf4(BYTES, BYTES), 3, BYTES, CHUNK),
     "MF4 more than declared": (_mf4(BYTES, 500), 3, "more than 500", "declares 500"),
     "db3 message in the WAL": (_in_wal, 3, BYTES, MESSAGE),
-    "zstd file with declared size": (_bag_with_zstd_file_of_declared_size, 4, BYTES, CHUNK),
-    "zstd file": (_bag_with_zstd_file, 4, r"\d+ bytes decompress", CHUNK),
+    "zstd file with declared size": (_bag_with_zstd_file(BYTES), 4, BYTES, CHUNK),
+    "zstd file": (_bag_with_zstd_file(-1), 4, r"\d+ bytes decompress", CHUNK),
 }
 
 
@@ -219,11 +203,8 @@ def test_gzip_file_is_refused_without_decompression(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["message", "file"])
 def test_max_chunk_option_limits_zstd_size_in_bag(tmp_path: Path, kind: str) -> None:
-    path = (
-        _in_db3(_zstd_with_declared_size)(tmp_path)
-        if kind == "message"
-        else _bag_with_zstd_file_of_declared_size(tmp_path)
-    )
+    make = _in_db3 if kind == "message" else _bag_with_zstd_file
+    path = make(BOMB_BYTES)(tmp_path)
 
     status, output, _ = measured(["info", str(path), "--max-chunk", "2"])
 

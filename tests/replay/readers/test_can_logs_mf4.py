@@ -1,7 +1,8 @@
-"""MDF 4 logs: bus logging and signals, compared with python-can and asammdf."""
+"""MDF 4 logs: bus logging and signals, finalized or not, compared with python-can and asammdf."""
 
 import random
 import warnings
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -9,16 +10,19 @@ import can
 import numpy as np
 import pytest
 
-from crosscue.replay.base import EVERYTHING, Selection
-from crosscue.replay.columns import Table
+from crosscue.replay.base import Selection
+from crosscue.replay.columns import CanFrames, Table
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.readers.mf4.blocks import Blocks
-from support.can_files import assert_equal_to_python_can, random_frames, read_back
+from support.accounted import read, read_topics
+from support.can_files import Sent, assert_equal_to_python_can, by_bus, random_frames, read_back
 from support.data import shared
 from support.every_format import mf4
+from support.mf4_files import unsorted
+from support.trees import written
 
 asammdf = pytest.importorskip("asammdf")
 REAL = ("can", "css_canedge", "3BA199E2", "00000164", "00000001-60FE3F04.MF4")
@@ -34,15 +38,6 @@ def _two_groups(path: Path) -> Path:
     return path
 
 
-def _tables(path: Path, selection: Selection = EVERYTHING) -> tuple[dict[str, list[Any]], Ledger]:
-    ledger = Ledger(str(path))
-    found: dict[str, list[Any]] = {}
-    with open_log(path) as log:
-        for block in log.read(ledger, selection):
-            found.setdefault(block.topic, []).append(block)
-    return found, ledger
-
-
 def test_signals_of_all_data_types_match_asammdf_input(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     times = np.arange(500) * 1e-3
@@ -54,11 +49,12 @@ def test_signals_of_all_data_types_match_asammdf_input(tmp_path: Path) -> None:
         mdf.append([asammdf.Signal(s, times, name=t) for t, s in samples.items()])
         mdf.save(path)
 
-    found, _ = _tables(path)
+    found, _ = read_topics(path)
 
-    (blocks,) = found.values()
+    ((block,),) = found.values()
+    assert isinstance(block.rows, Table)
     for name, expected in samples.items():
-        np.testing.assert_array_equal(blocks[0].rows[name], expected)
+        np.testing.assert_array_equal(block.rows[name], expected)
 
 
 def _read_with_python_can(path: Path) -> list[can.Message]:
@@ -73,40 +69,34 @@ def _read_with_python_can(path: Path) -> list[can.Message]:
 def test_bus_logs_match_python_can(tmp_path: Path, compression: int) -> None:
     frames = [f for f in random_frames(500) if f.kind == 0]
     path = mf4(tmp_path / "x.mf4", frames, compression)
-    assert_equal_to_python_can(path, _read_with_python_can(path), "can/{}", within_ns=2_000)
+    assert_equal_to_python_can(path, _read_with_python_can(path), within_ns=2_000)
 
 
 def test_unselected_rows_are_counted_but_not_read(tmp_path: Path) -> None:
     path = _two_groups(tmp_path / "x.mf4")
-    everything, _ = _tables(path)
+    everything, _ = read_topics(path)
     times = everything["drive"][0].log_ns
 
-    found, ledger = _tables(path, Selection(frozenset({"drive"}), int(times[10]), int(times[20])))
+    found, ledger = read_topics(
+        path, Selection(frozenset({"drive"}), int(times[10]), int(times[20]))
+    )
 
     assert [len(block) for block in found["drive"]] == [10]
     assert ledger.topic("drive").found == 1000
     assert ledger.topic("drive (2)").skipped.total() == 10
 
 
-def _frames_of_cut(path: Path, content: bytes, at: int) -> tuple[int, bool] | None:
-    path.write_bytes(content[:at])
-    try:
-        open_log(path).close()
-    except CrosscueError as refused:
-        message = str(refused)
-    else:
-        found, ledger = read_back(path)
-        return sum(map(len, found.values())), ledger.is_whole
-    assert "\n" not in message
-    return None
-
-
 def test_truncation_of_real_log_is_reported(tmp_path: Path) -> None:
     content = shared(*REAL).read_bytes()
+    path = tmp_path / "x.mf4"
     for at in range(5_000, len(content) - 1, len(content) // 12):
-        outcome = _frames_of_cut(tmp_path / "x.mf4", content, at)
-        if outcome is not None and outcome[0] < 65_296:
-            assert not outcome[1]
+        path.write_bytes(content[:at])
+        try:
+            blocks, ledger = read(path)
+        except CrosscueError as refused:
+            assert "\n" not in str(refused)  # noqa: PT017
+            continue
+        assert not ledger.is_whole or sum(map(len, blocks)) == 65_296
 
 
 @pytest.mark.parametrize("compression", [0, 2])
@@ -124,7 +114,7 @@ def test_damage_raises_only_crosscue_errors(tmp_path: Path, compression: int) ->
         except CrosscueError as refused:
             message = str(refused)
         else:
-            _tables(path)
+            read(path)
             continue
         assert "\n" not in message
         assert "x.mf4" in message
@@ -188,3 +178,134 @@ def test_time_range_of_bus_log_equals_filtered_complete_pass() -> None:
         assert part == {name: frames for name, frames in expected.items() if frames}
         assert ledger.is_whole
         assert sum(account.found for account in ledger.accounts.values()) == len(times)
+
+
+UNFINALIZED = [
+    (("css_unfinalized", "00000000_00000048_00000001.MF4"), {1: 1_026}),
+    (("css_unfinalized", "17BD1DB7_00000006_00000170.MF4"), {1: 2_010}),
+    (("css_unfinalized", "94C49784_00000005_00000002.MF4"), {1: 9_600}),
+    (("css_unfinalized", "FCBF0606_00002058_00000001-5FAB8E54.mf4"), {1: 17_674}),
+    (("css_unfinalized", "00000014.MF4"), {1: 14_360, 2: 14_361}),
+    (("css_unfinalized", "00000014_fin.MF4"), {1: 14_360, 2: 14_361}),
+    (("css_unfinalized", "asammdf-basics_00000001.MF4"), {1: 139_136, 9: 11_275}),
+    (("css_unfinalized", "7512BE4D_00000427_00000001.MF4"), {1: 15_302, 9: 56_707}),
+    (REAL[1:], {1: 7_692, 2: 57_604}),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("where", "expected"), UNFINALIZED, ids=[where[-1] for where, _ in UNFINALIZED]
+)
+def test_real_unfinalized_log_matches_python_can(
+    where: tuple[str, ...], expected: dict[int, int]
+) -> None:
+    path = shared("can", *where)
+    theirs = _read_with_python_can(path)
+
+    assert_equal_to_python_can(path, theirs, within_ns=1_000, by_id=True)
+
+    assert Counter(message.channel for message in theirs) == expected
+    rows = [block.rows for block in read(path)[0]]
+    sent = [one.is_tx for one in rows if isinstance(one, CanFrames) and one.is_tx is not None]
+    assert np.concatenate(sent).sum() == sum(not message.is_rx for message in theirs)
+
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "one group": {"virtual": False},
+    "virtual": {"virtual": True},
+    "identifiers of 2 bytes": {"virtual": True, "id_bytes": 2},
+    "identifiers of 4 bytes": {"virtual": False, "id_bytes": 4},
+    "identifiers of 8 bytes": {"virtual": True, "id_bytes": 8},
+    "values before their records": {"virtual": False, "order": "before"},
+    "values after all records": {"virtual": False, "order": "last"},
+    "values of some groups after all records": {"virtual": True, "order": "last"},
+    "offsets never written": {"virtual": False, "flags": 0x65},
+    "list of blocks": {"virtual": True, "stretch": 999, "flags": 0x21},
+    "list with its last blocks missing": {"virtual": False, "stretch": 999, "flags": 0x35},
+    "deflated": {"virtual": False, "stretch": 999, "coding": 0, "flags": 0x21},
+    "transposed": {"virtual": True, "stretch": 999, "coding": 1, "flags": 0x21},
+    "deflated, last blocks missing": {"virtual": True, "stretch": 999, "coding": 0, "flags": 0x31},
+    "finalized": {"virtual": True, "is_finalized": True},
+    "finalized, one group": {"virtual": False, "is_finalized": True},
+}
+
+
+def _frames(count: int, seed: int = 1, *, virtual: bool) -> list[Sent]:
+    """Return frames for a log; the older layout contains only data frames."""
+    return [f for f in random_frames(count, seed) if virtual or f.kind == 0]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_all_layouts_of_channel_groups_yield_every_frame(tmp_path: Path, variant: str) -> None:
+    options = VARIANTS[variant]
+    frames = _frames(1_500, virtual=options["virtual"])
+    path = written(tmp_path / "x.mf4", unsorted(frames, **options).content)
+
+    found, ledger = read_back(path)
+
+    assert found == by_bus(frames, "can/{}")
+    assert ledger.is_whole
+    notice = f"not finalized by the logger; {len(frames)} records recovered from the data block"
+    assert (notice in ledger.notices) != options.get("is_finalized", False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("order", ["after", "before", "last"])
+@pytest.mark.parametrize("virtual", [False, True])
+def test_truncation_drops_only_frames_after_it(tmp_path: Path, virtual: bool, order: str) -> None:
+    frames = _frames(120, seed=3, virtual=virtual)
+    whole = unsorted(frames, virtual=virtual, order=order)
+    path = tmp_path / "x.mf4"
+    chance = random.Random(7)
+    for cut in sorted(chance.sample(range(whole.data_at, len(whole.content)), 120)):
+        path.write_bytes(whole.content[:cut])
+        inside = [f for f, end in zip(frames, whole.ends, strict=True) if end <= cut]
+
+        found, ledger = read_back(path)
+
+        assert found == by_bus(inside, "can/{}"), f"cut at {cut}"
+        if cut not in whole.starts:
+            assert not ledger.is_whole, f"cut at {cut}: no loss reported"
+        known = sum(account.dropped.total() for account in ledger.accounts.values())
+        assert known <= len(frames) - len(inside) + 1
+
+
+CUT_UNSEEN = "not finalized: a cut between two records cannot be detected"
+
+
+@pytest.mark.parametrize("variant", ["one group", "virtual", "identifiers of 2 bytes"])
+def test_cut_between_records_of_unfinalized_log_is_disclosed_as_undetectable(
+    tmp_path: Path, variant: str
+) -> None:
+    options = VARIANTS[variant]
+    whole = unsorted(_frames(100, virtual=options["virtual"]), **options)
+    path = tmp_path / "x.mf4"
+    for end in (len(whole.content), whole.starts[60]):
+        path.write_bytes(whole.content[:end])
+        _, ledger = read_back(path)
+        assert ledger.is_whole
+        assert CUT_UNSEEN in ledger.integrity
+
+    path.write_bytes(unsorted(_frames(100, virtual=True), virtual=True, is_finalized=True).content)
+    assert CUT_UNSEEN not in read_back(path)[1].integrity
+
+
+@pytest.mark.parametrize("virtual", [False, True])
+def test_unknown_record_identifier_is_reported_and_adds_no_frames(
+    tmp_path: Path, virtual: bool
+) -> None:
+    frames = _frames(100, virtual=virtual)
+    whole = unsorted(frames, virtual=virtual)
+    path = tmp_path / "x.mf4"
+    for k in (0, 17, 60):
+        content = bytearray(whole.content)
+        content[whole.starts[k]] = 0xEE
+        path.write_bytes(content)
+
+        found, ledger = read_back(path)
+
+        inside = [f for f, e in zip(frames, whole.ends, strict=True) if e <= whole.starts[k]]
+        assert found == by_bus(inside, "can/{}")
+        assert not ledger.is_whole
+        assert any("unknown record identifier 238" in drop.detail for drop in ledger.drops())

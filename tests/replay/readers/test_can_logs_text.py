@@ -1,7 +1,7 @@
 """Text logs."""
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -21,6 +21,7 @@ from crosscue.replay.readers.can_text.trc import GO_BACK, MISFIT, MISSING
 from crosscue.replay.readers.text_log import MAX_LINE, Row, TextLog
 from support.can_files import Sent, assert_equal_to_python_can, random_frames, read_back, trc
 from support.data import shared
+from support.trees import written
 
 ASC_HEAD: Final = "date Fri Jul 10 12:00:00.000 pm 2015\nbase hex  timestamps absolute\n"
 TRC_V1: Final = ";$FILEVERSION=1.1\n;$STARTTIME=25569.5\n"
@@ -49,9 +50,8 @@ def write_log(folder: Path, dialect: str, text: str | bytes, encoding: str = "la
     return path
 
 
-@pytest.mark.parametrize("mark", ".,")
 @pytest.mark.parametrize(
-    ("line", "frame"),
+    ("text", "frame"),
     [
         ("1  64 Rx d 1 0A", Sent(HALF, "can/1", 0x64, b"\n")),
         ("1  64 Tx d 0", Sent(HALF, "can/1", 0x64, b"")),
@@ -65,20 +65,6 @@ def write_log(folder: Path, dialect: str, text: str | bytes, encoding: str = "la
         ("CANFD 2 Tx 300 1 0 2 2 01 02 10 20 303000 0", FD_FRAME),
         ("CANFD 2 Rx 300 Name 1 0 2 2 01 02 10 20 303000 0", FD_FRAME),
         ("CANFD 5 Tx ErrorFrame Not Acknowledge", Sent(HALF, "can/5", 0, b"", False, ERROR, True)),
-    ],
-)
-def test_line_of_asc_log_is_read_as_frame(
-    tmp_path: Path, line: str, frame: Sent, mark: str
-) -> None:
-    found, ledger = read_back(write_log(tmp_path, "asc", f"{ASC_HEAD}   0{mark}5 {line}\n"))
-
-    assert found == {frame.bus: [frame]}
-    assert ledger.is_whole
-
-
-@pytest.mark.parametrize(
-    ("text", "frame"),
-    [
         ("(1.5) can0 123#", Sent(S15, "can0", 0x123, b"")),
         ("(1.500000001) can0 123#AA", Sent(S15 + 1, "can0", 0x123, b"\xaa")),
         ("(0001.5) a 7FF#aa R", Sent(S15, "a", 0x7FF, b"\xaa")),
@@ -105,12 +91,13 @@ def test_line_of_asc_log_is_read_as_frame(
     ],
 )
 def test_line_is_read_as_frame(tmp_path: Path, text: str, frame: Sent) -> None:
-    dialect = "trc" if text.startswith(";") else "log"
+    dialect = "trc" if text.startswith(";") else "log" if "(" in text else "asc"
+    heads = [f"{ASC_HEAD}   0{mark}5 " for mark in ".,"] if dialect == "asc" else [""]
+    for head in heads:
+        found, ledger = read_back(write_log(tmp_path, dialect, f"{head}{text}\n"))
 
-    found, ledger = read_back(write_log(tmp_path, dialect, f"{text}\n"))
-
-    assert found == {frame.bus: [frame]}
-    assert ledger.is_whole
+        assert found == {frame.bus: [frame]}
+        assert ledger.is_whole
 
 
 @pytest.mark.parametrize(
@@ -280,7 +267,7 @@ def test_real_asc_logs_match_python_can(monkeypatch: pytest.MonkeyPatch, name: s
         assert isinstance(message.channel, int)
         message.channel += 1
 
-    assert_equal_to_python_can(path, peer, "can/{}")
+    assert_equal_to_python_can(path, peer)
 
 
 @pytest.mark.parametrize(
@@ -296,30 +283,7 @@ def test_real_trc_logs_match_python_can(name: str, missing: int) -> None:
     path = shared("can", "rusefi_trc", name)
 
     # python-can rounds the start time to microseconds.
-    assert_equal_to_python_can(path, can.TRCReader(path), "can/{}", within_ns=800, missing=missing)
-
-
-@dataclass(frozen=True)
-class LogWithGaps:
-    """A log with some of its rows deleted, and the number of detectable deletions."""
-
-    text: str
-    missing: int
-
-
-def trc_without(version: str, count: int, deleted: set[int]) -> LogWithGaps:
-    """Return a log of ``count`` rows without those at ``deleted``.
-
-    Deleted rows at the end of the log cannot be detected and are not counted.
-    """
-    is_old = version < "1.2"
-    frames = [replace(f, bus="1") if is_old else f for f in random_frames(count, fd=version > "2")]
-    lines = trc(frames, version).decode().splitlines(keepends=True)
-    head, rows = lines[:-count], lines[-count:]
-    kept = [k for k in range(count) if k not in deleted]
-    last = kept[-1] if kept else -1
-    text = "".join([*head, *(rows[k] for k in kept)])
-    return LogWithGaps(text, sum(k < last for k in deleted))
+    assert_equal_to_python_can(path, can.TRCReader(path), within_ns=800, missing=missing)
 
 
 @pytest.mark.parametrize("version", ["1.0", "1.1", "1.2", "1.3", "2.1"])
@@ -328,13 +292,21 @@ def trc_without(version: str, count: int, deleted: set[int]) -> LogWithGaps:
 def test_every_deleted_row_of_trc_log_is_reported_as_dropped(
     tmp_path_factory: pytest.TempPathFactory, version: str, deleted: set[int]
 ) -> None:
-    log = trc_without(version, 60, deleted)
+    frames = random_frames(60, fd=version > "2")
+    if version < "1.2":
+        frames = [replace(f, bus="1") for f in frames]
+    lines = trc(frames, version).splitlines(keepends=True)
+    head, rows = lines[:-60], lines[-60:]
+    kept = [k for k in range(60) if k not in deleted]
+    # Rows deleted at the end cannot be detected.
+    missing = sum(k < max(kept, default=-1) for k in deleted)
+    text = b"".join([*head, *(rows[k] for k in kept)])
 
-    found, ledger = read_back(write_log(tmp_path_factory.mktemp("log"), "trc", log.text))
+    found, ledger = read_back(write_log(tmp_path_factory.mktemp("log"), "trc", text))
 
-    assert sum(map(len, found.values())) == 60 - len(deleted)
-    assert ledger.topic("").dropped == ({MISSING: log.missing} if log.missing else {})
-    assert ledger.is_whole == (not log.missing)
+    assert sum(map(len, found.values())) == len(kept)
+    assert ledger.topic("").dropped == ({MISSING: missing} if missing else {})
+    assert ledger.is_whole == (not missing)
 
 
 def numbered(*numbers: int, head: str = TRC_V1) -> str:
@@ -385,8 +357,7 @@ def row_of(line: str) -> Row:
     ["not a number", "5 1.0", "5 1.0 2.0 3.0", f"{1 << 64} 1.0 2.0", "5 1.0 " + "2" * MAX_LINE],
 )
 def test_invalid_line_is_dropped_and_others_are_read(line: str, tmp_path: Path) -> None:
-    path = tmp_path / "log.txt"
-    path.write_text(f"1 2.0 3.0\n{line}\n9 4.0 5.0\n")
+    path = written(tmp_path / "log.txt", f"1 2.0 3.0\n{line}\n9 4.0 5.0\n")
     ledger = Ledger("log.txt")
 
     (block,) = TextLog(path, "text", "/rows", ["x_m", "y_m"], row_of).read(ledger)

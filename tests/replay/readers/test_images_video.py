@@ -18,6 +18,7 @@ from crosscue.replay.limits import DEFAULT_LIMITS, Limits
 from crosscue.replay.readers.time_file import TimeFile, read_time_file
 from support.accounted import read
 from support.pictures import picture, picture_folder
+from support.trees import written
 from support.videos import number_of, numbers_at_times, video
 
 N = 24
@@ -130,8 +131,7 @@ def test_truncated_video_is_refused_or_reported(
     if not whole.exists():
         video(whole, N, codec, NO_REORDERING if codec == "libx264" else {}, container)
     raw = whole.read_bytes()
-    cut = tmp_path / f"cut{whole.suffix}"
-    cut.write_bytes(raw[: int(fraction * len(raw))])
+    cut = written(tmp_path / f"cut{whole.suffix}", raw[: int(fraction * len(raw))])
     try:
         blocks, ledger = read(cut)
     except LogError as error:
@@ -153,8 +153,7 @@ def test_damaged_video_is_read_or_refused_in_one_line(tmp_path: Path, at: int, j
     raw = bytearray(whole.read_bytes())
     start = at % len(raw)
     raw[start : start + len(junk)] = junk
-    damaged = tmp_path / "damaged.mp4"
-    damaged.write_bytes(raw)
+    damaged = written(tmp_path / "damaged.mp4", raw)
 
     try:
         blocks, _ = read(damaged)
@@ -345,8 +344,7 @@ def test_invalid_line_is_refused_with_its_number(tmp_path: Path, text: str, mess
 @quick
 @given(st.binary(max_size=200))
 def test_any_bytes_are_read_or_refused_in_one_line(tmp_path: Path, raw: bytes) -> None:
-    path = tmp_path / "times.txt"
-    path.write_bytes(raw)
+    path = written(tmp_path / "times.txt", raw)
     refusal, count = "", 1
     try:
         times = read_time_file(path, DEFAULT_LIMITS)

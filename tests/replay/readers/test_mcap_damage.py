@@ -26,11 +26,12 @@ from support.mcap_files import (
     channel,
     header,
     message,
-    read_back,
+    read_coded,
     record,
     schema,
-    text,
+    stored_chunk,
 )
+from support.trees import written
 
 
 def messages_of(reading: Reading) -> Counter[tuple[str, Message]]:
@@ -50,16 +51,13 @@ def messages_on_both_channels(count: int, begin: int = 0) -> list[bytes]:
     ("name", "coded"), [pytest.param(n, c, id=n.replace(" ", "-")) for n, c in sound_files()]
 )
 def test_any_damage_is_reported(name: str, coded: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    path.write_bytes(coded)
-    truth = read_back(path)
+    truth = read_coded(tmp_path, coded)
     assert truth.ledger.is_whole
     assert truth.count() >= 600
 
     bad: list[str] = []
     for what, damaged in copies(coded, seed=len(coded), cuts=6, damages=14):
-        path.write_bytes(damaged)
-        verdict = judge(path, truth)
+        verdict = judge(written(tmp_path / "log.mcap", damaged), truth)
         if verdict.kind in FORBIDDEN or (what.startswith("cut") and verdict.kind is Kind.SAME):
             bad.append(f"{what}: {verdict.kind.value}")
 
@@ -74,10 +72,7 @@ def test_flipped_byte_drops_only_its_chunk_and_reports_it(tmp_path: Path, compre
     assert isinstance(first, ChunkOf)
     at = coded.index(first.coded())
     coded[at + len(first.coded()) // 2] ^= 0x10
-    path = tmp_path / "log.mcap"
-    path.write_bytes(coded)
-
-    reading = read_back(path)
+    reading = read_coded(tmp_path, coded)
 
     dropped = {name: account.dropped.total() for name, account in reading.ledger.accounts.items()}
     assert dropped == {"/imu": 9, "/can": 8, "/camera": 8}
@@ -97,45 +92,31 @@ def test_damaged_chunk_header_is_repaired_from_index(
     third = parts[2]
     assert isinstance(third, ChunkOf)
     coded = McapFile(parts, summary_crc=has_summary_crc).coded()
-    path = tmp_path / "log.mcap"
-    path.write_bytes(coded)
-    truth = read_back(path)
+    truth = read_coded(tmp_path, coded)
     begin, name = coded.index(third.coded()), len(compression)
     # Kind, length, both times, size, compression and stored size, but not the checksum.
     for at in (*range(37 - 4), *range(37, 49 + name)):
         damaged = bytearray(coded)
         damaged[begin + at] ^= 0x41
-        path.write_bytes(damaged)
 
-        reading = read_back(path)
+        reading = read_coded(tmp_path, damaged)
 
         assert messages_of(reading) == messages_of(truth), at
         assert reading.adds_up(), at
         assert any(f"chunk at byte {begin}" in notice for notice in reading.ledger.notices), at
 
 
-def chunk_record(body: bytes, size: int, compression: str, length: int | None = None) -> bytes:
-    fixed = struct.pack("<QQQI", 1, 1, size, 0) + text(compression)
-    content = fixed + struct.pack("<Q", len(body) if length is None else length) + body
-    return record(6, content)
-
-
-def nested_zeros(size: int) -> bytes:
-    """Return a zstd frame without a declared size that decompresses to ``size`` zeros."""
-    packer = zstandard.ZstdCompressor(write_content_size=False).compressobj()
-    out = b"".join(packer.compress(bytes(1 << 20)) for _ in range(size >> 20))
-    return out + packer.flush()
-
-
 BOMBS = {
-    "declares 2^40": chunk_record(b"x" * 20, 1 << 40, "zstd", 1 << 40),
-    "declares 2^40 in a sound record": chunk_record(b"x" * 20, 1 << 40, "zstd"),
-    "decompresses to more than declared": chunk_record(nested_zeros(64 << 20), 100, "zstd"),
-    "frame declares more than chunk": chunk_record(zstandard.compress(bytes(1 << 26)), 100, "zstd"),
-    "millions of empty records": chunk_record(
+    "declares 2^40": stored_chunk(b"x" * 20, 1 << 40, "zstd", 1 << 40),
+    "declares 2^40 in a sound record": stored_chunk(b"x" * 20, 1 << 40, "zstd"),
+    "decompresses to more than declared": stored_chunk(
+        zstandard.ZstdCompressor(write_content_size=False).compress(bytes(64 << 20)), 100, "zstd"
+    ),
+    "frame declares more than chunk": stored_chunk(zstandard.compress(bytes(1 << 26)), 100, "zstd"),
+    "millions of empty records": stored_chunk(
         zstandard.compress(record(0x42, b"") * 1_000_000), 9_000_000, "zstd"
     ),
-    "unknown compression": chunk_record(b"x" * 20, 20, "brotli"),
+    "unknown compression": stored_chunk(b"x" * 20, 20, "brotli"),
     "a record of 2^63 bytes": struct.pack("<BQ", 5, 1 << 63) + bytes(50),
     "a name of 4 GB": record(4, struct.pack("<HHI", 1, 1, 0xFFFFFFFF)),
 }
@@ -144,12 +125,11 @@ BOMBS = {
 @pytest.mark.parametrize("bomb", list(BOMBS), ids=lambda name: name.replace(" ", "-"))
 def test_malicious_chunk_is_reported_quickly(tmp_path: Path, bomb: str) -> None:
     sound = ChunkOf([*DEFINITIONS, *messages_on_both_channels(10)])
-    path = tmp_path / "log.mcap"
-    path.write_bytes(MAGIC + header() + sound.coded() + BOMBS[bomb])
+    coded = MAGIC + header() + sound.coded() + BOMBS[bomb]
     limits = Limits(chunk_bytes=32 << 20, records_per_chunk=100_000)
 
     begin = time.process_time()
-    reading = read_back(path, limits=limits)
+    reading = read_coded(tmp_path, coded, limits=limits)
 
     assert time.process_time() - begin < 5.0
     assert reading.count() == 10
@@ -159,11 +139,9 @@ def test_malicious_chunk_is_reported_quickly(tmp_path: Path, bomb: str) -> None:
 @pytest.mark.parametrize("is_chunked", [True, False])
 def test_message_over_size_limit_is_skipped_with_its_size(tmp_path: Path, is_chunked: bool) -> None:
     records = [*DEFINITIONS, message(1, 1), message(1, 2, bytes(3 << 20)), message(1, 3)]
-    path = tmp_path / "log.mcap"
     file = McapFile([ChunkOf(records)]) if is_chunked else McapFile(records)
-    path.write_bytes(file.coded())
 
-    reading = read_back(path, limits=Limits(message_bytes=2 << 20))
+    reading = read_coded(tmp_path, file, limits=Limits(message_bytes=2 << 20))
 
     assert [log for log, *_ in reading.messages["/a"]] == [1, 3]
     assert dict(reading.ledger.accounts["/a"].skipped) == {"message over the size limit": 1}
@@ -173,13 +151,12 @@ def test_message_over_size_limit_is_skipped_with_its_size(tmp_path: Path, is_chu
 
 def test_schema_over_size_limit_is_omitted(tmp_path: Path) -> None:
     records = [schema(1, body=bytes(5_000)), channel(1, 1, "/a"), message(1, 1, b"x")]
-    path = tmp_path / "log.mcap"
-    path.write_bytes(McapFile([ChunkOf(records)]).coded())
+    limits = Limits(schema_bytes=1_000)
 
-    with McapLog(path, Limits(schema_bytes=1_000)) as log:
+    reading = read_coded(tmp_path, McapFile([ChunkOf(records)]), limits=limits)
+
+    with McapLog(tmp_path / "log.mcap", limits) as log:
         (topic,) = log.topics
-    reading = read_back(path, limits=Limits(schema_bytes=1_000))
-
     assert topic.schema == b""
     assert reading.count() == 1
     assert any("its schema has 5000 bytes" in notice for notice in reading.ledger.notices)
@@ -190,7 +167,6 @@ def test_schema_over_size_limit_is_omitted(tmp_path: Path) -> None:
 def test_message_whose_kind_was_damaged_is_lost_and_reported(
     kind: int, is_padded: bool, tmp_path: Path
 ) -> None:
-    path = tmp_path / "log.mcap"
     named = [schema(1), channel(1, 1, "/a"), schema(2, ""), channel(2, 2, "/b", "")]
     if is_padded:
         named = [record(one[0], one[9:] + b"\x01\xff\xff") for one in DEFINITIONS]
@@ -199,15 +175,13 @@ def test_message_whose_kind_was_damaged_is_lost_and_reported(
         for one in messages_on_both_channels(30, 1_790_000_000_000_000_000):
             records.append(one[:11] + struct.pack("<I", sequence) + one[15:])
         coded = bytearray(McapFile(records, summary=False).coded())
-        path.write_bytes(coded)
-        sound = read_back(path)
+        sound = read_coded(tmp_path, coded)
         assert sound.count() == 30
         assert sound.ledger.is_whole
 
         coded[coded.index(records[20])] = kind
-        path.write_bytes(coded)
 
-        reading = read_back(path)
+        reading = read_coded(tmp_path, coded)
 
         assert 1 <= (messages_of(sound) - messages_of(reading)).total() <= 2, sequence
         assert not reading.ledger.is_whole, sequence
@@ -218,10 +192,7 @@ def test_records_inside_payload_are_not_read_as_messages(tmp_path: Path) -> None
     records = [*DEFINITIONS, *(message(1, 10**9 + i, b"outer" + inner + b"!") for i in range(30))]
     coded = bytearray(McapFile(records, data_crc=True).coded())
     coded[coded.index(records[8])] = 0x55
-    path = tmp_path / "log.mcap"
-    path.write_bytes(coded)
-
-    reading = read_back(path)
+    reading = read_coded(tmp_path, coded)
 
     assert all(payload.startswith(b"outer") for *_, payload in reading.messages["/a"])
     assert reading.count() >= 28
@@ -239,10 +210,7 @@ def test_chunks_without_checksum_are_read_after_damaged_one(
     coded = bytearray(McapFile(parts, summary=False).coded())
     at = coded.index(parts[4].coded())
     coded[at + 1 : at + 9] = b"\xff" * 8
-    path = tmp_path / "log.mcap"
-    path.write_bytes(coded)
-
-    reading = read_back(path)
+    reading = read_coded(tmp_path, coded)
 
     assert reading.count() == 575
     assert any(f"bytes {at} to " in drop.detail for drop in reading.ledger.drops())
@@ -255,10 +223,7 @@ def test_chunk_with_zeroed_header_and_checksum_is_reported(tmp_path: Path) -> No
     coded = bytearray(McapFile(parts).coded())
     at = coded.index(third.coded())
     coded[at + 9 : at + 9 + 40 + 4] = bytes(44)
-    path = tmp_path / "log.mcap"
-    path.write_bytes(coded)
-
-    reading = read_back(path)
+    reading = read_coded(tmp_path, coded)
 
     assert reading.count() == 575
     assert not reading.ledger.is_whole
@@ -281,10 +246,7 @@ def test_file_truncated_while_open_is_reported(tmp_path: Path) -> None:
 def test_recording_after_truncated_one_is_read(tmp_path: Path) -> None:
     first = McapFile(sound_parts("zstd", is_chunked=True)).coded()
     other = [schema(1, "c/D"), channel(1, 1, "/other"), *(message(1, i, b"o") for i in range(9))]
-    path = tmp_path / "log.mcap"
-    path.write_bytes(first[: len(first) // 2] + McapFile([ChunkOf(other)]).coded())
-
-    reading = read_back(path)
+    reading = read_coded(tmp_path, first[: len(first) // 2] + McapFile([ChunkOf(other)]).coded())
 
     assert len(reading.messages["/other"]) == 9
     assert 200 < reading.count() < 400

@@ -20,8 +20,10 @@ from support.mcap_files import (
     channel,
     message,
     read_back,
+    read_coded,
     schema,
 )
+from support.trees import written
 
 TOPICS = 4
 DEFINITIONS = [schema(1), *(channel(i, 1, f"/t{i}") for i in range(TOPICS))]
@@ -68,8 +70,7 @@ def test_selection_yields_same_rows_as_complete_pass(
 ) -> None:
     selection = Selection(topics, start_ns, end_ns)
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "log.mcap"
-        path.write_bytes(file.coded())
+        path = written(Path(folder) / "log.mcap", file.coded())
         ours, whole = read_back(path, selection), read_by_complete_pass(path, selection)
 
     assert ours.messages == whole.messages
@@ -132,8 +133,8 @@ def test_start_that_the_summary_does_not_state_is_that_of_the_first_row(
     if case != "times not set":
         chunks = [chunk(1), chunk(2)]
     path = tmp_path / "x.mcap"
-    coded = McapFile([*DEFINITIONS, *first, *chunks], summary_crc=case != "no checksum").coded()
-    path.write_bytes(coded)
+    file = McapFile([*DEFINITIONS, *first, *chunks], summary_crc=case != "no checksum")
+    path.write_bytes(file.coded())
 
     with crosscue.open(path) as log:
         part = log.part(0.0).selection
@@ -145,10 +146,7 @@ def test_wrong_time_in_index_without_checksum_is_detected(tmp_path: Path) -> Non
     coded = McapFile([*DEFINITIONS, *map(chunk, range(9))], summary_crc=False).coded()
     at = coded.rindex(struct.pack("<QQ", 400, 409))
     coded = coded[:at] + struct.pack("<QQ", 400, 404) + coded[at + 16 :]
-    path = tmp_path / "x.mcap"
-    path.write_bytes(coded)
-
-    reading = read_back(path, Selection(None, 405, 505))
+    reading = read_coded(tmp_path, coded, Selection(None, 405, 505))
 
     assert [m[0] for m in reading.messages["/t0"]] == [*range(405, 410), *range(500, 505)]
     assert any("does not match the chunk" in notice for notice in reading.ledger.notices)
@@ -159,10 +157,7 @@ def test_inconsistent_message_counts_are_reported(tmp_path: Path) -> None:
     counts = struct.pack("<HQ", 0, 90)
     before, _, after = file.coded().rpartition(counts)
     coded = before + struct.pack("<HQ", 0, 91) + after
-    path = tmp_path / "x.mcap"
-    path.write_bytes(coded)
-
-    reading = read_back(path, Selection(None, 400, 405))
+    reading = read_coded(tmp_path, coded, Selection(None, 400, 405))
 
     assert any("do not add up" in notice for notice in reading.ledger.notices)
     assert reading.ledger.accounts["/t0"].dropped.total() == 1

@@ -80,17 +80,25 @@ def test_rows_split_over_files_are_read_in_order(
     assert by_topic(read_rows(folder).rows) == by_topic(rows)
 
 
-def test_messages_of_missing_listed_file_are_dropped_by_topic(tmp_path: Path) -> None:
+@pytest.mark.parametrize("reason", ["storage file is missing", "storage file cannot be opened"])
+def test_messages_of_missing_or_unreadable_listed_file_are_dropped_by_topic(
+    tmp_path: Path, reason: str
+) -> None:
     rows = rows_of(300)
     folder = folder_of_parts(tmp_path / "bag", rows[:100], rows[100:])
     write_metadata(folder, "part_0.db3", "part_1.db3", counts=count_by_topic(rows))
     (folder / "part_1.db3").unlink()
-    ledger = read_rows(folder).ledger
-    dropped = {name: a.dropped["storage file is missing"] for name, a in ledger.accounts.items()}
+    if "missing" not in reason:
+        (folder / "part_1.db3").write_bytes(b"nothing of the kind")
 
+    reading = read_rows(folder)
+
+    assert by_topic(reading.rows) == by_topic(rows[:100])
+    dropped = {name: a.dropped[reason] for name, a in reading.ledger.accounts.items()}
     assert {name: count for name, count in dropped.items() if count} == count_by_topic(rows[100:])
     for name, count in count_by_topic(rows).items():
-        assert ledger.topic(name).in_file == count
+        assert reading.ledger.topic(name).in_file == count
+    assert any("part_1.db3" in sentence for sentence in reading.ledger.notices)
 
 
 @pytest.mark.parametrize(
@@ -166,16 +174,3 @@ def test_two_types_on_one_topic_are_not_mixed(tmp_path: Path) -> None:
     odd = count_by_topic(rows[50:])["/can"]
 
     assert reading.ledger.topic("/can").skipped == {"another message type on the same topic": odd}
-
-
-def test_messages_of_unreadable_listed_file_are_dropped(tmp_path: Path) -> None:
-    rows = rows_of(300)
-    folder = folder_of_parts(tmp_path / "bag", rows[:100], rows[100:])
-    write_metadata(folder, "part_0.db3", "part_1.db3", counts=count_by_topic(rows))
-    (folder / "part_1.db3").write_bytes(b"nothing of the kind")
-    reading = read_rows(folder)
-
-    assert by_topic(reading.rows) == by_topic(rows[:100])
-    dropped = sum(account.dropped.total() for account in reading.ledger.accounts.values())
-    assert dropped == 200
-    assert any("part_1.db3" in sentence for sentence in reading.ledger.notices)

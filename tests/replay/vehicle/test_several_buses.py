@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from crosscue.replay.base import EVERYTHING
-from crosscue.replay.columns import DATA, Block, CanFrames, Table, Topic
+from crosscue.replay.columns import Block, Table, Topic
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.signals.extractor import SampleExtractor
 from crosscue.replay.signals.kinds import Signal
@@ -16,7 +16,9 @@ from crosscue.replay.vehicle.drafting.camera import CameraMounting
 from crosscue.replay.vehicle.drafting.observed import observe
 from crosscue.replay.vehicle.drafting.text import draft_text, examine
 from crosscue.replay.vehicle.vehicle import load, parse
+from support.can_layouts import frames_of
 from support.memory_log import MemoryLog
+from support.trees import written
 
 DBC: Final = """VERSION ""
 BU_: A
@@ -39,15 +41,7 @@ def frames(
     for place, column in enumerate(values):
         raw = np.rint(column * 100.0).astype("<i2").view(np.uint8).reshape(N, 2)
         data[:, 2 * place : 2 * place + 2] = raw
-    rows = CanFrames(
-        np.full(N, arbitration_id, np.uint32),
-        np.zeros(N, np.bool_),
-        np.full(N, DATA, np.uint8),
-        np.full(N, 8, np.uint8),
-        data,
-        np.zeros(N, np.bool_),
-    )
-    return Block(bus, T_NS, rows)
+    return Block(bus, T_NS, frames_of(data, arbitration_id))
 
 
 @pytest.fixture
@@ -72,9 +66,7 @@ def log() -> MemoryLog:
 
 @pytest.fixture
 def dbc(tmp_path: Path) -> Path:
-    file = tmp_path / "car.dbc"
-    file.write_text(DBC)
-    return file
+    return written(tmp_path / "car.dbc", DBC)
 
 
 def test_each_section_is_read_from_its_bus(log: MemoryLog, dbc: Path) -> None:

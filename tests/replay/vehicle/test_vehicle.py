@@ -5,7 +5,6 @@ import pytest
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.signals.plan import plan
-from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Compass, Vehicle, parse
 from support.memory_log import MAGNETOMETER
 
@@ -43,10 +42,6 @@ def test_invalid_setting_is_refused_with_line_number(text: str, message: str) ->
         parse(text, "car.toml")
 
 
-def fusion_of(text: str) -> Fusion:
-    return parse("version = 1\n" + text, "car.toml").fusion
-
-
 @pytest.mark.parametrize(
     ("text", "match"),
     [
@@ -74,7 +69,7 @@ def fusion_of(text: str) -> Fusion:
 )
 def test_invalid_fusion_setting_is_refused_with_hint(text: str, match: str) -> None:
     with pytest.raises(VehicleError, match=match):
-        fusion_of(text)
+        parse("version = 1\n" + text, "car.toml")
 
 
 @pytest.mark.parametrize(

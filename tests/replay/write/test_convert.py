@@ -18,12 +18,13 @@ from mcap.writer import Writer as PeerWriter
 from rosbags.highlevel import AnyReader
 
 from crosscue.eval.cli import run as crosscue
-from crosscue.replay.columns import Block, CanFrames, Topic
+from crosscue.replay.columns import Block, Topic
 from crosscue.replay.errors import OutputError
 from crosscue.replay.files.partial_file import PartialFile
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import BAD_SCHEMA, NO_TYPE, TOO_EARLY, LogWriter
 from crosscue.replay.write.mcap import ChannelMessages, Compression, McapWriter
+from support.can_layouts import frames_of
 from support.data import shared
 from support.ros_messages import messages_of, random_message, ros2_store, ros2_topic
 
@@ -215,19 +216,13 @@ def test_invalid_arguments_are_refused_and_change_no_file(
 
 def test_rows_before_1970_are_skipped_and_counted(tmp_path: Path) -> None:
     ledger = Ledger("made")
-    block = Block("can0", np.array([-5, 5], np.int64), _frames(2))
+    block = Block("can0", np.array([-5, 5], np.int64), frames_of(np.zeros((2, 8), np.uint8), 0))
     with LogWriter(tmp_path / "o.mcap", ledger) as writer:
         writer.add_topic(Topic("can0", "crosscue/CanFrames", "columns"))
         assert writer.write(block) == 1
 
     assert ledger.topic("can0").skipped == {TOO_EARLY: 1}
     assert [t for _, t, *_ in messages_in_file_order(tmp_path / "o.mcap")] == [5]
-
-
-def _frames(n: int) -> CanFrames:
-    zeros = np.zeros(n, np.uint8)
-    no = np.zeros(n, np.bool_)
-    return CanFrames(np.zeros(n, np.uint32), no, zeros, zeros, np.zeros((n, 8), np.uint8), no)
 
 
 @pytest.mark.slow
