@@ -9,9 +9,6 @@ import pytest
 from crosscue.datasets.truth.box_labels import boxes_inside, read_box_labels
 from crosscue.replay.errors import AnnotationError, UsageError
 
-BOX = (10.0, 20.0, 50.0, 60.0)
-SIZE = (100, 80)
-
 
 def coco(folder: Path) -> Path:
     tree = {
@@ -59,11 +56,11 @@ def test_every_format_yields_same_box(name: str, tmp_path: Path) -> None:
     found = read_box_labels(FORMATS[name](tmp_path))
 
     (picture,) = found.pictures
-    car, *regions = boxes_inside(picture, SIZE, Counter())
+    car, *regions = boxes_inside(picture, (100, 80), Counter())
     assert found.format == name
     assert "car" in found.labels
     assert (car.label, car.is_crowd) == ("car", False)
-    assert car.box_px == pytest.approx(BOX)
+    assert car.box_px == pytest.approx((10.0, 20.0, 50.0, 60.0))
     assert [one.is_crowd for one in regions] == ([] if name == "yolo" else [True])
     assert car.range_m == (12.5 if name in ("coco", "kitti") else None)
 

@@ -13,21 +13,17 @@ from support.phone_drive import LATE_S, START_S, YAW_RATE_RADPS, phone_drive
 ZONE_S = -5 * 3600
 
 
-def test_yaw_rate_is_about_vertical_for_tilted_phone(tmp_path: Path) -> None:
+def test_rows_have_the_axes_of_the_car_and_the_times_of_the_wall_clock(tmp_path: Path) -> None:
     found, _ = read_topics(phone_drive(tmp_path / "drive"))
 
+    # About the vertical, although the phone is tilted.
     first, *_, last = column(found["phone/gyro"], "yaw_rate_radps")
     assert (first, last) == (0.0, pytest.approx(YAW_RATE_RADPS, abs=1e-8))
-
-
-def test_position_time_is_time_of_fix_on_wall_clock(tmp_path: Path) -> None:
-    found, _ = read_topics(phone_drive(tmp_path / "drive"))
-    t_ns = times(found["phone/gnss"])
-
-    assert len(t_ns) == 6
+    assert column(found["phone/gnss"], "course_rad")[0] == pytest.approx(-math.pi / 2)
+    # A position has the time of its fix.
+    assert len(t_ns := times(found["phone/gnss"])) == 6
     assert t_ns[0] * 1e-9 == pytest.approx(START_S + ZONE_S - LATE_S)
     assert times(found["car/speed"])[0] * 1e-9 == pytest.approx(START_S + ZONE_S, abs=0.1)
-    assert column(found["phone/gnss"], "course_rad")[0] == pytest.approx(-math.pi / 2)
 
 
 def test_damaged_phone_line_is_dropped_from_each_of_its_topics(tmp_path: Path) -> None:

@@ -29,17 +29,6 @@ def _sides(roads: RoadMap, ahead: Ahead) -> set[str]:
     return {side for side, legs in roads.legs(ahead).items() if legs}
 
 
-def test_distances_are_those_to_the_kerbs_of_the_crossroad(tmp_path: Path) -> None:
-    roads = roads_of(write_map(tmp_path / "a.osm", POINTS, STREETS))
-
-    ahead = _ahead(roads, 10.0)
-
-    assert ahead is not None
-    assert ahead.start_m == pytest.approx(50.0 - 6.5, abs=0.2)
-    assert ahead.end_m == pytest.approx(50.0 + 6.5, abs=0.2)
-    assert _sides(roads, ahead) == {"left", "right", "straight", "back"}
-
-
 def test_next_intersection_of_a_drive_begins_after_the_last(tmp_path: Path) -> None:
     roads = roads_of(write_map(tmp_path / "a.osm", POINTS, STREETS))
     x_m = np.arange(-60.0, 155.0, 1.0)
@@ -66,8 +55,14 @@ def test_a_turned_or_mirrored_map_gives_the_same_distances_and_turned_legs(
     turned = {k: (c * x - s * sign * y, s * x + c * sign * y) for k, (x, y) in POINTS.items()}
     roads = roads_of(write_map(tmp_path / "a.osm", turned, STREETS))
 
-    ahead = _ahead(roads, c * 130.0, s * 130.0, np.radians(turn_deg))
+    crossing, ahead = (
+        ahead_of(roads, c * x + s * sign * 2.0, s * x - c * sign * 2.0, np.radians(turn_deg))
+        for x in (10.0, 130.0)
+    )
 
+    assert crossing is not None
+    assert [crossing.start_m, crossing.end_m] == pytest.approx([43.5, 56.5], abs=0.2)
+    assert _sides(roads, crossing) == {"left", "right", "straight", "back"}
     assert ahead is not None
     assert ahead.start_m == pytest.approx(30.0 - 3.25, abs=0.2)
     assert _sides(roads, ahead) == {"right" if mirrored else "left", "straight", "back"}

@@ -287,6 +287,29 @@ def test_truth_that_contradicts_its_log_is_refused(
     assert message in refusal((1, 4), "check", _write(tmp_path / "truth.json", tree), log)
 
 
+CUE: dict[str, Any] = {"cue": "stop_sign", "present": True}
+MOMENT: dict[str, Any] = CUE | {"t_ns": START_NS}
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"approaches": [_approach(0, 0.1), _approach(0.2, 0.3)]}, "duplicate id"),
+        ({"approaches": [_approach(0, 1)]}, f"from {START_NS} to"),
+        ({"approaches": [_approach(0, 0.1) | {"control": "yield"}]}, "approaches.0.control"),
+        ({"cues": [CUE | {"t_ns": START_NS + FRAMES * STEP_NS}]}, f"from {START_NS} to"),
+        ({"cues": [MOMENT | {"cue": "zebra"}]}, "no such cue"),
+        ({"cues": [CUE]}, "either t_ns"),
+        ({"cues": [MOMENT | {"start_ns": START_NS, "end_ns": START_NS + 1}]}, "either t_ns"),
+        ({"cues": [CUE | {"start_ns": START_NS}]}, "either t_ns"),
+        ({"cues": [MOMENT | {"approach": 3}]}, "no approach 3"),
+    ],
+)
+def test_inconsistent_truth_is_refused(tmp_path: Path, more: dict[str, Any], message: str) -> None:
+    with pytest.raises(SchemaError, match=message):
+        read_truth(_write(tmp_path / "truth.json", _truth(**more)))
+
+
 def test_every_missing_field_of_a_truth_is_named_in_one_line(tmp_path: Path) -> None:
     path = written(tmp_path / "truth.json", '{"version": 1, "approaches": [{"id": 1}, {"id": 2}]}')
 

@@ -76,17 +76,14 @@ def _depth(value: object) -> int:
     return 1 + max(map(_depth, below), default=0)
 
 
-@pytest.mark.parametrize("text", DEEP_JSON)
-def test_deeply_nested_json_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="nested"):
-        json_tree(text)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("text", DEEP_TOML)
-def test_deeply_nested_toml_is_refused(text: str) -> None:
+@pytest.mark.parametrize(
+    ("parse", "text"),
+    [*((json_tree, text) for text in DEEP_JSON), *((toml_tree, text) for text in DEEP_TOML)],
+)
+def test_deeply_nested_text_is_refused(parse: Callable[[str], object], text: str) -> None:
     with pytest.raises(ValueError, match="nested"):
-        toml_tree(text)
+        parse(text)
 
 
 _TEXTS: Final = st.text("[]{}.=#\"'\\\na ", max_size=90)

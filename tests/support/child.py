@@ -7,13 +7,7 @@ from typing import Any
 
 
 def python(code: str, *words: object, **more: Any) -> subprocess.CompletedProcess[str]:
-    """Run code that imports what this process can, and return its status and output.
-
-    Args:
-        code: The code.
-        words: Its arguments.
-        more: Further arguments of ``subprocess.run``.
-    """
+    """Run code with arguments, which imports what this process can, by ``subprocess.run``."""
     settings: dict[str, Any] = {"timeout": 120, "capture_output": True, "text": True, **more}
     path = os.pathsep.join(filter(None, sys.path))
     settings["env"] = {**(settings.get("env") or os.environ), "PYTHONPATH": path}

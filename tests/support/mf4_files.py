@@ -24,11 +24,7 @@ class Blocks:
         self.add(b"##HD", [0] * 6, struct.pack("<QhhBBBxdd", START_NS, 0, 0, 0, 0, 0, 0.0, 0.0))
 
     def add(self, kind: bytes, links: Sequence[int], body: bytes) -> int:
-        """Write one block.
-
-        Returns:
-            Offset of the block.
-        """
+        """Write one block, and return its offset."""
         self.content += bytes(-len(self.content) % 8)
         at = len(self.content)
         size = 24 + 8 * len(links) + len(body)
@@ -94,11 +90,7 @@ class Made:
 
 
 def channels(blocks: Blocks, fields: Sequence[Field]) -> int:
-    """Write a chain of channels.
-
-    Returns:
-        Link to the first one.
-    """
+    """Write a chain of channels, and return the link to the first one."""
     following = 0
     for one in reversed(fields):
         conversion = blocks.conversion(*one.conversion) if one.conversion else 0

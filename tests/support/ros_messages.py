@@ -163,6 +163,14 @@ def block_of(topic: str, payloads: Sequence[bytes], gap: int = 3) -> Block:
     return Block(topic, log_ns, messages_of(payloads, gap))
 
 
+def serialized(
+    store: Typestore, message: object, name: str, is_cdr: bool = True, *, little: bool = True
+) -> bytes:
+    if is_cdr:
+        return bytes(store.serialize_cdr(message, name, little_endian=little))
+    return bytes(store.serialize_ros1(message, name))
+
+
 def ros2_topic(name: str, type_name: str, text: str | None = None) -> Topic:
     """A CDR topic; without ``text``, the definition is from the store of rosbags."""
     if text is None:

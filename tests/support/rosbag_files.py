@@ -142,13 +142,7 @@ Verdict = Literal[
 
 
 def judge(path: Path, truth: Sequence[Row], calm: frozenset[str] = frozenset()) -> Verdict:
-    """Read a damaged copy and classify the result.
-
-    Args:
-        path: Damaged copy.
-        truth: Rows of the undamaged file.
-        calm: Notices of the undamaged file.
-    """
+    """Compare a damaged copy with the rows and notices of the undamaged file."""
     try:
         reading = read_rows(path)
     except CrosscueError:

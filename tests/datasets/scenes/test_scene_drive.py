@@ -27,13 +27,11 @@ from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.decode import BusDecoder
 from crosscue.replay.columns import Block, CanFrames, Images, Table
 from crosscue.replay.decode import decoder_for
-from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.mobileye.can.decode import MobileyeDecoder
 from support.accounted import read
 from support.refusals import refusal
-from support.trees import written
 
 TINY = SceneCamera(width_px=192, height_px=108)
 
@@ -192,40 +190,3 @@ def test_annotation_masks_match_boxes_and_areas(files: SceneFiles) -> None:
 )
 def test_invalid_arguments_are_refused(argv: list[str], message: str) -> None:
     assert message in refusal(2, *argv)
-
-
-MINIMAL_TRUTH: dict[str, Any] = {"version": 1, "start_ns": 0, "end_ns": 100}
-APPROACH: dict[str, Any] = {
-    "id": 0,
-    "intersection": "A",
-    "start_ns": 0,
-    "enter_ns": 40,
-    "control": "none",
-    "features": {"left": True, "right": False, "straight": True},
-}
-CUE: dict[str, Any] = {"cue": "stop_sign", "present": True}
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (
-            {"approaches": [APPROACH, APPROACH | {"id": 1, "start_ns": 30, "enter_ns": 60}]},
-            "overlap",
-        ),
-        ({"approaches": [APPROACH, APPROACH | {"start_ns": 50, "enter_ns": 60}]}, "duplicate id"),
-        ({"approaches": [APPROACH | {"enter_ns": 101}]}, "from 0 to 100"),
-        ({"approaches": [APPROACH | {"control": "yield"}]}, "approaches.0.control"),
-        ({"cues": [CUE | {"t_ns": 100}]}, "from 0 to 100"),
-        ({"cues": [CUE | {"cue": "zebra", "t_ns": 5}]}, "no such cue"),
-        ({"cues": [CUE]}, "either t_ns"),
-        ({"cues": [CUE | {"t_ns": 5, "start_ns": 5, "end_ns": 6}]}, "either t_ns"),
-        ({"cues": [CUE | {"start_ns": 5}]}, "either t_ns"),
-        ({"cues": [CUE | {"t_ns": 5, "approach": 3}]}, "no approach 3"),
-    ],
-)
-def test_inconsistent_truth_is_refused(tmp_path: Path, more: dict[str, Any], message: str) -> None:
-    path = written(tmp_path / "truth.json", json.dumps(MINIMAL_TRUTH | more))
-
-    with pytest.raises(SchemaError, match=message):
-        read_truth(path)

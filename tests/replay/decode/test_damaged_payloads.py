@@ -21,23 +21,16 @@ from support.ros_messages import (
     ros1_topic,
     ros2_store,
     ros2_topic,
+    serialized,
 )
 
 PICTURE: Final = b"\xff\xd8" + bytes(range(64))
 
 
-def _ros2(rng: np.random.Generator, name: str) -> tuple[Topic, bytes]:
-    store = ros2_store()
-    return ros2_topic("/t", name), bytes(
-        store.serialize_cdr(random_message(rng, store, name), name)
-    )
-
-
-def _ros1(rng: np.random.Generator, name: str) -> tuple[Topic, bytes]:
-    store = ros1_store()
-    return ros1_topic("/t", name), bytes(
-        store.serialize_ros1(random_message(rng, store, name), name)
-    )
+def _ros(rng: np.random.Generator, kind: str) -> tuple[Topic, bytes]:
+    is_cdr, name = kind == "CDR", "sensor_msgs/msg/Imu"
+    store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
+    return topic_of("/t", name), serialized(store, random_message(rng, store, name), name, is_cdr)
 
 
 def _camera(rng: np.random.Generator, kind: str) -> tuple[Topic, bytes]:
@@ -45,14 +38,14 @@ def _camera(rng: np.random.Generator, kind: str) -> tuple[Topic, bytes]:
     header: Any = random_message(rng, store, "std_msgs/msg/Header")
     pixels = np.zeros(18, np.uint8)
     message = store.types[name](header, 2, 3, "rgb8", 0, 9, pixels)
-    return ros2_topic("/t", name), bytes(store.serialize_cdr(message, name))
+    return ros2_topic("/t", name), serialized(store, message, name)
 
 
 def _json(rng: np.random.Generator, kind: str) -> tuple[Topic, bytes]:
     tree = {"timestamp": {"sec": int(rng.integers(1, 99)), "nsec": 7}, "a": float(rng.random())}
-    if kind == "picture":
+    if kind == "JSON picture":
         tree |= {"data": b64encode(PICTURE).decode(), "format": "jpeg"}
-    name = "foxglove.CompressedImage" if kind == "picture" else "made.Thing"
+    name = "foxglove.CompressedImage" if kind == "JSON picture" else "made.Thing"
     return Topic("/t", name, "json"), json.dumps(tree).encode()
 
 
@@ -61,13 +54,13 @@ def _protobuf(rng: np.random.Generator, kind: str) -> tuple[Topic, bytes]:
     return topic, of(value=float(rng.random()) + 1.0, text="words").SerializeToString()
 
 
-KINDS: Final[dict[str, tuple[Callable[[np.random.Generator, str], tuple[Topic, bytes]], str]]] = {
-    "CDR": (_ros2, "sensor_msgs/msg/Imu"),
-    "CDR picture": (_camera, ""),
-    "ROS 1": (_ros1, "sensor_msgs/msg/Imu"),
-    "JSON": (_json, ""),
-    "JSON picture": (_json, "picture"),
-    "protobuf": (_protobuf, ""),
+KINDS: Final[dict[str, Callable[[np.random.Generator, str], tuple[Topic, bytes]]]] = {
+    "CDR": _ros,
+    "CDR picture": _camera,
+    "ROS 1": _ros,
+    "JSON": _json,
+    "JSON picture": _json,
+    "protobuf": _protobuf,
 }
 
 
@@ -76,8 +69,7 @@ KINDS: Final[dict[str, tuple[Callable[[np.random.Generator, str], tuple[Topic, b
 @settings(max_examples=15)
 def test_only_the_damaged_message_is_dropped(kind: str, seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
-    make, name = KINDS[kind]
-    made = [make(rng, name) for _ in range(count)]
+    made = [KINDS[kind](rng, kind) for _ in range(count)]
     payloads = [payload for _, payload in made]
     bad = int(rng.integers(count))
     payloads[bad] = payloads[bad][: len(payloads[bad]) - int(rng.integers(4, 6))]

@@ -28,6 +28,7 @@ from support.ros_messages import (
     ros1_topic,
     ros2_store,
     ros2_topic,
+    serialized,
 )
 
 MADE = "made_msgs/msg/Root"
@@ -40,14 +41,6 @@ def generic_decoder(topic: Topic) -> RosDecoder:
     decoder = decoder_of(topic)
     assert isinstance(decoder, RosDecoder)
     return replace(decoder, kind=RosConversion((), generic))
-
-
-def serialized(
-    store: Typestore, message: object, name: str, is_cdr: bool = True, *, little: bool = True
-) -> bytes:
-    if is_cdr:
-        return bytes(store.serialize_cdr(message, name, little_endian=little))
-    return bytes(store.serialize_ros1(message, name))
 
 
 def assert_same_values(table: Table, messages: list[object], store: Typestore, name: str) -> None:

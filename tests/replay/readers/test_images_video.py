@@ -173,9 +173,6 @@ def test_constant_rate_is_reported(tmp_path: Path) -> None:
     assert "times are computed from a constant rate of 10 Hz, from 0 on" in ledger.notices
 
 
-FIVE = "0.5\n1.5\n2.5\n3.5\n4.5\n"
-
-
 S = 1_000_000_000
 
 
@@ -249,7 +246,7 @@ def test_coding_is_detected_from_content_not_suffix(tmp_path: Path) -> None:
 
 
 def test_numbering_gap_with_matching_number_of_times_is_reported(tmp_path: Path) -> None:
-    folder = picture_folder(tmp_path / "front", 6, FIVE)
+    folder = picture_folder(tmp_path / "front", 6, "0.5\n1.5\n2.5\n3.5\n4.5\n")
     (folder / "frame_2.png").unlink()
 
     blocks, ledger = read(folder)

@@ -30,6 +30,7 @@ DEFINITIONS = [schema(1), *(channel(i, 1, f"/t{i}") for i in range(TOPICS))]
 BEYOND_INT64 = 1 << 63
 TIMES = st.integers(0, 60) | st.sampled_from([BEYOND_INT64 - 1, BEYOND_INT64, (1 << 64) - 1])
 ROWS = st.lists(st.tuples(st.integers(0, TOPICS - 1), TIMES, st.binary(max_size=20)), max_size=8)
+TOPIC_SETS = st.none() | st.frozensets(st.sampled_from(["/t0", "/t1", "/t2", "/t3", "/none"]))
 BOUND = st.none() | st.integers(-5, 70) | st.just(BEYOND_INT64)
 
 
@@ -59,16 +60,8 @@ def files(draw: st.DrawFn) -> McapFile:
 
 @pytest.mark.slow
 @settings(max_examples=120)
-@given(
-    file=files(),
-    topics=st.none() | st.frozensets(st.sampled_from(["/t0", "/t1", "/t2", "/t3", "/none"])),
-    start_ns=BOUND,
-    end_ns=BOUND,
-)
-def test_selection_yields_same_rows_as_complete_pass(
-    file: McapFile, topics: frozenset[str] | None, start_ns: int | None, end_ns: int | None
-) -> None:
-    selection = Selection(topics, start_ns, end_ns)
+@given(file=files(), selection=st.builds(Selection, TOPIC_SETS, BOUND, BOUND))
+def test_selection_yields_same_rows_as_complete_pass(file: McapFile, selection: Selection) -> None:
     with TemporaryDirectory() as folder:
         path = written(Path(folder) / "log.mcap", file.coded())
         ours, whole = read_back(path, selection), read_by_complete_pass(path, selection)

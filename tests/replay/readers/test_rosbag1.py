@@ -41,8 +41,6 @@ from support.rosbag_files import (
 )
 from support.trees import written
 
-COMPRESSIONS = ("none", "bz2", "lz4", "lz4 checked")
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize("parts", [("plotjuggler", "tilt_laser.bag"), ("sail_il", "run1.bag")])
@@ -191,7 +189,7 @@ def test_chunk_with_too_many_records_is_not_read_completely(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [*COMPRESSIONS, "unclosed"])
+@pytest.mark.parametrize("kind", ["none", "bz2", "lz4", "lz4 checked", "unclosed"])
 def test_any_damage_is_reported(tmp_path: Path, kind: str) -> None:
     rows = rows_of(250)
     path = write_bag(tmp_path / "a.bag", rows, "none" if kind == "unclosed" else kind)
@@ -223,24 +221,21 @@ def read_by_complete_pass(path: Path, selection: Selection) -> Reading:
     seed=st.integers(0, 1000),
     mixed=st.sampled_from([0, 3, 300]),
     compression=st.sampled_from(["none", "bz2", "lz4"]),
-    topics=st.none() | st.frozensets(st.sampled_from(["/can", "/gps/fix", "/none"])),
-    start_ns=BOUND,
-    end_ns=BOUND,
+    selection=st.builds(
+        Selection,
+        st.none() | st.frozensets(st.sampled_from(["/can", "/gps/fix", "/none"])),
+        BOUND,
+        BOUND,
+    ),
 )
 @settings(max_examples=60)
 def test_time_range_yields_same_rows_as_complete_pass(
-    seed: int,
-    mixed: int,
-    compression: str,
-    topics: frozenset[str] | None,
-    start_ns: int | None,
-    end_ns: int | None,
+    seed: int, mixed: int, compression: str, selection: Selection
 ) -> None:
     rows = rows_of(300, seed)
     # Out of order by up to `mixed` places, so that chunks overlap in time.
     order = np.argsort(np.arange(300) + np.random.default_rng(seed).uniform(0, mixed, 300))
     rows = [rows[i] for i in order]
-    selection = Selection(topics, start_ns, end_ns)
     with TemporaryDirectory() as folder:
         path = write_bag(Path(folder) / "a.bag", rows, compression, chunk_bytes=2000)
         ours, whole = read_rows(path, selection), read_by_complete_pass(path, selection)
@@ -249,8 +244,8 @@ def test_time_range_yields_same_rows_as_complete_pass(
         row
         for row in rows
         if selection.wants(row.topic)
-        and (start_ns is None or row.log_ns >= start_ns)
-        and (end_ns is None or row.log_ns < end_ns)
+        and (selection.start_ns is None or row.log_ns >= selection.start_ns)
+        and (selection.end_ns is None or row.log_ns < selection.end_ns)
     ]
     assert by_topic(ours.rows) == by_topic(kept) == by_topic(whole.rows)
     assert ours.ledger.accounts == whole.ledger.accounts

@@ -23,14 +23,19 @@ from crosscue.replay.readers.rosbag2.pages import PageRows, page_rows
 from crosscue.replay.readers.rosbag2.sqlite import open_database
 from support.data import shared
 from support.rosbag_files import Row, damaged_copies, faults, read_rows, rows_of, write_folder
-from support.trees import written
+from support.trees import contents, written
 
-TABLES = """
+TOPICS = """
 CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
-CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);
-CREATE INDEX timestamp_idx ON messages (timestamp ASC);
 INSERT INTO topics VALUES(1, '/a', 'std_msgs/msg/String', 'cdr');
+INSERT INTO topics VALUES(300, '/b', 'std_msgs/msg/String', 'cdr');
 """
+MESSAGES = """
+CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,
+    timestamp INTEGER NOT NULL, data BLOB NOT NULL);
+"""
+INDEX = "CREATE INDEX timestamp_idx ON messages (timestamp ASC);"
+TABLES = TOPICS + MESSAGES + INDEX
 RECORDER = f"""
 import os, sqlite3, sys
 path, journal, before, after = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
@@ -54,10 +59,10 @@ os._exit(9)
 """
 
 
-def write_database(path: Path, *rows: tuple[object, ...], tables: str = TABLES) -> Path:
+def write_database(path: Path, *rows: tuple[object, ...]) -> Path:
     """Write a database with ``rows`` of topic id, timestamp and payload."""
     with sqlite3.connect(path) as db:
-        db.executescript(tables)
+        db.executescript(TABLES)
         db.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)", rows)
     db.close()
     return path
@@ -69,10 +74,6 @@ def killed_recorder(folder: Path, journal: str) -> Path:
     arguments = [sys.executable, "-c", RECORDER, str(path), journal, "600", "1000"]
     assert subprocess.run(arguments, check=False).returncode == 9
     return path
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def test_real_database_matches_rosbags() -> None:
@@ -186,16 +187,6 @@ def test_any_damage_is_reported(tmp_path: Path, compression: str) -> None:
     assert not faults(path, rows, 21, forbidden=("SILENT", "wrong"))
 
 
-TOPICS = """
-CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
-INSERT INTO topics VALUES(1, '/a', 'std_msgs/msg/String', 'cdr');
-INSERT INTO topics VALUES(300, '/b', 'std_msgs/msg/String', 'cdr');
-"""
-MESSAGES = """
-CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,
-    timestamp INTEGER NOT NULL, data BLOB NOT NULL);
-"""
-INDEX = "CREATE INDEX timestamp_idx ON messages (timestamp ASC);"
 Stored = tuple[int, int, int, bytes]
 
 
@@ -258,27 +249,25 @@ def fill(db: sqlite3.Connection, seed: int, count: int, largest: int, has_index:
 
 @pytest.mark.slow
 @given(
-    page_bytes=st.sampled_from([512, 1024, 2048, 4096, 8192, 16384, 32768, 65536]),
-    reserved=st.integers(0, 32),
-    auto_vacuum=st.integers(0, 2),
-    has_index=st.booleans(),
-    count=st.integers(0, 250),
-    largest=st.sampled_from([10, 5000, 200_000]),
-    seed=st.integers(0, 1 << 30),
+    # Bytes of a page, reserved ones of them, and the vacuum; seed, rows, largest and an index.
+    pages=st.tuples(
+        st.sampled_from([1 << k for k in range(9, 17)]), st.integers(0, 32), st.integers(0, 2)
+    ),
+    rows=st.tuples(
+        st.integers(0, 1 << 30),
+        st.integers(0, 250),
+        st.sampled_from([10, 5000, 200_000]),
+        st.booleans(),
+    ),
 )
 @settings(max_examples=40)
 def test_rows_read_from_pages_equal_sqlite_rows(
     tmp_path_factory: pytest.TempPathFactory,
-    page_bytes: int,
-    reserved: int,
-    auto_vacuum: int,
-    has_index: bool,
-    count: int,
-    largest: int,
-    seed: int,
+    pages: tuple[int, int, int],
+    rows: tuple[int, int, int, bool],
 ) -> None:
     path = tmp_path_factory.mktemp("pages") / "a.db3"
-    fill(empty(path, page_bytes, reserved, auto_vacuum), seed, count, largest, has_index)
+    fill(empty(path, *pages), *rows)
 
     assert rows_in_pages(path) == stored_rows(path)
 
@@ -286,7 +275,7 @@ def test_rows_read_from_pages_equal_sqlite_rows(
 def test_long_payloads_in_scattered_pages_are_complete_and_batches_bounded(tmp_path: Path) -> None:
     path = tmp_path / "a.db3"
     db = empty(path, 512, 0)
-    db.executescript(TOPICS + MESSAGES + INDEX + "BEGIN;")
+    db.executescript(TABLES + "BEGIN;")
     small = [(i, i) for i in range(4000)]
     db.executemany("INSERT INTO messages VALUES(?, 1, ?, zeroblob(490))", small)
     db.execute("DELETE FROM messages WHERE id % 2")

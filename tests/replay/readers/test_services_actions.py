@@ -11,6 +11,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from crosscue.eval import cli
 from crosscue.replay.logs.opening import open_log
+from support.ros_messages import ros2_topic
 
 ROWS = 7
 SERVICE = "/add/_service_event"
@@ -25,12 +26,6 @@ TYPES = {
 END = "=" * 80 + "\n"
 TIME = "int32 sec\nuint32 nanosec\n"
 UUID = f"{END}MSG: unique_identifier_msgs/UUID\nuint8[16] uuid\n"
-STATUS_TEXT = (
-    "action_msgs/GoalStatus[] status_list\n"
-    f"{END}MSG: action_msgs/GoalStatus\nGoalInfo goal_info\nint8 status\n"
-    f"{END}MSG: action_msgs/GoalInfo\nunique_identifier_msgs/UUID goal_id\n"
-    f"builtin_interfaces/Time stamp\n{UUID}{END}MSG: builtin_interfaces/Time\n{TIME}"
-)
 EVENT_TEXT = (
     "service_msgs/ServiceEventInfo info\n"
     "example_interfaces/srv/AddTwoInts_Request[<=1] request\n"
@@ -90,8 +85,7 @@ def texts(service: str, feedback: str) -> dict[str, str]:
     return {
         SERVICE: SERVICE_TEXTS[service],
         FEEDBACK: FEEDBACK_TEXTS[feedback],
-        STATUS: STATUS_TEXT,
-        "/word": "string data\n",
+        **{name: ros2_topic(name, TYPES[name]).schema.decode() for name in (STATUS, "/word")},
     }
 
 

@@ -133,24 +133,15 @@ def test_wheel_radius_is_estimated_from_angular_speeds() -> None:
 
 
 def test_mobileye_is_recognised_by_message_lengths() -> None:
-    mobileye_lengths = {
-        0x738: {7},
-        0x739: {8},
-        0x73A: {8},
-        0x73B: {8},
-        0x700: {8},
-        0x669: {8},
-        0x737: {8},
-    }
-    other_lengths = {key: {4} for key in mobileye_lengths}
+    lengths = {0x738: 7} | dict.fromkeys((0x739, 0x73A, 0x73B, 0x700, 0x669, 0x737), 8)
 
-    assert (
-        "status"
-        in Bus("can1", ids={(key, False): of for key, of in mobileye_lengths.items()}).mobileye
-    )
-    assert not Bus("can1", ids={(key, False): of for key, of in other_lengths.items()}).mobileye
-    assert not Bus("can1", ids={(key, True): of for key, of in mobileye_lengths.items()}).mobileye
-    assert not Bus("can1", ids={(0x738, False): {7}}).mobileye
+    def recognised(ids: dict[int, int], is_extended: bool = False) -> tuple[str, ...]:
+        return Bus("can1", ids={(key, is_extended): {of} for key, of in ids.items()}).mobileye
+
+    assert "status" in recognised(lengths)
+    assert not recognised(dict.fromkeys(lengths, 4))
+    assert not recognised(lengths, is_extended=True)
+    assert not recognised({0x738: 7})
 
 
 def test_signs_are_undetermined_without_wheels_and_gnss() -> None:
