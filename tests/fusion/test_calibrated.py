@@ -16,7 +16,7 @@ from crosscue.fusion.situation import Situation
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Fusion, RangeFilter, Rates
 from crosscue.replay.vehicle.vehicle import parse
-from support.fusion import FADE_M, RATES, annotated, drive, situation
+from support.fusion import annotated, drive, situation
 
 GRAPH = graph_of(Fusion())
 LEFT = GRAPH.feature_names.index("left")
@@ -173,35 +173,6 @@ def test_message_memory_is_reset_for_each_approach() -> None:
 
     assert first == [pytest.approx(one) for one in second]
     assert loop.counts["approaches opened"] == 2
-
-
-def test_fit_recovers_true_rates() -> None:
-    fit = fit_messages(annotated(1, 150), GRAPH)
-
-    for one in fit.rates:
-        if one.rates is not None:
-            wanted = RATES[one.cue]
-            found = (one.rates.if_there, one.rates.if_not)
-            for rate, side, fraction in zip(wanted, (one.there, one.missing), found, strict=True):
-                four_sd = 4 * math.sqrt(rate * (1 - rate) / side.observations)
-                assert fraction == pytest.approx(rate, abs=four_sd)
-    learned = {(one.cue, one.feature) for one in fit.calibrated.rates}
-    assert learned == {
-        ("road_left", "left"),
-        ("parked_left", "left"),
-        ("road_straight", "straight"),
-    }
-
-
-def test_fit_recovers_true_fade_length() -> None:
-    fit = fit_messages(annotated(2, 400), GRAPH)
-
-    for one in fit.fades:
-        if one.is_learned:
-            # At 10 m/s, fades over distance and over time are equivalent here.
-            scale_m = one.fade.way_m or (one.fade.time_s or 0.0) * 10.0
-            assert scale_m == pytest.approx(FADE_M, rel=0.35)
-    assert sum(one.is_learned for one in fit.fades) == 3
 
 
 def test_calibrated_model_beats_source_on_held_out_simulated_approaches() -> None:

@@ -282,18 +282,6 @@ def learned(drives: list[AnnotatedDrive]) -> Temporal:
     return fit_temporal(drives, GRAPH).temporal
 
 
-def chain(learned: Temporal, cue: str, there: tuple[str, ...]) -> CueChain:
-    return next(one for one in learned.chains if one.cue == cue and one.there == there)
-
-
-def test_fit_recovers_chain_rates(learned: Temporal) -> None:
-    found = chain(learned, "road", ("intersection", "left"))
-
-    assert np.mean(found.stays) == pytest.approx(STAYS, abs=0.08)
-    assert np.mean(found.appears) == pytest.approx(APPEARS, abs=0.08)
-    assert chain(learned, "road", ("intersection",)).appears[0] < 0.1
-
-
 def test_redundant_cue_lowers_exponent(learned: Temporal, drives: list[AnnotatedDrive]) -> None:
     once = fit_temporal(drives, GRAPH.without("again")).temporal
 

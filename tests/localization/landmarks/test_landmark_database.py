@@ -1,11 +1,9 @@
 """Tests of the landmark database: round trip, queries by ellipse, and damaged files."""
 
-import os
 import resource
 import signal
 import sqlite3
 import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -111,7 +109,8 @@ def test_invalid_covariance_is_refused(cov: list[list[float]], message: str) -> 
 
 
 @pytest.mark.parametrize(
-    ("change", "message"), [("x_m = 9e999", "finite"), ("var_x_m2 = -1.0", "positive definite")]
+    ("change", "message"),
+    [("x_m = 9e999", "finite"), ("var_x_m2 = -1.0", "landmark 0: covariance.*positive definite")],
 )
 def test_landmark_in_the_file_that_no_update_can_use_is_damage(
     grid: Path, tmp_path: Path, change: str, message: str
@@ -140,19 +139,13 @@ def test_truncated_file_is_refused_and_unchanged(
     assert cut.read_bytes() == whole[: int(fraction * len(whole))]
 
 
-def test_changed_coordinates_and_covariance_are_found(tmp_path: Path) -> None:
+def test_changed_coordinates_are_found(tmp_path: Path) -> None:
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
-    hand = sqlite3.connect(path)
-    hand.execute("UPDATE landmark SET x_m = x_m + 1 WHERE id = 2")
-    hand.execute("UPDATE landmark SET var_x_m2 = -1 WHERE id = 3")
-    hand.commit()
-    hand.close()
+    with closing(sqlite3.connect(path)) as sql, sql:
+        sql.execute("UPDATE landmark SET x_m = x_m + 1 WHERE id = 2")
 
-    with LandmarkDatabase(path) as database:
-        with pytest.raises(LogFormatError, match="checksum"):
-            database.features(2)
-        with pytest.raises(LogFormatError, match="damaged: landmark 2: covariance"):
-            list(database)
+    with LandmarkDatabase(path) as database, pytest.raises(LogFormatError, match="checksum"):
+        database.features(2)
 
 
 @given(st.integers(0, 10_000), st.integers(1, 255))
@@ -175,13 +168,6 @@ def test_damaged_byte_is_refused_or_harmless(
     except LogError as refused:
         message = str(refused)
         assert message.startswith(str(path))
-
-
-def _add(path: Path, names: list[str], max_pages: int = 1_000_000) -> None:
-    with LandmarkWriter(path, "orb") as writer:
-        writer._sql.execute(f"PRAGMA max_page_count = {max_pages}")
-        for name in names:
-            writer.add(place_at(1.0, 1.0, name), some_features(9, 200))
 
 
 def test_second_concurrent_writer_is_refused(
@@ -212,19 +198,12 @@ with LandmarkWriter(Path(sys.argv[1]), "orb") as writer:
 """
 
 
-def _killed_while_adding(path: Path, count: int) -> int:
-    """Add landmarks in a process that kills itself, and return its exit status."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    argv = [sys.executable, "-c", WRITE_MANY, str(path), str(count)]
-    return subprocess.run(argv, env=environment, check=False).returncode
-
-
 def test_killed_writer_leaves_previous_landmarks(tmp_path: Path) -> None:
     """A tiny cache writes pages to disk before the kill; the next read rolls them back."""
     path = database_of(tmp_path / "lm.sqlite", GRID[:3])
     before = path.stat().st_size
 
-    assert _killed_while_adding(path, 200) == -9
+    assert _in_child(path, 200).returncode == -9
     assert path.stat().st_size > before
     assert (tmp_path / "lm.sqlite-journal").exists()
 
@@ -232,15 +211,6 @@ def test_killed_writer_leaves_previous_landmarks(tmp_path: Path) -> None:
         assert [one.place.name for one in database] == ["0", "1", "2"]
         assert [len(database.features(one.key)) for one in database] == [20, 20, 20]
     assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]
-
-
-def test_page_limit_is_reported_as_a_full_disk(tmp_path: Path) -> None:
-    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
-
-    with pytest.raises(OutputError, match=r"lm\.sqlite: the disk is full"):
-        _add(path, [f"new {i}" for i in range(200)], max_pages=1)
-    with LandmarkDatabase(path) as database:
-        assert len(database) == 3
 
 
 def test_query_distance_includes_the_landmark_covariance(tmp_path: Path) -> None:
