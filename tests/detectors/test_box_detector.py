@@ -52,7 +52,11 @@ def bright(frame: Frame) -> Iterator[ScoredBox]:
 
 
 @pytest.mark.parametrize(
-    "given", [Corner, Corner(side_px=4), bright, f"{__name__}:Corner", f"{__name__}:Corner.build"]
+    "given",
+    [
+        *(Corner, Corner(side_px=4), bright),
+        *(f"{__name__}:{name}" for name in ("bright", "corner", "Corner", "Corner.build")),
+    ],
 )
 def test_class_object_function_and_name_are_detectors(given: object) -> None:
     (choice,) = chosen([given], {})
@@ -183,33 +187,24 @@ def test_other_mistakes_break_the_contract_in_one_line(kind: Any, fault: str) ->
 corner = Corner(side_px=4)
 
 
-@pytest.mark.parametrize("name", ["bright", "corner", "Corner", "Corner.build"])
-def test_names_of_functions_objects_and_classes_are_detectors(name: str) -> None:
-    check_detector(lambda: make(chosen(f"{__name__}:{name}", {})[0]))
-
-
-class Unnamed(BoxDetector):
-    """Detector as a beginner writes it, without a name."""
-
-    labels = ("stop sign",)
-
-    def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
-        """Return nothing."""
-        yield from ()
-
-
-class OneText(Unnamed):
-    """Detector whose labels are a text."""
-
-    labels = "stop sign"  # type: ignore[assignment]
-
-
 class Unlabelled(BoxDetector):
     """Detector without labels."""
 
     def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
         """Return nothing."""
         yield from ()
+
+
+class Unnamed(Unlabelled):
+    """Detector as a beginner writes it, without a name."""
+
+    labels = ("stop sign",)
+
+
+class OneText(Unlabelled):
+    """Detector whose labels are a text."""
+
+    labels = "stop sign"  # type: ignore[assignment]
 
 
 def test_class_without_a_name_is_named_after_itself_and_one_without_labels_is_refused() -> None:

@@ -38,11 +38,9 @@ from crosscue.detectors.networks.mask_rcnn.detector import (
     calibrated,
     detector_of,
     laid_in,
-    place_picture,
     raw_score,
 )
-from crosscue.detectors.networks.mask_rcnn.network import build_network, set_limits
-from crosscue.detectors.networks.mask_rcnn.parts import Body, MaskRcnnLayers, as_input
+from crosscue.detectors.networks.mask_rcnn.parts import Body, MaskRcnnLayers
 from crosscue.detectors.weights_file import SUM
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import VehicleError
@@ -67,43 +65,6 @@ def _equal(one: Detections, other: Detections) -> bool:
         and np.array_equal(one.scores, other.scores)
         and (one.labels, one.masks) == (other.labels, other.masks)
     )
-
-
-def test_detections_above_the_score_match_torchvision() -> None:
-    detector = _detector(proposals=1000)
-    frame = noise_frame()
-    (ours,) = _found(detector, frame)
-    network = build_network(plan_of())
-    network.load_state_dict(random_checkpoint().network.state_dict())
-    set_limits(network, 1000, 0.05)
-    given = as_input(place_picture(frame.pixels, plan_of()).pixels[None], CPU)
-    network.transform = _Bare()
-
-    with torch.inference_mode():
-        (theirs,) = network.eval()([given[0]])
-
-    keep = theirs["scores"] >= 0.4
-    assert len(ours) == int(keep.sum()) > 3
-    np.testing.assert_allclose(ours.boxes_px, theirs["boxes"][keep].numpy(), atol=1e-3)
-    np.testing.assert_allclose(ours.scores, theirs["scores"][keep].numpy(), atol=1e-5)
-    masks = theirs["masks"][keep][:, 0].numpy()
-    assert ours.masks == tuple(
-        laid_in(mask, box, frame.size_px) for mask, box in zip(masks, ours.boxes_px, strict=True)
-    )
-
-
-class _Bare(torch.nn.Module):
-    """Torchvision's transform without scaling, so that pictures and masks are unchanged."""
-
-    def forward(self, images: list[Tensor], targets: None) -> tuple[Any, None]:
-        from torchvision.models.detection.image_list import ImageList
-
-        return ImageList(torch.stack(images), [tuple(images[0].shape[1:])]), targets
-
-    def postprocess(
-        self, found: list[dict[str, Tensor]], sizes: Any, originals: Any
-    ) -> list[dict[str, Tensor]]:
-        return found
 
 
 def test_grey_picture_equals_picture_with_equal_channels() -> None:

@@ -2,7 +2,6 @@
 
 import hashlib
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -34,6 +33,11 @@ def card(folder: Path, model: bytes, output: str, **more: str) -> Path:
     path = folder / "net.toml"
     path.write_text(f"{text}[output]\n{output}\n", encoding="utf-8")
     return path
+
+
+def card_of_boxes(folder: Path, model: bytes, output: str) -> Path:
+    """Write a card for an ONNX file with an input of 256 x 128."""
+    return card(folder, model, output, input="width_px = 256\nheight_px = 128\n")
 
 
 def frame(width: int, height: int, box: tuple[int, int, int, int], t_ns: int = 0) -> Frame:
@@ -147,30 +151,8 @@ def test_mask_has_the_size_of_the_camera_picture(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"values": np.full((1, 3, 6), np.nan, np.float32)}, "3 of 3 candidates are not finite"),
-        ({"values": np.zeros((1, 3, 7), np.float32)}, "expected (1, N, 6)"),
-        ({"values": np.full((1, 3, 6), 9.0, np.float32)}, "class numbers 9 to 9"),
-    ],
-)
-def test_invalid_output_is_reported_on_one_line(
-    tmp_path: Path, change: dict[str, Any], message: str
-) -> None:
-    path = card(tmp_path, constant_model((1, 3, 32, 64), {"out": change["values"]}), BRIGHT)
-
-    with pytest.raises(VehicleError) as error:
-        build(card=str(path))
-
-    assert message in str(error.value)
-    assert "net.toml" in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
     ("output", "sections", "message"),
     [
-        ('kind = "end-to-end"\nclasses = []', {}, "output.classes is empty"),
         (BRIGHT, {"labels": 'bicycle = "car"'}, "'bicycle' is not one of output.classes"),
         ('kind = "yolo12"\nclasses = ["car"]', {}, "yolox"),
     ],
@@ -180,16 +162,11 @@ def test_invalid_card_is_reported_on_one_line(
 ) -> None:
     path = card(tmp_path, bright_box_model(), output, **sections)
 
-    with pytest.raises(VehicleError) as error:
+    with pytest.raises(VehicleError, match=rf"^.*{message}.*$"):
         build(card=str(path))
-
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def _yolox(folder: Path, width: int, height: int, backend: str) -> Detections:
-    import cv2
-
     path = yolox_card(folder)
     text = path.read_text(encoding="utf-8").replace("width_px = 416", f"width_px = {width}")
     text = text.replace("height_px = 416", f"height_px = {height}\nis_resizable = true")
@@ -213,13 +190,6 @@ def test_fully_convolutional_network_runs_at_the_size_of_the_card(
 
     assert large.labels.count("traffic light") > small.labels.count("traffic light")
     assert large.labels.count("car") > small.labels.count("car")
-
-
-def test_card_of_another_size_than_its_network_is_refused(tmp_path: Path) -> None:
-    card = yolox_card(tmp_path, width_px="640")
-
-    with pytest.raises(VehicleError, match="the network does not run on input 640 x 416"):
-        build(card=str(card))
 
 
 # Cells of strides 8, 16 and 32 at 256 x 128.
@@ -257,40 +227,19 @@ GARBAGE = {
 }
 
 
-def card_of_boxes(folder: Path, model: bytes, output: str) -> Path:
-    """Write ``net.onnx`` and a card for it, and return the card."""
-    (folder / "net.onnx").write_bytes(model)
-    text = f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(model).hexdigest()}"\n'
-    text += f"[input]\nwidth_px = 256\nheight_px = 128\n[output]\n{output}\n"
-    path = folder / "net.toml"
-    path.write_text(text)
-    return path
-
-
-def names(folder: Path) -> Path:
-    """Write a file of two class names."""
-    path = folder / "names.txt"
-    path.write_text("dog\ncat\n")
-    return path
-
-
 @pytest.mark.parametrize("seen", GARBAGE)
-def test_card_is_refused_with_what_was_seen(tmp_path: Path, seen: str) -> None:
-    net = tmp_path / "net.onnx"
-    net.write_bytes(constant_model(SHAPE, {"rows": GARBAGE[seen]}))
-
-    with pytest.raises(VehicleError, match=f"net.toml: not written: on noise, .*{seen}"):
-        crosscue.draft_card(net, kind="end-to-end", class_names=names(tmp_path))
-
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["names.txt", "net.onnx"]
-
-
-@pytest.mark.parametrize("seen", GARBAGE)
-def test_check_refuses_the_card(tmp_path: Path, seen: str) -> None:
-    model = constant_model(SHAPE, {"rows": GARBAGE[seen]})
+def test_card_of_garbage_is_neither_passed_nor_written_and_says_what_was_seen(
+    tmp_path: Path, seen: str
+) -> None:
+    path = card_of_boxes(tmp_path, constant_model(SHAPE, {"rows": GARBAGE[seen]}), END_TO_END)
 
     with pytest.raises(VehicleError, match=f"net.toml: on noise, .*{seen}"):
-        check_card(card_of_boxes(tmp_path, model, END_TO_END))
+        check_card(path)
+    path.unlink()
+    with pytest.raises(VehicleError, match=f"net.toml: not written: on noise, .*{seen}"):
+        crosscue.draft_card(tmp_path / "net.onnx", kind="end-to-end", class_names=["dog", "cat"])
+
+    assert [one.name for one in tmp_path.iterdir()] == ["net.onnx"]
 
 
 def test_sensible_boxes_pass(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +16,7 @@ from crosscue.detectors.base import Detections, Frame, RoadMask
 from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.draft import draft_card_text
 from crosscue.detectors.catalog.recognise import _suppressed_classes, guesses
-from crosscue.detectors.decoders.base import Interface, Size, Tensor, cell_count, cell_grid
+from crosscue.detectors.decoders.base import Array, Interface, Size, Tensor, cell_count, cell_grid
 from crosscue.detectors.networks.backends import _random_operation, load_network, missing_operation
 from crosscue.detectors.networks.model_detector import build
 from crosscue.detectors.networks.weights import Weights
@@ -40,6 +41,20 @@ def found_in(card: Path, size: Size) -> Detections:
     return found
 
 
+def tflite(folder: Path, size: Size, outputs: Mapping[str, Array], **more: Any) -> Path:
+    """Write a network for pictures of this size, with the same outputs for each."""
+    net = folder / "net.tflite"
+    net.write_bytes(constant_tflite((1, size[1], size[0], 3), outputs, **more))
+    return net
+
+
+def yolov8(folder: Path) -> Path:
+    """Write an ONNX file without class names."""
+    net = folder / "net.onnx"
+    net.write_bytes(export(FAMILIES["yolov8"](SIZE)))
+    return net
+
+
 def columns(size: Size) -> NDArray[np.float32]:
     """Ultralytics' TFLite output: boxes in fractions around all cells, one of them known."""
     corner, stride = cell_grid(size, (8, 16, 32))
@@ -54,11 +69,9 @@ def columns(size: Size) -> NDArray[np.float32]:
 @pytest.mark.parametrize("files", [NAMES, JSON], ids=["text", "JSON"])
 @SIZES
 def test_boxes_in_fractions_are_exact(tmp_path: Path, size: Size, files: dict[str, str]) -> None:
-    net = tmp_path / "net.tflite"
-    shape = (1, size[1], size[0], 3)
-    net.write_bytes(constant_tflite(shape, {"Identity": columns(size)}, files=files))
-
-    card = crosscue.draft_card(net).path
+    card = crosscue.draft_card(
+        tflite(tmp_path, size, {"Identity": columns(size)}, files=files)
+    ).path
 
     output = read_card(card).output
     assert (output.kind, output.classes) == ("yolov8", CLASSES)
@@ -70,13 +83,11 @@ def test_boxes_in_fractions_are_exact(tmp_path: Path, size: Size, files: dict[st
 @SIZES
 def test_suppressed_boxes_in_fractions_are_exact(tmp_path: Path, size: Size) -> None:
     """Ultralytics' YOLO26 as TFLite: the rows of its ONNX file, in fractions."""
-    net = tmp_path / "net.tflite"
     rows = np.zeros((1, 300, 6), np.float32)
     rows[0, :, :4] = np.array([0.1, 0.2, 0.3, 0.6])
     rows[0, 0] = [*BOX / np.tile(size, 2), 0.75, 2.0]
-    net.write_bytes(constant_tflite((1, size[1], size[0], 3), {"Identity": rows}, files=NAMES))
 
-    card = crosscue.draft_card(net).path
+    card = crosscue.draft_card(tflite(tmp_path, size, {"Identity": rows}, files=NAMES)).path
 
     assert read_card(card).output.kind == "end-to-end"
     found = found_in(card, size)
@@ -85,10 +96,9 @@ def test_suppressed_boxes_in_fractions_are_exact(tmp_path: Path, size: Size) -> 
 
 
 def test_boxes_in_pixels_are_exact(tmp_path: Path) -> None:
-    net = tmp_path / "net.tflite"
     table = columns(SIZE)
     table[0, :4] *= np.tile(SIZE, 2)[:, None]
-    net.write_bytes(constant_tflite((1, SIZE[1], SIZE[0], 3), {"Identity": table}, files=NAMES))
+    net = tflite(tmp_path, SIZE, {"Identity": table}, files=NAMES)
 
     card = crosscue.draft_card(net, kind="yolov8").path
 
@@ -97,16 +107,9 @@ def test_boxes_in_pixels_are_exact(tmp_path: Path) -> None:
 
 def test_quantised_numbers_are_read(tmp_path: Path) -> None:
     """Input and output are int8, as in Ultralytics' exports with int8."""
-    net = tmp_path / "net.tflite"
     values = np.clip(np.rint(columns(SIZE) * 256.0) - 128, -128, 127).astype(np.int8)
-    content = constant_tflite(
-        (1, SIZE[1], SIZE[0], 3),
-        {"Identity": values},
-        dtype="int8",
-        scales={"images": (1 / 255, -128), "Identity": (1 / 256, -128)},
-        files=NAMES,
-    )
-    net.write_bytes(content)
+    scales = {"images": (1 / 255, -128), "Identity": (1 / 256, -128)}
+    net = tflite(tmp_path, SIZE, {"Identity": values}, dtype="int8", scales=scales, files=NAMES)
 
     card = crosscue.draft_card(net).path
 
@@ -125,7 +128,6 @@ def test_quantised_numbers_are_read(tmp_path: Path) -> None:
 )
 @SIZES
 def test_suppressed_boxes_are_exact(tmp_path: Path, names: list[str], size: Size) -> None:
-    net = tmp_path / "net.tflite"
     x0, y0, x1, y1 = BOX / np.tile(size, 2)
     numbers: list[Any] = [
         [[[y0, x0, y1, x1], [0.0] * 4]], [[2.0, 0.0]], [[0.75, 0.0]], [1.0],
@@ -134,15 +136,9 @@ def test_suppressed_boxes_are_exact(tmp_path: Path, names: list[str], size: Size
         names[0] + end: np.array(values, np.float32)
         for end, values in zip(names[1:], numbers, strict=True)
     }
-    content = constant_tflite(
-        (1, size[1], size[0], 3),
-        outputs,
-        dtype="uint8",
-        files={"labelmap.txt": "a\nb\nstop sign\n"},
-    )
-    net.write_bytes(content)
+    files = {"labelmap.txt": "a\nb\nstop sign\n"}
 
-    card = crosscue.draft_card(net).path
+    card = crosscue.draft_card(tflite(tmp_path, size, outputs, dtype="uint8", files=files)).path
 
     found = found_in(card, size)
     np.testing.assert_allclose(found.boxes_px, [BOX], atol=1e-3)
@@ -152,12 +148,11 @@ def test_suppressed_boxes_are_exact(tmp_path: Path, names: list[str], size: Size
 
 @pytest.mark.parametrize("is_numbers", [True, False])
 def test_road_is_read(tmp_path: Path, *, is_numbers: bool) -> None:
-    net = tmp_path / "net.tflite"
     numbers = np.zeros((1, 32, 64), np.int64)
     numbers[:, 16:] = 1
     scores = np.eye(2, dtype=np.float32)[numbers]
     outputs = {"ArgMax": numbers} if is_numbers else {"scores": scores}
-    net.write_bytes(constant_tflite((1, 64, 128, 3), outputs, dtype="uint8"))
+    net = tflite(tmp_path, (128, 64), outputs, dtype="uint8")
 
     card = crosscue.draft_card(net, classes="background,road").path
 
@@ -200,34 +195,25 @@ def test_first_class_is_as_given(tmp_path: Path, first: int | None, label: str) 
     assert found_in(card, SIZE).labels == (label,)
 
 
-def test_first_class_is_refused_where_no_number_is_read(tmp_path: Path) -> None:
-    net = tmp_path / "net.onnx"
-    net.write_bytes(export(FAMILIES["yolov8"](SIZE)))
-
-    with pytest.raises(crosscue.UsageError, match=r"first_class: 0, .*not yolov8"):
-        crosscue.draft_card(net, class_names=CLASSES, first_class=0)
-
-
 @pytest.mark.parametrize(
     "text", ["names: [person, car, stop sign]", "names: {0: person, 1: car, 2: stop sign}"]
 )
 def test_class_names_are_read_from_a_data_set_file(tmp_path: Path, text: str) -> None:
-    net = tmp_path / "net.onnx"
-    net.write_bytes(export(FAMILIES["yolov8"](SIZE)))
     (tmp_path / "data.yaml").write_text(f"path: ..\n{text}\n")
 
-    card = crosscue.draft_card(net, class_names=tmp_path / "data.yaml").path
+    card = crosscue.draft_card(yolov8(tmp_path), class_names=tmp_path / "data.yaml").path
 
     assert read_card(card).output.classes == CLASSES
 
 
-def test_data_set_file_without_names_is_refused(tmp_path: Path) -> None:
-    net = tmp_path / "net.onnx"
-    net.write_bytes(export(FAMILIES["yolov8"](SIZE)))
-    (tmp_path / "data.yaml").write_text("path: ..\n")
+def test_options_that_say_nothing_of_a_network_are_refused(tmp_path: Path) -> None:
+    net, data = yolov8(tmp_path), tmp_path / "data.yaml"
+    data.write_text("path: ..\n")
 
     with pytest.raises(crosscue.UsageError, match=r"data.yaml: expected class names under names"):
-        crosscue.draft_card(net, class_names=tmp_path / "data.yaml")
+        crosscue.draft_card(net, class_names=data)
+    with pytest.raises(crosscue.UsageError, match=r"first_class: 0, .*not yolov8"):
+        crosscue.draft_card(net, class_names=CLASSES, first_class=0)
 
 
 def test_number_of_classes_is_that_of_the_suppression() -> None:
@@ -262,7 +248,6 @@ def test_suppressed_network_of_other_classes_asks_for_their_names(tmp_path: Path
 @SIZES
 def test_masks_with_channels_last_are_exact(tmp_path: Path, size: Size) -> None:
     """Ultralytics' segmentation networks in TFLite have prototypes (1, h, w, 32)."""
-    net = tmp_path / "net.tflite"
     width, height = size
     table = columns(size)
     # Noise may have a box or two beyond the picture.
@@ -274,9 +259,8 @@ def test_masks_with_channels_last_are_exact(tmp_path: Path, size: Size) -> None:
     prototypes[0, 10:22, 25:55, 7] = 9.0
     outputs = {"Identity": np.concatenate([table, weights], axis=1), "Identity_1": prototypes}
     files = {"temp_meta.txt": NAMES["temp_meta.txt"].replace("detect", "segment")}
-    net.write_bytes(constant_tflite((1, height, width, 3), outputs, files=files))
 
-    drafted = crosscue.draft_card(net)
+    drafted = crosscue.draft_card(tflite(tmp_path, size, outputs, files=files))
 
     assert drafted.draft.kind == "yolov8-seg"
     found = found_in(drafted.path, size)
@@ -293,12 +277,9 @@ def test_quantised_input_says_how_pixels_are_scaled(
     tmp_path: Path, scale: float, zero: int, darkest: float
 ) -> None:
     """A YOLOX export in int8 has pixels from 0 to 255, or what it was calibrated with."""
-    net = tmp_path / "net.tflite"
     rows = np.zeros((1, cell_count(SIZE, (8, 16, 32)), 8), np.float32)
-    content = constant_tflite(
-        (1, SIZE[1], SIZE[0], 3), {"Identity": rows}, dtype="int8", scales={"images": (scale, zero)}
-    )
-    net.write_bytes(content)
+    scales = {"images": (scale, zero)}
+    net = tflite(tmp_path, SIZE, {"Identity": rows}, dtype="int8", scales=scales)
 
     drafted = crosscue.draft_card(net, kind="yolox", class_names=CLASSES)
 

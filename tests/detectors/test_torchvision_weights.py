@@ -27,6 +27,7 @@ from support.refusals import refusal
 from support.torchvision_files import NAMES, class_names, hollow, network
 
 SIZE = (160, 96)
+SSDLITE = "ssdlite320_mobilenet_v3_large"
 MEAN = "head.classification_head.module_list.0.0.1.running_mean"
 
 
@@ -155,7 +156,7 @@ def test_coco_class_names_are_known_and_others_are_required(
 ) -> None:
     path = tmp_path / "my.pth"
     for classes, message in ((91, None), (4, "3 classes without names")):
-        torch.save(hollow("ssdlite320_mobilenet_v3_large", classes), path)
+        torch.save(hollow(SSDLITE, classes), path)
         state = run(["model", "init", str(path), "--overwrite"])
         error = capsys.readouterr().err
         if message is None:
@@ -191,22 +192,17 @@ def _with_code(folder: Path) -> object:
     [
         (_with_code, "holds code or objects other than tensors (posix.mkdir)"),
         (lambda folder: argparse.Namespace(epoch=1), "other than tensors (argparse.Namespace)"),
-        (
-            lambda folder: network("ssdlite320_mobilenet_v3_large"),
-            "other than tensors (torchvision.models.detection",
-        ),
+        (lambda folder: network(SSDLITE), "other than tensors (torchvision.models.detection"),
         (lambda folder: {"epoch": 3}, "'epoch' is int, not a tensor"),
         (lambda folder: [torch.zeros(2)], "list; expected a state dict"),
         (lambda folder: {}, "dict; expected a state dict"),
         (lambda folder: {"a": torch.zeros(2)}, "no tensors of a known network"),
         (
-            lambda folder: {
-                k: v for k, v in hollow("ssdlite320_mobilenet_v3_large", 4).items() if k != MEAN
-            },
+            lambda folder: {k: v for k, v in hollow(SSDLITE, 4).items() if k != MEAN},
             f"nearest is ssdlite320_mobilenet_v3_large, from which 1 differ: {MEAN} is missing",
         ),
         (
-            lambda folder: hollow("ssdlite320_mobilenet_v3_large", 4) | {MEAN: torch.zeros(3)},
+            lambda folder: hollow(SSDLITE, 4) | {MEAN: torch.zeros(3)},
             f"{MEAN} has shape (3,), expected (672,)",
         ),
     ],
@@ -232,9 +228,18 @@ def _oversized_archive() -> bytes:
     return bytes(packed)
 
 
+def _torchscript() -> bytes:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for name in ("data.pkl", "constants.pkl", "version"):
+            archive.writestr(f"my/{name}", b"\x80\x02N.")
+    return content.getvalue()
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
+        ("my.pt", _torchscript(), "TorchScript archive carries code"),
         ("my.pth", b"", "not a complete weights file"),
         ("my.pth", b"half of it", "not a complete weights file"),
         ("my.pth", _oversized_archive(), "unpacks to 3,221,225,472 bytes"),
@@ -253,7 +258,7 @@ def test_damaged_weights_are_refused_on_one_line(
 def hollow_card(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The card of weights that are all zero."""
     path = tmp_path_factory.mktemp("hollow") / "my.pth"
-    torch.save(hollow("ssdlite320_mobilenet_v3_large", 4), path)
+    torch.save(hollow(SSDLITE, 4), path)
     return crosscue.draft_card(path, class_names=NAMES).path
 
 
@@ -262,14 +267,14 @@ def hollow_card(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ('"car", ', "", "its head has 3 classes and the background, the card lists 2"),
         (
-            'architecture = "ssdlite320_mobilenet_v3_large"',
+            f'architecture = "{SSDLITE}"',
             'architecture = "fasterrcnn_resnet50_fpn"',
             "tensors do not fit fasterrcnn_resnet50_fpn",
         ),
         (
-            'architecture = "ssdlite320_mobilenet_v3_large"',
+            f'architecture = "{SSDLITE}"',
             'architecture = "ssd301"',
-            "ssdlite320_mobilenet_v3_large",
+            SSDLITE,
         ),
         ("width_px = 320", "width_px = 321", "accepts pictures of 320 x 320"),
         ('fit = "network"', 'fit = "stretch"', 'input.fit = "network" is required with [network]'),
@@ -295,10 +300,7 @@ def test_card_that_contradicts_its_weights_is_refused(
 def test_nested_and_prefixed_weights_are_recognised(tmp_path: Path) -> None:
     from crosscue.detectors.catalog.recognise_weights import recognise_weights
 
-    state = {
-        f"module.{name}": value
-        for name, value in hollow("ssdlite320_mobilenet_v3_large", 4).items()
-    }
+    state = {f"module.{name}": value for name, value in hollow(SSDLITE, 4).items()}
     torch.save({"model": state, "epoch": 7}, tmp_path / "my.pth")
 
     _, guess = recognise_weights(tmp_path / "my.pth", None)
@@ -309,23 +311,11 @@ def test_nested_and_prefixed_weights_are_recognised(tmp_path: Path) -> None:
     )
 
 
-def test_torchscript_archive_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "my.pt"
-    with zipfile.ZipFile(path, "w") as archive:
-        for name in ("data.pkl", "constants.pkl", "version"):
-            archive.writestr(f"my/{name}", b"\x80\x02N.")
-
-    assert "TorchScript archive carries code" in refusal((1, 2), "model", "init", path)
-
-
 def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
-    state = hollow("ssdlite320_mobilenet_v3_large", 4)
-    state[MEAN] = torch.full((672,), torch.nan)
-    torch.save(state, tmp_path / "my.pth")
+    torch.save(hollow(SSDLITE, 4) | {MEAN: torch.full((672,), torch.nan)}, tmp_path / "my.pth")
 
-    with pytest.raises(
-        crosscue.errors.VehicleError, match=f"{MEAN}: holds values that are not finite"
-    ):
+    wanted = f"{MEAN}: holds values that are not finite"
+    with pytest.raises(crosscue.errors.VehicleError, match=wanted):
         crosscue.draft_card(tmp_path / "my.pth", class_names=NAMES)
 
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["my.pth"]
+    assert [one.name for one in tmp_path.iterdir()] == ["my.pth"]
