@@ -52,10 +52,6 @@ def followed(*frames: Detections, ego: CarStep = STILL, rules: Cars = RULES) -> 
     return cars
 
 
-def is_same(first: Box, second: Box, **changes: Any) -> bool:
-    return len(followed(found(first), found(second), **changes)) == 1
-
-
 def observation(k: int, box: Box, **changes: Any) -> Observation:
     """Observe a box in frame k, with a camera that stands."""
     x0, y0, x1, y1 = box
@@ -173,12 +169,6 @@ def test_cars_without_a_focal_length_are_not_seen() -> None:
     assert tracks.seen == 0
 
 
-@pytest.mark.parametrize(("height", "is_followed"), [(10.34, True), (10.32, False)])
-def test_car_is_followed_to_the_distance_of_cars_past(height: float, is_followed: bool) -> None:
-    """1,240 / 10.33 = 120 m, further than it counts as seen."""
-    assert is_same(sized(height), sized(height)) == is_followed
-
-
 def test_distance_of_cars_past_is_120_metres_or_15_pixels() -> None:
     """15 px are 1.55 * f / 15: 82.7 m with 800 px and 155 m with 1,500 px."""
     assert past_within_m(CAMERA, RULES) == 120.0
@@ -210,47 +200,31 @@ def test_unsure_box_continues_a_track_and_begins_none() -> None:
     assert [one.frames for one in tracks.longer()] == [3]
 
 
+NARROW: Box = (600.0, 300.0, 670.0, 362.0)
+
+
 @pytest.mark.parametrize(
-    ("second", "is_continued"),
+    ("first", "second", "is_continued"),
     [
-        (moved(53.0), True),
-        (moved(53.2), False),
-        (sized(44.4), True),
-        (sized(44.2), False),
-        (sized(86.7), True),
-        (sized(86.9), False),
+        # Shifted by s, (124 - s) / (124 + s) > 0.4 if s < 53.14; of 70 px by 30, 40 / 100 = 0.4.
+        (CAR, moved(53.0), True),
+        (CAR, moved(53.2), False),
+        (NARROW, moved(30.0, box=NARROW), False),
+        # Heights are within 62 / 1.4 = 44.29 and 62 * 1.4 = 86.8; 70 / 50 = 1.4.
+        (CAR, sized(44.4), True),
+        (CAR, sized(44.2), False),
+        (CAR, sized(86.7), True),
+        (CAR, sized(86.9), False),
+        (sized(70.0), sized(50.0), False),
+        (sized(50.0), sized(70.0), False),
     ],
 )
 def test_unsure_box_overlaps_the_prediction_and_hardly_grows(
-    second: Box, is_continued: bool
+    first: Box, second: Box, is_continued: bool
 ) -> None:
-    """Shifted by s, (124 - s) / (124 + s) > 0.4 if s < 53.14. Heights within 62 / 1.4 and 62 * 1.4.
-
-    62 / 1.4 = 44.29 and 62 * 1.4 = 86.8.
-    """
-    (made,) = followed(found(CAR), found(second, scores=[0.4]), found(CAR))
+    (made,) = followed(found(first), found(second, scores=[0.4]), found(first))
 
     assert made.frames == 2 + is_continued
-
-
-def test_overlap_of_exactly_two_fifths_does_not_continue_a_track() -> None:
-    """Boxes of 70 px, shifted by 30 px: 40 / 100 = 0.4."""
-    box = (600.0, 300.0, 670.0, 362.0)
-    second = found(moved(30.0, box=box), scores=[0.4])
-
-    (made,) = followed(found(box), second, found(box))
-
-    assert made.frames == 2
-
-
-@pytest.mark.parametrize(("first", "second"), [(70.0, 50.0), (50.0, 70.0)])
-def test_height_changed_by_exactly_the_ratio_does_not_continue_a_track(
-    first: float, second: float
-) -> None:
-    """70 / 50 = 1.4."""
-    (made,) = followed(found(sized(first)), found(sized(second), scores=[0.4]), found(sized(first)))
-
-    assert made.frames == 2
 
 
 @pytest.mark.parametrize("longest", ["max_frames", "parked_frames", "past_frames"])
@@ -302,53 +276,45 @@ def test_car_is_forgotten_after_half_a_second(gap: int, is_same_car: bool) -> No
     assert (len(made) == 1) == is_same_car
 
 
-@pytest.mark.parametrize(("dx", "is_same_car"), [(119.0, True), (121.0, False), (-121.0, False)])
-def test_car_moves_sideways_by_at_most_25_metres_a_second(dx: float, is_same_car: bool) -> None:
-    """25 * 0.1 + 0.5 = 3 m, at 20 m 3 * 800 / 20 = 120 px."""
-    assert is_same(CAR, moved(dx)) == is_same_car
+NEARER: Box = (560.0, 240.0, 808.0, 364.0)
+ASIDE: Box = (1000.0, 300.0, 1124.0, 362.0)
 
 
-@pytest.mark.parametrize(("height", "is_same_car"), [(85.0, True), (85.2, False)])
-def test_height_of_a_car_changes_by_its_errors_and_speed(height: float, is_same_car: bool) -> None:
-    """At 85 px it is 14.588 m ahead: |ln(14.588 / 20)| = 0.3155.
+@pytest.mark.parametrize(
+    ("first", "second", "way_m", "is_same_car"),
+    [
+        # A car is followed to the distance of cars past, 1,240 / 10.33 = 120 m.
+        (sized(10.34), sized(10.34), 0.0, True),
+        (sized(10.32), sized(10.32), 0.0, False),
+        # At 25 m/s it moves sideways by 25 * 0.1 + 0.5 = 3 m, at 20 m 3 * 800 / 20 = 120 px.
+        (CAR, moved(119.0), 0.0, True),
+        (CAR, moved(121.0), 0.0, False),
+        (CAR, moved(-121.0), 0.0, False),
+        # At 85 px it is 14.588 m ahead: |ln(14.588 / 20)| = 0.3155, below
+        # 4 * sqrt((1 / 85)**2 + 0.03**2) + ln(1 + 3 / 14.588) = 0.1289 + 0.1870 = 0.3159.
+        (CAR, (750.0, 300.0, 900.0, 385.0), 0.0, True),
+        # At 85.2 px 0.3178 is above 0.1289 + 0.1874 = 0.3163.
+        (CAR, (750.0, 300.0, 900.0, 385.2), 0.0, False),
+        # A standing car that is 10 m nearer is twice as high, and its ends are twice as far from
+        # the centre. The boxes overlap by 0.25 only. After 25 m it would be behind.
+        (CAR, NEARER, 10.0, True),
+        (CAR, NEARER, 0.0, False),
+        (CAR, NEARER, 25.0, False),
+        # After 19.2 m it is 0.8 m ahead, and a box of 700 px looks 1.771 m away:
+        # ln(1.771 / 0.8) = 0.795 < 4 * 0.03 + ln(1 + 3 / 1.771) = 1.11.
+        (CAR, (200.0, 10.0, 1000.0, 710.0), 19.2, True),
+        # A car at 20 m is from 9.0 to 12.1 m to the right, and one of 85 px, at 14.588 m, from
+        # 3.67 m. Scaled by 14.588 / 20, it stood from 6.56 to 8.83 m, so it moved by 2.9 m.
+        (ASIDE, (841.0, 300.0, 965.0, 385.0), 0.0, True),
+        (ASIDE, (831.0, 300.0, 955.0, 385.0), 0.0, False),
+    ],
+)
+def test_box_is_of_a_car_that_may_have_moved_there(
+    first: Box, second: Box, way_m: float, is_same_car: bool
+) -> None:
+    made = followed(found(first), found(second), ego=CarStep(way_m, 0.0, 0.0, 0.1))
 
-    Limit: 4 * sqrt((1 / 85)**2 + 0.03**2) + ln(1 + 3 / 14.588) = 0.1289 + 0.1870 = 0.3159. At
-    85.2 px 0.3178 is above 0.1289 + 0.1874 = 0.3163.
-    """
-    second = (750.0, 300.0, 900.0, 300.0 + height)
-
-    assert is_same(CAR, second) == is_same_car
-
-
-def test_standing_car_is_found_where_the_ego_motion_predicts() -> None:
-    """10 m nearer, the box is twice as high, and its ends are twice as far from the centre.
-
-    The boxes (600, 300, 724, 362) and (560, 240, 808, 364) overlap by 0.25 only.
-    """
-    nearer = (560.0, 240.0, 808.0, 364.0)
-
-    assert is_same(CAR, nearer, ego=CarStep(10.0, 0.0, 0.0, 0.1))
-    assert not is_same(CAR, nearer)
-    assert not is_same(CAR, nearer, ego=CarStep(25.0, 0.0, 0.0, 0.1))  # it would be behind
-
-
-def test_standing_car_may_be_nearer_than_a_metre() -> None:
-    """After 19.2 m it is 0.8 m ahead, and a box of 700 px looks 1.771 m away.
-
-    ln(1.771 / 0.8) = 0.795 < 4 * 0.03 + ln(1 + 3 / 1.771) = 1.11.
-    """
-    assert is_same(CAR, (200.0, 10.0, 1000.0, 710.0), ego=CarStep(19.2, 0.0, 0.0, 0.1))
-
-
-def test_place_of_a_standing_car_is_scaled_to_the_distance_of_the_box() -> None:
-    """A car at 20 m is from 9.0 to 12.1 m to the right, and one of 85 px, at 14.588 m, from 3.67 m.
-
-    Scaled by 14.588 / 20, it stood from 6.56 to 8.83 m, so it moved by 2.9 m, within 3 m.
-    """
-    before = (1000.0, 300.0, 1124.0, 362.0)
-
-    assert is_same(before, (841.0, 300.0, 965.0, 385.0))
-    assert not is_same(before, (831.0, 300.0, 955.0, 385.0))
+    assert (len(made) == 1) == is_same_car
 
 
 def test_each_box_continues_the_track_it_fits_best() -> None:
@@ -361,10 +327,8 @@ def test_each_box_continues_the_track_it_fits_best() -> None:
     assert (one.number, one.step_px) == (2, (-2.0, 0.0))
     (one,) = followed(found(CAR), found(moved(20.0), moved(2.0)))
     assert (one.number, one.step_px) == (1, (2.0, 0.0))
-    assert sorted(one.number for one in followed(*[found(CAR), found(CAR, moved(400.0))] * 2)) == [
-        1,
-        2,
-    ]
+    both = followed(*[found(CAR), found(CAR, moved(400.0))] * 2)
+    assert sorted(one.number for one in both) == [1, 2]
 
 
 def test_tracks_are_forgotten_at_a_restart() -> None:

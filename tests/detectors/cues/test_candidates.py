@@ -6,17 +6,10 @@ from hypothesis import strategies as st
 
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.candidates import (
-    BELOW_SCORE,
-    CUT_OR_FAR,
-    NOT_FOUND_BEFORE,
-    NOT_FROM_THE_SIDE,
-    OTHER_MOTION,
-    TOO_FEW_FRAMES,
-    TOO_LITTLE_ROAD,
     Candidates,
 )
 from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import FrameDetections, RoadFractions
+from crosscue.detectors.cues.observed import FrameDetections
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Camera, Cars, Cues, OwnCue, Vehicle
@@ -45,56 +38,6 @@ def _found(t_ns: int, *found: tuple[str, float, float]) -> Detections:
 def _pass(vehicle: Vehicle = VEHICLE) -> tuple[CuePass, dict[str, Candidates]]:
     cues = CuePass(vehicle)
     return cues, cues.candidates
-
-
-def test_lights_below_threshold_are_counted_with_their_max_score() -> None:
-    cues, tally = _pass(Vehicle(version=1, cues=Cues(traffic_light_score=0.9)))
-    for t, score in enumerate((0.41, 0.62, 0.3)):
-        cues(FrameDetections(t, objects=(_found(t, ("traffic light", score, 20.0)),)))
-
-    lights = tally["traffic_light"]
-    assert (lights.seen, lights.used, lights.skipped) == (3, 0, {BELOW_SCORE: 3})
-    assert (lights.max_score, lights.threshold) == (0.62, 0.9)
-    assert lights.setting == "[cues] traffic_light_score"
-
-
-def test_car_of_a_pair_is_skipped_for_the_first_rule_it_fails() -> None:
-    cues, tally = _pass()
-    standing = ("car", 0.99, 100.0)
-    cues(
-        FrameDetections(0, objects=(_found(0, standing, ("car", 0.5, 100.0), ("car", 0.99, 50.0)),))
-    )
-    cues(FrameDetections(10**8, objects=(_found(10**8, standing),)))
-
-    cars = tally["cross_traffic_left"]
-    assert (cars.seen, cars.used) == (4, 0)
-    assert cars.skipped == {
-        BELOW_SCORE: 1,
-        NOT_FROM_THE_SIDE: 1,
-        NOT_FOUND_BEFORE: 1,
-        OTHER_MOTION: 1,
-    }
-
-
-def test_tracked_car_is_skipped_for_the_first_rule_it_fails() -> None:
-    cues, tally = _pass(TRACKED)
-    for _ in range(2):
-        found = ("car", 0.99, 100.0), ("car", 0.5, 100.0), ("car", 0.99, 640.0)
-        cues(FrameDetections(0, objects=(_found(0, *found),)), CarStep(0.0, 0.0, 0.0, 0.1))
-
-    cars = tally["parked_right"]
-    assert (cars.seen, cars.used) == (6, 0)
-    assert cars.skipped == {BELOW_SCORE: 2, CUT_OR_FAR: 2, TOO_FEW_FRAMES: 2}
-
-
-def test_region_with_too_little_road_is_counted_as_skipped() -> None:
-    cues, tally = _pass()
-    cues(FrameDetections(0, road=RoadFractions(left=0.13, straight=0.5, right=0.0)))
-
-    assert tally["road_left"].skipped == {TOO_LITTLE_ROAD: 1}
-    assert tally["road_left"].max_score == 0.13
-    assert tally["road_straight"].used == 1
-    assert tally["road_right"].seen == 0
 
 
 # Groups of cues that need the place of an intersection.

@@ -14,11 +14,9 @@ from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
 from crosscue.detectors.cues.candidates import ELSEWHERE
 from crosscue.detectors.cues.cars import CarCandidates, count_in_leg, no_pairs
-from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import (
     NONE,
     CarCounts,
-    FrameDetections,
     Place,
     Sides,
     Ways,
@@ -31,14 +29,13 @@ from crosscue.detectors.cues.tracked.judge import (
     parked,
 )
 from crosscue.detectors.cues.tracked.motion import CAR_HEIGHT_M, CarMotion
-from crosscue.detectors.cues.tracked.tracks import CarTracks, are_hidden
+from crosscue.detectors.cues.tracked.tracks import CarTracks
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.vehicle.vehicle import CUES, SIMULATED_CAR, Camera, Cars, Vehicle
 
 SIZE = (1280, 720)
 CAMERA = Camera(x_m=1.7, z_m=1.4, focal_px=704.0, center_px=(640.0, 360.0))
 RULES = Cars(kind="tracks", score=0.5)
-VEHICLE = Vehicle(version=1, camera=CAMERA, cars=RULES)
 CAR_LENGTH_M = 4.6
 PERIOD_S = 0.1
 WAY_M = 0.8
@@ -212,31 +209,6 @@ def test_growing_box_of_an_occluded_car_does_not_cross() -> None:
         assert not crossing(cars, RULES)
 
 
-def test_fewer_than_three_frames_yield_no_cue() -> None:
-    first, second, *_ = drive([Car(30.0, 0.0, 8.0), Car(30.0, 9.0, nose=1)], steady(3, 0.0))
-
-    assert not first
-    assert len(second) == 2
-    assert not crossing(second, RULES)
-    assert not parked(second, RULES)
-
-
-@pytest.mark.parametrize("nose", [-1, 1])
-def test_parked_car_counts_only_at_the_intersection(nose: int) -> None:
-    steps = steady(10)
-    *_, last = drive([Car(40.0, 2.0, nose=nose)], steps)
-    ahead_m = 40.0 - 10 * WAY_M
-
-    here = count_cars(last, last, 1, CAMERA, RULES, Place(ahead_m - 5.0, ahead_m + 8.0, 1.0))
-    further = count_cars(last, last, 1, CAMERA, RULES, Place(ahead_m + 30.0, ahead_m + 45.0, 1.0))
-
-    side = Sides(nose < 0, nose > 0)
-    assert (here.parked, here.parked_elsewhere) == (side, Sides(0, 0))
-    assert (further.parked, further.parked_elsewhere) == (Sides(0, 0), side)
-    assert count_cars(last, last, 1, CAMERA, RULES, None).parked == Sides(0, 0)
-    assert here.crossing == further.crossing == Sides(0, 0)
-
-
 @pytest.mark.parametrize("right_m", [-20.0, 20.0])
 @pytest.mark.parametrize(("right_mps", "is_parked"), [(0.0, True), (2.5, False), (-2.5, False)])
 def test_distant_parked_car_is_recognised_over_more_frames(
@@ -296,50 +268,6 @@ def test_bearing_shows_an_oncoming_car_earlier_than_growth() -> None:
     assert from_bearing.ahead_mps < -2.0 * from_bearing.ahead_sd_mps
 
 
-@pytest.mark.parametrize(("long", "oncoming"), [(1.2, 1), (0.85, 0)])
-def test_box_narrower_than_high_does_not_count_as_oncoming(long: float, oncoming: int) -> None:
-    tracks = CarTracks(CAMERA, RULES)
-    for way_m in range(30):
-        height_px = 704.0 * CAR_HEIGHT_M / (80.0 - way_m)
-        half_px = 0.5 * long * height_px
-        box = (640.0 - half_px, 375.0 - height_px, 640.0 + half_px, 375.0)
-        tracks([found(np.array([box]), [0])], CarStep(0.0, 0.0, 0.0, PERIOD_S))
-
-    assert cars_past(tracks.longer(), CAMERA, RULES, Place(5.0, 15.0, 1.0)) == Ways(oncoming, 0)
-
-
-@pytest.mark.parametrize("scores", [(0.9, 0.4, 0.4, 0.9), (0.4, 0.4, 0.4, 0.9)])
-def test_low_score_box_continues_but_does_not_start_a_track(scores: tuple[float, ...]) -> None:
-    tracks = CarTracks(CAMERA, RULES)
-    now: list[CarMotion] = []
-    for score in scores:
-        one = found(np.array([[600.0, 350.0, 660.0, 380.0]]), [0])
-        now = tracks([replace(one, scores=np.array([score]))], CarStep(0.0, 0.0, 0.0, PERIOD_S))
-
-        assert tracks.seen == (score > 0.5)
-        assert len(now) <= tracks.seen
-
-    assert [car.frames for car in now] == ([4] if scores[0] > 0.5 else [])
-
-
-@pytest.mark.parametrize(
-    ("focal_px", "past_within_m", "outgoing"),
-    [(704.0, None, 0), (2000.0, None, 1), (2000.0, 120.0, 0)],
-)
-def test_outgoing_car_counts_within_the_resolved_distance(
-    focal_px: float, past_within_m: float | None, outgoing: int
-) -> None:
-    camera = CAMERA.model_copy(update={"focal_px": focal_px})
-    rules = RULES.model_copy(update={"past_within_m": past_within_m})
-    tracks = CarTracks(camera, rules)
-    for step in range(20):
-        height_px = focal_px * CAR_HEIGHT_M / (130.0 + 1.5 * step)
-        box = (640.0 - 0.6 * height_px, 375.0 - height_px, 640.0 + 0.6 * height_px, 375.0)
-        tracks([found(np.array([box]), [0])], CarStep(0.0, 0.0, 0.0, PERIOD_S))
-
-    assert cars_past(tracks.longer(), camera, rules, Place(5.0, 15.0, 1.0)) == Ways(0, outgoing)
-
-
 @settings(max_examples=100)
 @given(steps=ego_motions, car=standing)
 def test_stationary_car_is_neither_oncoming_nor_outgoing(steps: list[CarStep], car: Car) -> None:
@@ -349,40 +277,6 @@ def test_stationary_car_is_neither_oncoming_nor_outgoing(steps: list[CarStep], c
 def test_turning_crossing_and_lateral_cars_do_not_count_past() -> None:
     for car in (Car(60.0, -5.0, 8.0, -8.0), Car(60.0, 20.0, 0.0, -10.0), Car(50.0, 0.0, 9.0)):
         assert past(car, steady(15), Place(5.0, 10.0, 1.0)) == Ways(0, 0)
-
-
-def test_overlapped_box_with_a_higher_bottom_is_hidden() -> None:
-    near, behind, aside = (600, 350, 680, 400), (640, 352, 700, 380), (690, 352, 740, 380)
-
-    boxes = np.array([near, behind, aside], np.float64)
-
-    assert are_hidden(boxes, np.ones(3, np.bool_)) == [False, True, False]
-    assert are_hidden(boxes, np.array([False, True, True])) == [False, False, False]
-    assert are_hidden(np.empty((0, 4)), np.empty(0, np.bool_)) == []
-
-
-def cues(steps: Sequence[CarStep | None], vehicle: Vehicle = VEHICLE) -> CuePass:
-    one = CuePass(vehicle)
-    for step in steps:
-        box = np.array([[600.0, 350.0, 680.0, 380.0]])
-        counts = one(FrameDetections(0, (found(box, [0]),)), step).counts
-        if step is None or step.seconds > 0.5:
-            assert "cross_traffic_left" not in counts
-    return one
-
-
-def test_car_cues_below_two_frames_per_second_are_noted_as_missing() -> None:
-    slow = [CarStep(5.0, 0.0, 0.0, 0.51)] * 4
-
-    assert cues(slow).notes() == {"crossing and parked cars: frames further than 0.5 s apart": 4}
-    assert not cues([CarStep(5.0, 0.0, 0.0, 0.5)] * 4).notes()
-
-
-def test_missing_odometry_or_focal_length_is_reported() -> None:
-    (reason,) = cues([None, None]).not_followed
-    assert reason == "no odometry, so the camera's own motion is unknown"
-    (reason,) = cues([None], Vehicle(version=1)).not_followed
-    assert reason == "camera.focal_px is not set"
 
 
 def test_car_rules_default_to_pairs_only_for_the_simulated_car() -> None:

@@ -108,6 +108,14 @@ def test_counts_are_known_ahead_of_the_intersections_end(end_m: float | None, kn
     assert bool(past_counts(MobileyeState(np.array([obstacle()]), None), end_m, PAST)) == known
 
 
+def test_device_without_data_has_no_counts_and_one_that_found_nothing_has_zeros() -> None:
+    nothing = np.empty((0, 8))
+
+    assert past_counts(MobileyeState(None, None), END_M, PAST) == {}
+    counts = past_counts(MobileyeState(nothing, nothing), END_M, PAST)
+    assert counts == {"vehicles_past": 0, "lanes_past": 0}
+
+
 def test_end_is_the_start_plus_sixteen_metres() -> None:
     assert end_of(30.0, is_end=False, past=PAST) == 46.0
     assert end_of(30.0, is_end=True, past=PAST) == 30.0

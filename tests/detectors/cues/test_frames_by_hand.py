@@ -72,6 +72,8 @@ TRACKED = VEHICLE.model_copy(
     update={"cars": Cars(kind="tracks", score=0.5, max_gap_s=0.5), "camera": CAMERA}
 )
 EGO = CarStep(0.5, 0.0, 0.0, 0.1)
+SIGN_CUES = ("one_way_left", "one_way_right", "do_not_enter")
+PAIR_CUES = ("cross_traffic_left", "cross_traffic_right", "parked_left", "parked_right")
 Thing = tuple[str, float]
 
 
@@ -176,9 +178,8 @@ def test_number_of_a_rule_is_explained_by_the_labels_and_threshold_of_its_row(
     lights = _taken("objects", [found(("traffic light", 0.5), ("traffic light", 0.7))])
 
     assert skipped(lights, "traffic_light") == (2, 1, {BELOW_SCORE: 1})
-    monkeypatch.setitem(
-        CUES, "cross_traffic_left", replace(CUES["cross_traffic_left"], rule=row.rule)
-    )
+    left = replace(CUES["cross_traffic_left"], rule=row.rule)
+    monkeypatch.setitem(CUES, "cross_traffic_left", left)
     assert "cross_traffic_left" not in _taken("car pairs", no_pairs(640))
     assert _numbers("car pairs", no_pairs(640))["cross_traffic_left"] == 1
 
@@ -192,18 +193,9 @@ def test_rules_are_found_by_module_and_function() -> None:
     assert rule_of("crosscue.detectors.cues.labelled:count") is count
     light = found(("traffic light", 0.7))
     assert _numbers("objects", [light]) == {"stop_sign": 0, "traffic_light": 1}
-    assert list(counts_of("signs", [light], VEHICLE)) == [
-        "one_way_left",
-        "one_way_right",
-        "do_not_enter",
-    ]
-    pairs = no_pairs(640)
-    assert _numbers("car pairs", pairs) == {
-        "cross_traffic_left": 0,
-        "cross_traffic_right": 0,
-        "parked_left": 0,
-        "parked_right": 0,
-    }  # the cars past the intersection are unknown
+    assert list(counts_of("signs", [light], VEHICLE)) == [*SIGN_CUES]
+    # The cars past the intersection are unknown.
+    assert _numbers("car pairs", no_pairs(640)) == dict.fromkeys(PAIR_CUES, 0)
 
 
 def road(fraction: float = 1.0) -> RoadMask:
@@ -236,23 +228,16 @@ def test_meaning_of_a_label_is_the_first_label_of_its_cue() -> None:
     assert "cat" not in meaning
 
 
-@pytest.mark.parametrize(("left", "is_same"), [(5.0 + 33.0, True), (5.0 + 34.0, False)])
-def test_same_object_overlaps_by_more_than_half(left: float, is_same: bool) -> None:
-    """Boxes of 100 px: shifted by 33, 67 / 133 = 0.504; by 34, 66 / 134 = 0.493."""
-    one = found(("car", 0.9))
-    two = found(("van", 0.8), boxes=[(left, 5.0, left + 100.0, 45.0)])
+@pytest.mark.parametrize(
+    ("width", "shift", "is_same"), [(100.0, 33.0, True), (100.0, 34.0, False), (90.0, 30.0, False)]
+)
+def test_same_object_overlaps_by_more_than_half(width: float, shift: float, is_same: bool) -> None:
+    """67 / 133 = 0.504 and 66 / 134 = 0.493; 60 / 120 = 0.5 is another object."""
+    one = found(("car", 0.9), boxes=[(0.0, 0.0, width, 40.0)])
+    two = found(("van", 0.8), boxes=[(shift, 0.0, shift + width, 40.0)])
+    same = same_objects((one, two), label_meanings(VEHICLE), (False, False))
 
-    assert [
-        a.tolist() for a in same_objects((one, two), label_meanings(VEHICLE), (False, False))
-    ] == [[KEPT], [0 if is_same else KEPT]]
-
-
-def test_overlap_of_exactly_half_is_another_object() -> None:
-    """Boxes of 90 px shifted by 30: 60 / 120 = 0.5."""
-    one = found(("car", 0.9), boxes=[(0.0, 0.0, 90.0, 40.0)])
-    two = found(("car", 0.8), boxes=[(30.0, 0.0, 120.0, 40.0)])
-
-    assert [a.tolist() for a in same_objects((one, two), {}, (False, False))] == [[KEPT], [KEPT]]
+    assert [a.tolist() for a in same] == [[KEPT], [0 if is_same else KEPT]]
 
 
 def test_detection_is_the_same_as_the_one_that_overlaps_most() -> None:
@@ -306,18 +291,9 @@ def test_frame_counts_each_kind_of_cue() -> None:
 
     made = cues(FrameDetections(0, (objects,), (signs,), road(0.65)))
 
-    assert made.counts == {
-        "stop_sign": 0,
-        "traffic_light": 1,
-        "one_way_left": 1,
-        "one_way_right": 0,
-        "do_not_enter": 1,
-        "crossing": 1,
-        "dogs": 1,
-        "road_left": 1,
-        "road_straight": 1,
-        "road_right": 0,
-    }
+    once = ("traffic_light", "one_way_left", "do_not_enter", "crossing", "dogs")
+    counts = dict.fromkeys((*once, "road_left", "road_straight"), 1)
+    assert made.counts == counts | dict.fromkeys(("stop_sign", "one_way_right", "road_right"), 0)
     assert made.road == RoadFractions(1.0, 1.0, 0.0)
     assert cues(FrameDetections(1)).counts == {}
     assert cues(FrameDetections(1)).road is None
@@ -326,16 +302,10 @@ def test_frame_counts_each_kind_of_cue() -> None:
 def test_only_cues_whose_labels_can_be_reported_are_counted() -> None:
     """Road has no label, so it always counts."""
     cues, _ = _cues()
-    shown = FrameDetections(
-        0, (found(("dog", 0.9)),), labels=frozenset({"dog", "van"}), road=RoadFractions(1, 0, 0)
-    )
+    dog, road = (found(("dog", 0.9)),), RoadFractions(1, 0, 0)
+    counts = cues(FrameDetections(0, dog, labels=frozenset({"dog", "van"}), road=road)).counts
 
-    assert dict(cues(shown).counts) == {
-        "dogs": 1,
-        "road_left": 1,
-        "road_straight": 0,
-        "road_right": 0,
-    }
+    assert counts == {"dogs": 1, "road_left": 1, "road_straight": 0, "road_right": 0}
 
 
 def test_an_unseen_road_is_no_count_and_one_picture_alone_shows_no_road_area() -> None:
@@ -373,15 +343,14 @@ def test_cars_are_paired_with_the_previous_frame_until_restarted() -> None:
     assert "cross_traffic_right" not in cues(moved(300)).counts
 
 
+NO_ODOMETRY = "no odometry, so the camera's own motion is unknown"
+
+
 @pytest.mark.parametrize(
     ("vehicle", "ego", "why"),
     [
-        (TRACKED, None, "no odometry, so the camera's own motion is unknown"),
-        (
-            TRACKED,
-            CarStep(None, 0.0, 0.0, 0.1),
-            "no odometry, so the camera's own motion is unknown",
-        ),
+        (TRACKED, None, NO_ODOMETRY),
+        (TRACKED, CarStep(None, 0.0, 0.0, 0.1), NO_ODOMETRY),
         (TRACKED, CarStep(0.5, 0.0, 0.0, 0.51), "frames further than 0.5 s apart"),
         (TRACKED.model_copy(update={"camera": Camera()}), EGO, "camera.focal_px is not set"),
     ],
@@ -499,11 +468,8 @@ def test_own_cues_have_their_own_score() -> None:
 
     made = count_own(things, "crossing", VEHICLE.cues.own["crossing"])
 
-    assert (made.number, made.scores, made.skipped) == (
-        1,
-        [0.3, 0.4],
-        {BELOW_SCORE: 1, NOT_COUNTED: 0},
-    )
+    assert (made.number, made.scores) == (1, [0.3, 0.4])
+    assert made.skipped == {BELOW_SCORE: 1, NOT_COUNTED: 0}
     assert (made.setting, made.thresholds) == ("[cues.own.crossing] score", [0.3])
 
 
@@ -521,12 +487,7 @@ def test_pairs_are_skipped_by_the_first_rule_that_fails() -> None:
     """11 cars: 2 low; 7 of 9 from the side; 4 of 7 found before; 1 and 0 cross."""
     tally = _taken("car pairs", _pairs(CARS))
 
-    assert set(tally) == {
-        "cross_traffic_left",
-        "cross_traffic_right",
-        "parked_left",
-        "parked_right",
-    }
+    assert set(tally) == {*PAIR_CUES}
     before = {BELOW_SCORE: 2, NOT_FROM_THE_SIDE: 2, NOT_FOUND_BEFORE: 3}
     assert skipped(tally, "cross_traffic_left") == (11, 1, before | {OTHER_MOTION: 3})
     assert skipped(tally, "cross_traffic_right") == (11, 0, before | {OTHER_MOTION: 4})
@@ -603,11 +564,8 @@ def test_road_is_a_candidate_of_its_side() -> None:
     assert skipped(unseen, "road_left") == (1, 0, {REGION_NOT_SEEN: 1})
     assert unseen["road_left"].max_score == 0.0
     assert skipped(unseen, "road_straight") == (1, 0, {TOO_LITTLE_ROAD: 1})
-    assert _numbers("road", RoadFractions(math.nan, 0.1, 1.0)) == {
-        "road_left": None,
-        "road_straight": 0,
-        "road_right": 1,
-    }
+    numbers = _numbers("road", RoadFractions(math.nan, 0.1, 1.0))
+    assert numbers == {"road_left": None, "road_straight": 0, "road_right": 1}
 
 
 def test_frames_are_explained_by_the_detectors_that_ran() -> None:
@@ -622,11 +580,8 @@ def test_frames_are_explained_by_the_detectors_that_ran() -> None:
     for t_ms in (0, 100):
         cues(FrameDetections(t_ms * MS, (replace(car, t_ns=t_ms * MS),), (signs,), doubles=(car,)))
 
-    assert skipped(tally, "parked_left") == (
-        3,
-        0,
-        {NOT_FOUND_BEFORE: 1, OTHER_MOTION: 1, SAME_OBJECT: 1},
-    )
+    each = dict.fromkeys((NOT_FOUND_BEFORE, OTHER_MOTION, SAME_OBJECT), 1)
+    assert skipped(tally, "parked_left") == (3, 0, each)
     assert skipped(tally, "dogs") == (6, 2, {BELOW_SCORE: 2, SAME_OBJECT: 2})
     assert skipped(tally, "one_way_left") == (2, 2, {})
     assert skipped(tally, "traffic_light") == (0, 0, {})

@@ -7,7 +7,6 @@ import pytest
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
-from crosscue.detectors.cues.candidates import Count
 from crosscue.detectors.cues.cars import (
     CarShapes,
     Pairs,
@@ -132,6 +131,10 @@ def test_cars_need_a_detector() -> None:
         car_shapes([], RULES)
 
 
+def is_pair_of(before: CarShapes, now: CarShapes) -> bool:
+    return len(pair_cars(before, now, RULES).nose) == 1
+
+
 @pytest.mark.parametrize(
     ("before", "now", "is_pair"),
     [
@@ -146,9 +149,8 @@ def test_area_changes_by_less_than_three_percent_of_the_earlier_area(
     before: float, now: float, is_pair: bool
 ) -> None:
     """|A2 - A1| / A1 < 0.03 (eq. 15)."""
-    found = pair_cars(shapes((50, 50, before)), shapes((50, 50, now), t_ns=S // 10), RULES)
-
-    assert len(found.nose) == is_pair
+    later = shapes((50, 50, now), t_ns=S // 10)
+    assert is_pair_of(shapes((50, 50, before)), later) == is_pair
 
 
 @pytest.mark.parametrize(
@@ -159,9 +161,8 @@ def test_position_changes_by_less_than_five_percent_of_the_width(
     dx: float, dy: float, is_pair: bool
 ) -> None:
     """0.05 * 400 px = 20 px; sqrt(12**2 + 16**2) = 20 (eq. 15)."""
-    found = pair_cars(shapes((50, 50, 100)), shapes((50 + dx, 50 + dy, 100), t_ns=S // 10), RULES)
-
-    assert len(found.nose) == is_pair
+    later = shapes((50 + dx, 50 + dy, 100), t_ns=S // 10)
+    assert is_pair_of(shapes((50, 50, 100)), later) == is_pair
 
 
 @pytest.mark.parametrize(
@@ -169,11 +170,8 @@ def test_position_changes_by_less_than_five_percent_of_the_width(
 )
 def test_pair_is_at_most_half_a_second_apart(t_ns: int, is_pair: bool) -> None:
     """0 < 5 s + t - 5 s <= 0.5 s."""
-    found = pair_cars(
-        shapes((50, 50, 100), t_ns=5 * S), shapes((50, 50, 100), t_ns=5 * S + t_ns), RULES
-    )
-
-    assert len(found.nose) == is_pair
+    later = shapes((50, 50, 100), t_ns=5 * S + t_ns)
+    assert is_pair_of(shapes((50, 50, 100), t_ns=5 * S), later) == is_pair
 
 
 def test_pair_has_step_centre_and_nose_of_the_later_frame() -> None:
@@ -264,35 +262,32 @@ def test_parked_car_stands_on_both_axes_and_shows_its_nose() -> None:
     assert parked_cars(pairs(), RULES) == Sides(0, 0)
 
 
-def number_of(found: Count | None) -> int | None:
-    return None if found is None else found.number
+def numbers(found: Pairs) -> list[int | None]:
+    """Numbers of cars that cross, are parked, come towards the ego vehicle and drive away."""
+    rules = (count_crossing, count_crossing, count_parked, count_parked)
+    cues = ("cross_traffic_left", "cross_traffic_right", "parked_left", "parked_right")
+    counts = [
+        *(rule(found, VEHICLE, CUES[cue]) for rule, cue in zip(rules, cues, strict=True)),
+        count_oncoming(found, VEHICLE, CUES["oncoming_cars"]),
+        count_outgoing(found, VEHICLE, CUES["outgoing_cars"]),
+    ]
+    return [None if count is None else count.number for count in counts]
 
 
 def test_cues_of_a_pair_count_their_side() -> None:
     """Two cars cross to the left and one to the right; one is parked left and two right."""
     found = pairs((-4, 0), (-4, 0), (4, 0), (0, 0), (0, 0), (0, 0), noses=[0, 0, 0, -1, 1, 1])
 
-    assert number_of(count_crossing(found, VEHICLE, CUES["cross_traffic_left"])) == 2
-    assert number_of(count_crossing(found, VEHICLE, CUES["cross_traffic_right"])) == 1
-    assert number_of(count_parked(found, VEHICLE, CUES["parked_left"])) == 1
-    assert number_of(count_parked(found, VEHICLE, CUES["parked_right"])) == 2
-    assert count_oncoming(found, VEHICLE, CUES["oncoming_cars"]) is None
-    assert count_outgoing(found, VEHICLE, CUES["outgoing_cars"]) is None
+    assert numbers(found) == [2, 1, 1, 2, None, None]
 
 
 def test_cues_of_tracked_cars_are_those_judged_over_frames() -> None:
     judged = CarCounts(Sides(1, 2), Sides(3, 4), Sides(5, 6), Sides(7, 8), 9, 9, Ways(10, 11))
     found = Pairs(np.array([[-4.0, 0.0]]), np.zeros((1, 2)), np.zeros(1, np.int64), 400, judged)
 
-    assert number_of(count_crossing(found, VEHICLE, CUES["cross_traffic_left"])) == 1
-    assert number_of(count_crossing(found, VEHICLE, CUES["cross_traffic_right"])) == 2
-    assert number_of(count_parked(found, VEHICLE, CUES["parked_left"])) == 3
-    assert number_of(count_parked(found, VEHICLE, CUES["parked_right"])) == 4
-    assert number_of(count_oncoming(found, VEHICLE, CUES["oncoming_cars"])) == 10
-    assert number_of(count_outgoing(found, VEHICLE, CUES["outgoing_cars"])) == 11
+    assert numbers(found) == [1, 2, 3, 4, 10, 11]
     unknown = Pairs(found.step_px, found.center_px, found.nose, 400, judged._replace(past=None))
-    assert count_oncoming(unknown, VEHICLE, CUES["oncoming_cars"]) is None
-    assert count_outgoing(unknown, VEHICLE, CUES["outgoing_cars"]) is None
+    assert numbers(unknown) == [1, 2, 3, 4, None, None]
 
 
 def test_side_is_that_which_the_cue_supports() -> None:

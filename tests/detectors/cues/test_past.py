@@ -1,16 +1,11 @@
 """Tests of the counts of lane lines and vehicles past an intersection, from a Mobileye bus."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from crosscue.detectors.cues.far_side import (
-    MobileyeState,
-    end_of,
-    past_counts,
     state_at,
     vehicles_past,
 )
@@ -35,63 +30,6 @@ NAN = float("nan")
 
 def obstacle(x_m: float, y_m: float, kind: int = 0, age: int = 9, burst: int = 0) -> list[float]:
     return [burst, x_m, y_m, 0.0, kind, 3, 2, age]
-
-
-def lane(x_end_m: float, c0_m: float = 0.2, quality: int = 3, slope: float = 0.0) -> list[float]:
-    return [1.0, 4, quality, c0_m, slope, 0.0, 0.0, x_end_m]
-
-
-def state(
-    obstacles: Sequence[list[float]] | None = None, lanes: Sequence[list[float]] | None = None
-) -> MobileyeState:
-    return MobileyeState(
-        None if obstacles is None else np.array(obstacles, float).reshape(-1, 8),
-        None if lanes is None else np.array(lanes, float).reshape(-1, 8),
-    )
-
-
-@pytest.mark.parametrize(
-    ("row", "count"),
-    [
-        (obstacle(40.0, 2.0), 1),
-        (obstacle(22.0, 2.0), 0),  # still within the intersection
-        (obstacle(40.0, -9.0), 0),  # in a parking lot next to the road
-        (obstacle(40.0, 9.0), 0),
-        (obstacle(40.0, 0.0, kind=3), 0),  # a pedestrian
-        (obstacle(40.0, 0.0, age=1), 0),  # seen for the first time
-    ],
-)
-def test_vehicle_counts_past_the_intersection_and_on_the_road(row: list[float], count: int) -> None:
-    assert past_counts(state([row]), 20.0, PAST) == {"vehicles_past": count}
-
-
-@pytest.mark.parametrize(
-    ("row", "count"),
-    [
-        (lane(50.0), 1),
-        (lane(24.0), 0),  # ends with the intersection
-        (lane(50.0, quality=1), 0),
-        (lane(50.0, slope=0.6), 0),  # bends into the crossroad
-        (lane(NAN, c0_m=NAN, quality=0), 0),  # no marking on this side
-    ],
-)
-def test_lane_line_counts_if_it_extends_past_the_intersection(row: list[float], count: int) -> None:
-    assert past_counts(state(lanes=[row]), 20.0, PAST) == {"lanes_past": count}
-
-
-@pytest.mark.parametrize("end_m", [None, 0.0, -3.0])
-def test_counts_are_missing_without_a_valid_range(end_m: float | None) -> None:
-    assert past_counts(state([obstacle(40.0, 0.0)], [lane(60.0)]), end_m, PAST) == {}
-
-
-def test_missing_data_yields_no_counts_and_empty_data_yields_zero() -> None:
-    assert past_counts(state(), 20.0, PAST) == {}
-    assert past_counts(state([], []), 20.0, PAST) == {"vehicles_past": 0, "lanes_past": 0}
-
-
-def test_intersection_end_is_its_start_plus_its_length() -> None:
-    assert end_of(30.0, is_end=True, past=PAST) == 30.0
-    assert end_of(30.0, is_end=False, past=Past(intersection_length_m=12.0)) == 42.0
 
 
 rows = st.lists(
@@ -133,22 +71,6 @@ def test_state_depends_only_on_earlier_bursts(seed: int, t_ns: int) -> None:
         np.testing.assert_array_equal(of_whole, of_known)
         burst = min((t_ns - round(PAST.settles_s * S)) // (S // 10), 29)
         assert len(of_whole) == int((whole.values[:, 0] == burst).sum()) - 1
-
-
-@pytest.mark.parametrize("late_s", [0.55, 5.0])
-def test_state_is_missing_after_the_device_stops(late_s: float) -> None:
-    whole = simulated_bursts(3, np.random.default_rng(1))
-
-    assert state_at(whole, None, round((0.2 + late_s) * S), PAST).obstacles is None
-
-
-def test_incomplete_burst_is_not_used() -> None:
-    whole = simulated_bursts(2, np.random.default_rng(3))
-
-    early = state_at(whole, None, S // 10 + 20_000_000, PAST).obstacles
-
-    assert early is not None
-    assert len(early) == int((whole.values[:, 0] == 0).sum()) - 1
 
 
 def vehicle_of(text: str) -> Vehicle:

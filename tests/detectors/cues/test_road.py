@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.observed import RoadFractions
-from crosscue.detectors.cues.road import outlines, region_mask, road_fractions
+from crosscue.detectors.cues.road import outlines, road_fractions
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Regions, Vehicle, parse
 
@@ -24,12 +24,6 @@ def test_full_road_mask_has_fraction_one_and_empty_mask_zero() -> None:
 
     assert full == RoadFractions(1.0, 1.0, 1.0)
     assert road_fractions(_mask(np.zeros((90, 160), np.bool_)), Regions()) == RoadFractions(0, 0, 0)
-
-
-def test_fractions_are_plain_floats() -> None:
-    found = road_fractions(_mask(np.eye(90, 160, dtype=np.bool_)), Regions())
-
-    assert [type(one) for one in (found.left, found.straight, found.right)] == [float] * 3
 
 
 @settings(max_examples=20)
@@ -54,17 +48,6 @@ def test_fractions_do_not_depend_on_the_mask_resolution(factor: int) -> None:
 
     assert fine.left == pytest.approx(coarse.left, abs=0.02)
     assert coarse.left == pytest.approx(0.5, abs=0.02)
-
-
-def test_fraction_equal_to_the_threshold_is_not_positive() -> None:
-    assert RoadFractions(0.2, 0.21, 0.19).positive(0.2) == (False, True, False)
-
-
-def test_square_region_contains_exactly_its_pixels() -> None:
-    inside = region_mask(((0.25, 0.5), (0.75, 0.5), (0.75, 1.0), (0.25, 1.0)), (4, 8))
-
-    assert inside.sum() == 8
-    assert inside[2:, 2:6].all()
 
 
 @pytest.mark.parametrize(

@@ -86,3 +86,4 @@ def test_road_is_a_cue_above_the_fraction(
     ]
 
     assert tuple(found) == counts
+    assert fractions.positive(0.2) == tuple(count == 1 for count in counts)

@@ -6,9 +6,6 @@ from hypothesis import strategies as st
 
 from crosscue.detectors.base import Detections
 from crosscue.detectors.boxes import box_ious
-from crosscue.detectors.cues.candidates import SAME_OBJECT
-from crosscue.detectors.cues.frame import CuePass
-from crosscue.detectors.cues.observed import FrameDetections
 from crosscue.detectors.cues.same_object import KEPT, MIN_IOU, label_meanings, same_objects
 from crosscue.replay.vehicle.vehicle import Cars, Cues, Vehicle
 
@@ -31,43 +28,6 @@ def found(*things: Object) -> Detections:
     scores = np.array([score for _, score, _ in things], np.float64)
     labels = tuple(label for label, _, _ in things)
     return Detections(0, (640, 480), boxes, scores, labels, (b"",) * len(things))
-
-
-def duplicates(*results: Detections, calibrated: tuple[bool, ...] | None = None) -> list[list[int]]:
-    flags = calibrated or (False,) * len(results)
-    return [one.tolist() for one in same_objects(results, MEANING, flags)]
-
-
-def test_detection_of_the_higher_score_is_kept() -> None:
-    low, high = found(("car", 0.6, 10.0)), found(("car", 0.8, 11.0))
-
-    assert duplicates(low, high) == [[1], [KEPT]]
-    assert duplicates(high, low) == [[KEPT], [0]]
-
-
-def test_calibrated_score_is_kept_before_a_higher_one() -> None:
-    low, high = found(("car", 0.6, 10.0)), found(("car", 0.8, 11.0))
-
-    assert duplicates(low, high, calibrated=(True, False)) == [[KEPT], [0]]
-    assert duplicates(low, high, calibrated=(True, True)) == [[1], [KEPT]]
-
-
-def test_labels_of_one_cue_mean_the_same_object() -> None:
-    assert duplicates(found(("truck", 0.6, 10.0)), found(("car", 0.8, 10.0))) == [[1], [KEPT]]
-    assert duplicates(found(("no entry", 0.6, 0.0)), found(("do not enter", 0.8, 0.0))) == [
-        [1],
-        [KEPT],
-    ]
-    assert duplicates(found(("dog", 0.6, 10.0)), found(("car", 0.8, 10.0))) == [[KEPT], [KEPT]]
-    assert label_meanings(Vehicle(version=1)).get("truck") is None
-
-
-def test_one_detection_replaces_at_most_one_per_detector() -> None:
-    pair = found(("car", 0.7, 10.0), ("car", 0.6, 14.0))
-
-    assert duplicates(pair) == [[KEPT, KEPT]]
-    assert duplicates(found(("car", 0.9, 12.0)), pair) == [[KEPT], [0, KEPT]]
-    assert duplicates(found(("car", 0.9, 10.0), ("car", 0.8, 14.0)), pair) == [[KEPT, KEPT], [0, 0]]
 
 
 @given(st.lists(OBJECTS, min_size=1, max_size=3))
@@ -100,15 +60,3 @@ def test_identical_second_detector_is_dropped_completely(things: list[Object]) -
 
     assert (first == KEPT).all()
     assert (second == 0).all()
-
-
-def test_duplicate_detection_is_tallied_with_its_reason() -> None:
-    cues = CuePass(VEHICLE)
-    tally = cues.candidates
-    light, weaker = found(("traffic light", 0.95, 10.0)), found(("traffic light", 0.7, 10.0))
-
-    counts = cues(FrameDetections(0, objects=(light, found()), doubles=(weaker,))).counts
-
-    lights = tally["traffic_light"]
-    assert counts["traffic_light"] == lights.used == 1
-    assert (lights.seen, lights.skipped) == (2, {SAME_OBJECT: 1})

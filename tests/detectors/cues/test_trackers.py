@@ -16,7 +16,7 @@ from crosscue.detectors.cues.cars import (
     pair_cars,
     parked_cars,
 )
-from crosscue.detectors.cues.observed import Sides, nose_of
+from crosscue.detectors.cues.observed import Sides
 from crosscue.replay.vehicle.vehicle import Cars
 
 SIZE = (400, 200)
@@ -55,12 +55,6 @@ def _sides(before: CarShapes, now: CarShapes) -> tuple[Sides, Sides]:
     return cross_traffic(pairs, RULES), parked_cars(pairs, RULES)
 
 
-def test_car_moving_left_is_cross_traffic_to_the_left() -> None:
-    before, now = _shapes(_car(200, 1, 0)), _shapes(_car(190, 1, 10**8))
-
-    assert _sides(before, now) == (Sides(1, 0), Sides(0, 0))
-
-
 @pytest.mark.parametrize(("nose", "expected"), [(-1, Sides(1, 0)), (1, Sides(0, 1))])
 def test_parked_car_counts_on_the_side_of_its_nose(nose: int, expected: Sides) -> None:
     before, now = _shapes(_car(200, nose, 0)), _shapes(_car(200, nose, 10**8))
@@ -81,46 +75,6 @@ def test_mirrored_pair_counts_on_the_other_side(x: int, dx: int, dy: int, nose: 
     mirrored = _sides(_shapes(_mirrored(before)), _shapes(_mirrored(now)))
 
     assert [Sides(s.right, s.left) for s in seen] == list(mirrored)
-
-
-@pytest.mark.parametrize(
-    ("second", "reason"),
-    [
-        (_car(221, 1, 10**8), "moved by more than 5 % of the width"),
-        (_car(190, 1, 10**8, length=100), "grew by more than 3 %"),
-        (_car(190, 1, 10**9), "seen too much later"),
-        (_car(190, 1, 0), "not later"),
-        (_car(190, 1, 10**8, score=0.95), "score not above 0.95"),
-        (_car(190, 1, 10**8, length=60), "not longer than twice its height"),
-    ],
-)
-def test_cars_are_not_paired_across_a_failed_rule(second: Detections, reason: str) -> None:
-    assert len(pair_cars(_shapes(_car(200, 1, 0)), _shapes(second), RULES).nose) == 0, reason
-
-
-def test_car_moving_down_the_picture_neither_crosses_nor_parks() -> None:
-    before, now = _shapes(_car(200, 1, 0)), _shapes(_car(202, 1, 10**8, y=68))
-
-    assert _sides(before, now) == (Sides(0, 0), Sides(0, 0))
-
-
-def test_each_car_is_paired_once() -> None:
-    before = _shapes(_car(200, 1, 0), _car(206, 1, 0))
-    now = _shapes(_car(203, 1, 10**8))
-
-    assert len(pair_cars(before, now, RULES).nose) == 1
-
-
-def test_car_without_mask_has_no_nose() -> None:
-    bare = replace(_car(200, 1, 0), masks=(b"",))
-    later = replace(bare, t_ns=10**8)
-
-    assert _shapes(bare).nose.tolist() == [0]
-    assert _sides(_shapes(bare), _shapes(later)) == (Sides(0, 0), Sides(0, 0))
-
-
-def test_rectangular_profile_has_no_nose() -> None:
-    assert nose_of(np.full(40, 12.0)) == 0
 
 
 @given(

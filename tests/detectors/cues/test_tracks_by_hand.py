@@ -16,6 +16,7 @@ from crosscue.detectors.cues.tracked.judge import (
     crossing_gates,
     is_at,
     is_past,
+    may_be_parked,
     parked,
 )
 from crosscue.detectors.cues.tracked.motion import CarMotion, Observation, motions_of, place_of_end
@@ -352,6 +353,30 @@ def test_motion_is_the_least_squares_fit_of_both_ends(
     )
     assert made.long == sorted(one.long for one in seen)[frames // 2] or frames % 2 == 0
     assert made.nose == pytest.approx(sum(noses) / len(noses) if noses else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("newest", "noses", "may_be"),
+    [
+        ({}, (0, 1, 0), True),
+        ({}, (0, 0, -1), True),
+        ({}, (1, 0, 0), False),  # not in the newest two frames
+        ({"distance_m": 100.0}, (1, 1, 1), True),
+        ({"distance_m": 100.1}, (1, 1, 1), False),
+        ({"edges_rad": (math.atan(0.5), math.atan(0.69))}, (1, 1, 1), True),
+        ({"edges_rad": (math.atan(0.5), math.atan(0.71))}, (1, 1, 1), False),
+        ({"edges_rad": (math.atan(-0.5), math.atan(-0.71))}, (1, 1, 1), False),
+    ],
+)
+def test_car_that_may_be_parked_is_near_ahead_and_shows_its_nose(
+    newest: dict[str, Any], noses: tuple[int, int, int], may_be: bool
+) -> None:
+    """The mean of its ends is at most 0.6 of its distance aside, in the newest frame."""
+    rules = RULES.model_copy(update={"parked_frames": 2})
+    far = observed(0.0, (1.0, 1.0), distance_m=200.0, nose=noses[0])
+    seen = [far, observed(0.1, nose=noses[1])]
+
+    assert may_be_parked([*seen, observed(0.2, nose=noses[2], **newest)], rules) == may_be
 
 
 def test_newest_observation_decides_whether_a_car_is_hidden() -> None:
