@@ -47,10 +47,8 @@ def test_nanoseconds_survive_conversion_to_text(t_ns: int) -> None:
 
 @given(seed=st.integers(0, 10_000), n=st.integers(0, 20))
 @settings(max_examples=30)
-def test_trajectory_is_read_back_exactly(
-    seed: int, n: int, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    path = tmp_path_factory.mktemp("tum") / "poses.tum"
+def test_trajectory_is_read_back_exactly(seed: int, n: int, tmp_path: Path) -> None:
+    path = tmp_path / "poses.tum"
     trajectory = random_trajectory(seed, n)
     write_tum(path, trajectory, comment="two\nlines")
     found = read_tum(path)

@@ -76,10 +76,12 @@ def _depth(value: object) -> int:
     return 1 + max(map(_depth, below), default=0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parse", "text"),
-    [*((json_tree, text) for text in DEEP_JSON), *((toml_tree, text) for text in DEEP_TOML)],
+    [
+        *((json_tree, text) for text in DEEP_JSON),
+        *(pytest.param(toml_tree, text, marks=pytest.mark.slow) for text in DEEP_TOML),
+    ],
 )
 def test_deeply_nested_text_is_refused(parse: Callable[[str], object], text: str) -> None:
     with pytest.raises(ValueError, match="nested"):

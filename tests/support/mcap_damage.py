@@ -127,10 +127,6 @@ def _are_changed(
     return changed <= 3 and unexpected.total() <= missing.total()
 
 
-def cut(coded: bytes, rng: np.random.Generator) -> bytes:
-    return coded[: int(rng.integers(0, len(coded)))]
-
-
 def damage(coded: bytes, rng: np.random.Generator) -> bytes:
     """Overwrite 1 to 64 bytes by noise, zeros, ones or other bytes of the file, or flip one bit."""
     out = bytearray(coded)
@@ -155,6 +151,6 @@ def copies(coded: bytes, seed: int, cuts: int, damages: int) -> Iterator[tuple[s
     """Yield damaged copies of a file, each with a description; the seed determines all."""
     rng = np.random.default_rng(seed)
     for i in range(cuts):
-        yield f"cut {i}", cut(coded, rng)
+        yield f"cut {i}", coded[: int(rng.integers(0, len(coded)))]
     for i in range(damages):
         yield f"damage {i}", damage(coded, rng)

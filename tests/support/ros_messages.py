@@ -1,6 +1,6 @@
 """Random ROS types and messages, encoded by rosbags, as an independent check of our decoder."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from typing import Any
 
@@ -161,6 +161,11 @@ def block_of(topic: str, payloads: Sequence[bytes], gap: int = 3) -> Block:
     """A block of messages, a millisecond apart."""
     log_ns = np.arange(len(payloads), dtype=np.int64) * 1_000_000
     return Block(topic, log_ns, messages_of(payloads, gap))
+
+
+def ros(is_cdr: bool) -> tuple[Typestore, Callable[[str, str], Topic]]:
+    """The types of ROS 2 or ROS 1, and what makes a topic of one."""
+    return (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
 
 
 def serialized(

@@ -17,8 +17,7 @@ from support.ros_messages import (
     block_of,
     decoder_of,
     random_message,
-    ros1_store,
-    ros1_topic,
+    ros,
     ros2_store,
     ros2_topic,
     serialized,
@@ -29,7 +28,7 @@ PICTURE: Final = b"\xff\xd8" + bytes(range(64))
 
 def _ros(rng: np.random.Generator, kind: str) -> tuple[Topic, bytes]:
     is_cdr, name = kind == "CDR", "sensor_msgs/msg/Imu"
-    store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
+    store, topic_of = ros(is_cdr)
     return topic_of("/t", name), serialized(store, random_message(rng, store, name), name, is_cdr)
 
 

@@ -24,7 +24,7 @@ from support.ros_messages import (
     numbers_in,
     random_definition,
     random_message,
-    ros1_store,
+    ros,
     ros1_topic,
     ros2_store,
     ros2_topic,
@@ -53,7 +53,7 @@ def assert_same_values(table: Table, messages: list[object], store: Typestore, n
 @pytest.mark.slow
 @pytest.mark.parametrize("is_cdr", [True, False])
 def test_standard_types_decode_like_rosbags(is_cdr: bool) -> None:
-    store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
+    store, topic_of = ros(is_cdr)
     rng = np.random.default_rng(5)
     compared = 0
     for name in sorted(store.fielddefs):
@@ -145,7 +145,7 @@ def test_damaged_messages_are_dropped_like_rosbags(seed: int, is_cdr: bool) -> N
     rng = np.random.default_rng(seed)
     sensors = [f"sensor_msgs/msg/{name}" for name in ("JointState", "PointCloud2", "Imu")]
     name = str(rng.choice([*sensors, "diagnostic_msgs/msg/DiagnosticArray", "nav_msgs/msg/Path"]))
-    store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
+    store, topic_of = ros(is_cdr)
     payloads, accepted = [], []
     for _ in range(24):
         raw = bytearray(serialized(store, random_message(rng, store, name), name, is_cdr))
@@ -264,7 +264,7 @@ def test_costly_idl_definition_is_refused(idl: str) -> None:
 @QUICK
 def test_damaged_definition_is_used_or_refused_in_one_line(seed: int, is_cdr: bool) -> None:
     rng = np.random.default_rng(seed)
-    store, topic_of = (ros2_store(), ros2_topic) if is_cdr else (ros1_store(), ros1_topic)
+    store, topic_of = ros(is_cdr)
     name = str(rng.choice(["sensor_msgs/msg/Imu", "nav_msgs/msg/Path", "sensor_msgs/msg/Image"]))
     topic = topic_of("/t", name)
     text = bytearray(topic.schema)

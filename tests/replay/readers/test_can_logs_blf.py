@@ -66,14 +66,14 @@ MINUTE_LOG = blf(MINUTE_FRAMES, container=4_000)
 )
 @settings(max_examples=20)
 def test_time_range_yields_exact_frames_and_account(
-    tmp_path_factory: pytest.TempPathFactory, window: tuple[int, int], ends: str, stored: bool
+    tmp_path: Path, window: tuple[int, int], ends: str, stored: bool
 ) -> None:
     start_ns, end_ns = (START_NS + s * 10**9 for s in sorted(window))
     start_ns, end_ns = (0 if ends == "to" else start_ns), (1 << 62 if ends == "from" else end_ns)
     selection = Selection(None, start_ns or None, None if ends == "from" else end_ns)
     content = blf(MINUTE_FRAMES, container=4_000, stored=stored) if stored else MINUTE_LOG
 
-    found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), content), selection)
+    found, ledger = read_back(_log(tmp_path, content), selection)
 
     wanted = [f for f in MINUTE_FRAMES if start_ns <= f.t_ns < end_ns]
     assert found == by_bus(wanted)
@@ -110,14 +110,12 @@ def test_read_buffer_may_end_anywhere_in_object(
 
 @given(deleted=st.sets(st.integers(0, 79)))
 @settings(max_examples=25)
-def test_every_deleted_object_is_reported_as_dropped(
-    tmp_path_factory: pytest.TempPathFactory, deleted: set[int]
-) -> None:
+def test_every_deleted_object_is_reported_as_dropped(tmp_path: Path, deleted: set[int]) -> None:
     frames = random_frames(80)
     kept = [frame for k, frame in enumerate(frames) if k not in deleted]
     content = blf(kept)[:32] + struct.pack("<L", len(frames)) + blf(kept)[36:]
 
-    found, ledger = read_back(_log(tmp_path_factory.mktemp("log"), content))
+    found, ledger = read_back(_log(tmp_path, content))
 
     assert found == by_bus(kept)
     assert ledger.topic("").dropped.total() == len(deleted)
@@ -155,11 +153,9 @@ EVERY_KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=list(KINDS))
 @EVERY_KIND
 @given(seed=st.integers(0, 2**31))
 @settings(max_examples=5)
-def test_frames_survive_write_and_read(
-    tmp_path_factory: pytest.TempPathFactory, kind: Kind, seed: int
-) -> None:
+def test_frames_survive_write_and_read(tmp_path: Path, kind: Kind, seed: int) -> None:
     frames = kind.frames(300, seed)
-    path = _log(tmp_path_factory.mktemp("log"), kind.spell(frames), kind.suffix)
+    path = _log(tmp_path, kind.spell(frames), kind.suffix)
 
     found, ledger = read_back(path)
 

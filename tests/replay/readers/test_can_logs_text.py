@@ -290,7 +290,7 @@ def test_real_trc_logs_match_python_can(name: str, missing: int) -> None:
 @given(deleted=st.sets(st.integers(0, 59)))
 @settings(max_examples=25)
 def test_every_deleted_row_of_trc_log_is_reported_as_dropped(
-    tmp_path_factory: pytest.TempPathFactory, version: str, deleted: set[int]
+    tmp_path: Path, version: str, deleted: set[int]
 ) -> None:
     frames = random_frames(60, fd=version > "2")
     if version < "1.2":
@@ -302,7 +302,7 @@ def test_every_deleted_row_of_trc_log_is_reported_as_dropped(
     missing = sum(k < max(kept, default=-1) for k in deleted)
     text = b"".join([*head, *(rows[k] for k in kept)])
 
-    found, ledger = read_back(write_log(tmp_path_factory.mktemp("log"), "trc", text))
+    found, ledger = read_back(write_log(tmp_path, "trc", text))
 
     assert sum(map(len, found.values())) == len(kept)
     assert ledger.topic("").dropped == ({MISSING: missing} if missing else {})

@@ -4,7 +4,6 @@ import struct
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -177,7 +176,7 @@ OPTIONS = st.fixed_dictionaries(
 @given(messages=MESSAGES, options=OPTIONS)
 @settings(max_examples=60)
 def test_messages_match_mcap_package(
-    messages: list[tuple[int, int, int, bytes]], options: dict[str, Any]
+    tmp_path: Path, messages: list[tuple[int, int, int, bytes]], options: dict[str, Any]
 ) -> None:
     stream = BytesIO()
     writer = Writer(stream, repeat_schemas=options["repeat_channels"], **options)
@@ -193,8 +192,7 @@ def test_messages_match_mcap_package(
     for _, sent_on, found in NonSeekingReader(stream).iter_messages(log_time_order=False):
         one = (found.log_time, found.publish_time, found.data)
         theirs.setdefault(sent_on.topic, []).append(one)
-    with TemporaryDirectory() as folder:
-        ours = read_coded(Path(folder), stream.getvalue())
+    ours = read_coded(tmp_path, stream.getvalue())
 
     assert ours.messages == theirs
     assert ours.ledger.is_whole

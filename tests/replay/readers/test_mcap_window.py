@@ -3,7 +3,6 @@
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
 from hypothesis import given, settings
@@ -61,10 +60,12 @@ def files(draw: st.DrawFn) -> McapFile:
 @pytest.mark.slow
 @settings(max_examples=120)
 @given(file=files(), selection=st.builds(Selection, TOPIC_SETS, BOUND, BOUND))
-def test_selection_yields_same_rows_as_complete_pass(file: McapFile, selection: Selection) -> None:
-    with TemporaryDirectory() as folder:
-        path = written(Path(folder) / "log.mcap", file.coded())
-        ours, whole = read_back(path, selection), read_by_complete_pass(path, selection)
+def test_selection_yields_same_rows_as_complete_pass(
+    tmp_path: Path, file: McapFile, selection: Selection
+) -> None:
+    path = written(tmp_path / "log.mcap", file.coded())
+
+    ours, whole = read_back(path, selection), read_by_complete_pass(path, selection)
 
     assert ours.messages == whole.messages
     assert ours.ledger.accounts == whole.ledger.accounts
