@@ -288,11 +288,7 @@ def test_unusable_input_file_is_refused_in_one_line(
 
 
 def _assert_refused(
-    argv: list[str],
-    expected: int,
-    named: str,
-    names: dict[str, Path],
-    out: Path,
+    argv: list[str], expected: int, named: str, names: dict[str, Path], out: Path
 ) -> list[str]:
     """Check how a command ends, and return the files that it opened."""
     inputs = names["masks"].parent

@@ -1,6 +1,5 @@
 """Invalid networks, cards and labels are refused in one line, and no run folder remains."""
 
-import hashlib
 import json
 import shutil
 from collections.abc import Iterator
@@ -13,7 +12,7 @@ import crosscue
 from crosscue.detectors.base import Frame, View
 from crosscue.detectors.box_detector import BoxDetector, ScoredBox
 from crosscue.eval import cli
-from support.onnx_models import constant_model
+from support.onnx_models import constant_model, write_card
 from support.pictures import picture_folder
 from support.refusals import refusal
 
@@ -46,21 +45,15 @@ class Everything(BoxDetector):
         yield "whatever", 1.0, (0, 0, frame.pixels.shape[1], frame.pixels.shape[0])
 
 
-def card(folder: Path, model: bytes, classes: list[str], width_px: int = 64) -> str:
-    """Write a network, and return the text of a card for it."""
-    (folder / "net.onnx").write_bytes(model)
-    text = f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(model).hexdigest()}"\n'
-    text += f"[input]\nwidth_px = {width_px}\nheight_px = 32\n[output]\n"
-    return text + OUTPUT.format(json.dumps(classes))
-
-
 def write_invalid_model(folder: Path, bad: str) -> None:
     """Write ``net.toml`` with its network, and ``car.toml``."""
     rows = {"nan": np.full_like(ROWS, np.nan), "other-shape": ROWS[:, :, :5]}.get(bad, ROWS)
     classes = {"other-classes": ["dog"], "no-classes": []}.get(bad, ["dog", "cat"])
     model = constant_model((1, 3, 32, 64), {"rows": rows})
-    text = card(folder, model, classes, 40 if bad == "other-size" else 64)
-    (folder / "net.toml").write_text("" if bad == "empty-card" else text)
+    size = (40 if bad == "other-size" else 64, 32)
+    card = write_card(folder, model, OUTPUT.format(json.dumps(classes)), size)
+    if bad == "empty-card":
+        card.write_text("")
     if bad == "other-weights":
         (folder / "net.onnx").write_bytes(model + b" ")
     if bad == "no-weights":

@@ -11,14 +11,11 @@ import pytest
 
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive as simulated
-from crosscue.datasets.truth.truth import Truth, save
-from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.detectors.images import MAX_PIXELS
 from crosscue.eval import cli
 from crosscue.localization.landmarks.database import LandmarkWriter
-from crosscue.replay.columns import Floats
 from crosscue.replay.limits import MIB
-from support.coco import stop_signs
+from support.coco import annotate, stop_signs
 from support.every_format import EVERY_FORMAT
 from support.failures import table_of_failures
 from support.gap_drive import BEGIN, SIZE, Clock, replayed, write_drive
@@ -215,7 +212,7 @@ def test_oversized_camera_picture_is_reported_with_size_and_limit(
     coded = [*CODED][[*HOLDERS].index(holder) % len(CODED)]
     valid = [("png", picture(number)) for number in range(3)]
     log = HOLDERS[holder](drive, [(coded, CODED[coded]()), *valid])
-    _annotate(drive, 0 if holder == "folder" else START_NS)
+    annotate(drive, 0 if holder == "folder" else START_NS)
     with LandmarkWriter(tmp_path / "known.db", "orb"):
         pass
     names = {
@@ -322,16 +319,3 @@ def test_array_header_exceeding_file_is_reported(
     printed = capsys.readouterr()
     assert status == (4 if len(shape) == 1 else 3), printed.err
     assert ("copy it again" in printed.err) if status == 4 else ("losses" in printed.out)
-
-
-def _annotate(drive: Path, start_ns: int) -> None:
-    """Write the truth of four pictures, a tenth of a second apart."""
-    t_ns = start_ns + np.arange(4) * 100_000_000
-    times = t_ns.tolist()
-    (drive / "objects.json").write_text(stop_signs([(f"{t}.png", t) for t in times], (24, 16)))
-    save(
-        Truth(version=1, source="x", start_ns=times[0], end_ns=times[-1] + 1, pose="pose.tum"),
-        drive,
-    )
-    zero: Floats = np.zeros(4)
-    write_tum(drive / "pose.tum", planar(t_ns, zero + 100.0 * np.arange(4), zero, zero), "made up")

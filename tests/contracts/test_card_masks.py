@@ -1,6 +1,5 @@
 """Masks of a network with a model card are used in eq. 13, 15 and 16."""
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,8 +10,7 @@ from numpy.typing import NDArray
 
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import open_run
-from crosscue.eval.runs.manifest import DetectorRow
-from support.onnx_models import constant_model
+from support.onnx_models import constant_model, write_card
 from support.pictures import picture_folder
 
 # Size of the network's input; pictures of 24 x 16 pixels are stretched to it.
@@ -76,12 +74,8 @@ def replay_constant_network(
 ) -> Path:
     """Replay three pictures with a network that returns the same outputs for each."""
     model = constant_model((1, 3, HEIGHT, WIDTH), outputs)
-    (folder / "net.onnx").write_bytes(model)
-    (folder / "net.toml").write_text(
-        f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(model).hexdigest()}"\n'
-        f'[input]\nwidth_px = {WIDTH}\nheight_px = {HEIGHT}\nfit = "stretch"\n'
-        f"[output]\nclasses = {json.dumps(classes)}\n{output}"
-    )
+    output += f"classes = {json.dumps(classes)}"
+    write_card(folder, model, output, (WIDTH, HEIGHT), 'fit = "stretch"')
     (folder / "car.toml").write_text(VEHICLE)
     log, out = picture_folder(folder / "front", 3, "rate_hz: 10\n"), folder / "out"
     argv = ["replay", log, "--detectors", folder / "net.toml", "--vehicle", folder / "car.toml"]
@@ -97,14 +91,6 @@ def positive(out: Path) -> dict[str, int]:
     return counts
 
 
-def detector_of(out: Path) -> DetectorRow:
-    """Manifest entry of the only detector of a run."""
-    detected = open_run(out).drive_manifest().detected
-    assert detected is not None
-    (detector,) = detected.detectors
-    return detector
-
-
 @pytest.mark.parametrize("nose", ["left", "right"])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_mask_shows_orientation_of_parked_car(tmp_path: Path, layout: str, nose: str) -> None:
@@ -115,7 +101,9 @@ def test_mask_shows_orientation_of_parked_car(tmp_path: Path, layout: str, nose:
     found = positive(out)
     other = "right" if nose == "left" else "left"
     assert (found[f"parked_{nose}"], found[f"parked_{other}"]) == (2, 0)
-    detector = detector_of(out)
+    detected = open_run(out).drive_manifest().detected
+    assert detected is not None
+    (detector,) = detected.detectors
     assert (detector.with_mask, detector.boxes_only) == (("car",), ())
 
 

@@ -77,10 +77,7 @@ def _prepare(name: str, folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_changed_settings_are_refused_and_files_are_unchanged(
-    name: str,
-    folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    name: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     argv = _prepare(name, folder, tmp_path / "out", monkeypatch)
     _, flag, other = COMMANDS[name]
@@ -95,10 +92,7 @@ def test_changed_settings_are_refused_and_files_are_unchanged(
 
 @pytest.mark.parametrize("name", ["train road", "train mask-rcnn"])
 def test_changed_pictures_are_refused_with_both_identities(
-    name: str,
-    folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    name: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     argv = _prepare(name, folder, tmp_path / "out", monkeypatch)
     (folder / "images" / "1.png").write_bytes(picture(7, width=128, height=80))

@@ -19,7 +19,9 @@ from crosscue.replay.formats import FORMATS, Format
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.testing import check_cue, check_detector, check_reader
 from support import one_row
+from support.commands import output_of
 from support.every_format import _bytes
+from support.refusals import refusal
 
 PAGE = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text(encoding="utf-8")
 
@@ -82,9 +84,7 @@ def test_detector_example_fulfils_contract(module: Callable[[str, str], str]) ->
 
 
 def test_command_example_has_the_described_options(
-    module: Callable[[str, str], str],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    module: Callable[[str, str], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (code,) = _code("a command")
     verb = vars(import_module(module("example_command", code)))["longest_gap"]
@@ -93,11 +93,11 @@ def test_command_example_has_the_described_options(
         sys.modules, "crosscue.eval.logs.longest_gap", SimpleNamespace(longest_gap=verb)
     )
 
-    assert cli.run(["longest-gap", "--help"]) == 0
-    help_text = capsys.readouterr().out
+    help_text = output_of("longest-gap", "--help")
     for option in ("LOG", "--from", "--to", "--topics", "--max-chunk", "--min-s S", "--json", "-q"):
         assert option in help_text, option
-    assert cli.run(["longest-gap", "drive.mcap", "--min-s", "-1"]) == 2
-    assert "--min-s -1.0: expected more than 0" in capsys.readouterr().err
+    assert "--min-s -1.0: expected more than 0" in refusal(
+        2, "longest-gap", "drive.mcap", "--min-s", "-1"
+    )
     with pytest.raises(UsageError, match=r"min_s: -1\.0, expected more than 0"):
         verb("drive.mcap", min_s=-1.0)

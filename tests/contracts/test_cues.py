@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 import pytest
-from rerun.chunk import RrdReader
 
 import crosscue
 from crosscue.datasets.scenes.scene_truth import SIMULATED
@@ -20,6 +19,7 @@ from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.testing import check_cue
 from support.gap_drive import Clock, GreyNumber, write_drive
+from support.recordings import cells
 
 DUMMY = CueSpec(
     name="zebra",
@@ -142,20 +142,5 @@ def test_dummy_cue_appears_in_tables_scores_report_and_recording(
     (score,) = [row for row in scored.cues.to_pylist() if row["cue"] == "zebra"]
     assert (score["precision"], score["precision_of"]) == (1.0, 33)
     assert "<td>zebra</td>" in scored.report.read_text()
-    assert _static(recording, "/cues/zebra", "colors") == [[int.from_bytes((1, 2, 3, 255))]]
-
-
-def _static(recording: Path, entity: str, component: str) -> list[object]:
-    """Return the static components of an entity in a recording."""
-    batches = [
-        chunk.to_record_batch()
-        for chunk in RrdReader(recording).stream()
-        if chunk.entity_path == entity and chunk.is_static
-    ]
-    return [
-        cell
-        for batch in batches
-        for name in batch.schema.names
-        if name.endswith(component)
-        for cell in batch[name].to_pylist()
-    ]
+    (colour,) = cells(recording, "/cues/zebra", "colors", is_static=True)
+    assert colour[1] == [int.from_bytes((1, 2, 3, 255))]

@@ -1,15 +1,11 @@
 """Cut logs are read in part or refused, and a missing camera is blamed on the cut."""
 
-import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
-from crosscue.datasets.truth.truth import Truth, save
-from crosscue.datasets.truth.tum import planar, write_tum
 from crosscue.eval import cli
 from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.replay.base import report_missing
@@ -17,6 +13,8 @@ from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from support.accounted import read
+from support.coco import annotate
+from support.commands import output_of
 from support.every_format import EVERY_FORMAT
 from support.mcap_files import ChunkOf, McapFile, channel, message, schema
 from support.refusals import refusal
@@ -119,9 +117,7 @@ def _times(log: Path) -> tuple[dict[str, set[int]], Ledger]:
 @pytest.mark.parametrize(
     ("name", "file"), [(name, file) for name in TIME_FILES for file in TIME_FILES[name]]
 )
-def test_rows_without_time_stamp_are_dropped(
-    name: str, file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_rows_without_time_stamp_are_dropped(name: str, file: str, tmp_path: Path) -> None:
     log = EVERY_FORMAT[name](tmp_path)
     if name == "images":
         (log / file).write_text("".join(f"{0.1 * i:.3f}\n" for i in range(12)))
@@ -141,8 +137,7 @@ def test_rows_without_time_stamp_are_dropped(
     assert seen
 
     path.write_bytes(raw[: len(raw) // 2])
-    assert cli.run(["info", str(log)]) == 3
-    message = " ".join(capsys.readouterr().out.split())
+    message = " ".join(output_of("info", log, status=3).split())
     assert any(reason in message for reason in seen)
 
 
@@ -205,17 +200,7 @@ def _drive(folder: Path, is_cut: bool, camera: str) -> dict[str, Path]:
     coded = McapFile([ChunkOf([*named, *rows[:100]]), ChunkOf(rows[100:])]).coded()
     (folder / "a.mcap").write_bytes(coded[: len(coded) * 2 // 3] if is_cut else coded)
     (folder / "vehicle.toml").write_text(f"version = 1\n{camera}")
-    t_ns = START_NS + np.arange(4) * 10**8
-    zero = np.zeros(4)
-    truth = Truth(
-        version=1, source="x", start_ns=int(t_ns[0]), end_ns=int(t_ns[-1]) + 1, pose="pose.tum"
-    )
-    save(truth, folder)
-    write_tum(folder / "pose.tum", planar(t_ns, 9 * np.arange(4.0), zero, zero), "made up")
-    image = {"id": 0, "file_name": "a.png", "width": 24, "height": 16, "t_ns": START_NS}
-    kinds = [{"id": 1, "name": "stop sign"}]
-    coco = json.dumps({"categories": kinds, "images": [image], "annotations": []})
-    (folder / "objects.json").write_text(coco)
+    annotate(folder, START_NS)
     with LandmarkWriter(folder.parent / "known.db", "orb"):
         pass
     return {

@@ -12,10 +12,10 @@ from typing import Final
 import numpy as np
 import pytest
 
-from crosscue.eval import cli
 from crosscue.replay.formats import FORMATS
 from support.accounted import read
 from support.can_files import blf, random_frames, trc
+from support.commands import output_of
 from support.every_format import EVERY_FORMAT, FRAMES
 from support.mcap_files import McapFile, channel, schema
 from support.mcap_files import message as mcap_message
@@ -188,9 +188,7 @@ def test_every_format_is_classified_by_row_counter() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(ONE_REMOVED))
-def test_removed_row_is_reported_as_one_dropped_row(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_removed_row_is_reported_as_one_dropped_row(name: str, tmp_path: Path) -> None:
     log = ONE_REMOVED[name](tmp_path)
 
     _, ledger = read(log)
@@ -198,8 +196,7 @@ def test_removed_row_is_reported_as_one_dropped_row(
     accounts = ledger.accounts.values()
     assert sum(account.dropped.total() for account in accounts) == 1, ledger.details
     assert not any(account.dropped_unknown for account in accounts), ledger.details
-    assert cli.run(["info", str(log)]) == 3
-    assert "losses" in capsys.readouterr().out
+    assert "losses" in output_of("info", log, status=3)
 
 
 @pytest.mark.parametrize("name", sorted(WITHOUT_COUNTER))

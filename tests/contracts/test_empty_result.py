@@ -10,6 +10,7 @@ from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import MANIFEST
+from support.commands import output_of
 from support.empty_inputs import COMMANDS, empty_inputs
 from support.pictures import picture_folder
 from support.refusals import refusal
@@ -46,17 +47,13 @@ def test_finished_run_is_unchanged_if_next_result_is_empty(
     assert contents(out) == before
 
 
-def test_overwritten_run_contains_only_new_files(
-    drive: DriveFiles, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_overwritten_run_contains_only_new_files(drive: DriveFiles, tmp_path: Path) -> None:
     out, fresh = tmp_path / "out", tmp_path / "fresh"
     argv = ["replay", str(drive.log), "--vehicle", str(drive.vehicle)]
     assert cli.run([*argv, "-o", str(out)]) == 0
     (out / "score").mkdir()
-    capsys.readouterr()
     (out / "cues.parquet").write_bytes(b"")
-    assert cli.run([*argv, "-o", str(out), "--overwrite", "--to", "5", "--json"]) == 0
-    message = capsys.readouterr().out
+    message = output_of(*argv, "-o", out, "--overwrite", "--to", "5", "--json")
     assert cli.run([*argv, "-o", str(fresh), "--to", "5"]) == 0
 
     assert json.loads(message)["run"] == str(out)

@@ -22,6 +22,7 @@ from crosscue.eval import cli
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.runs.logs import log_location
 from crosscue.replay.files.tree_text import spelled, unspelled
+from support.commands import json_of
 from support.gap_drive import VEHICLE, Clock, write_drive
 
 HOSTILE: Final[dict[str, bytes]] = {
@@ -120,8 +121,7 @@ def test_batch_of_drives_with_any_names(
 
     assert cli.run(argv) == 3, capsys.readouterr().err
     capsys.readouterr()
-    assert cli.run(["query", str(tmp_path / "runs"), "from runs", "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)
+    rows = json_of("query", tmp_path / "runs", "from runs")
     assert cli.run(["status", str(tmp_path / "runs"), "--json"]) == 3
 
     logs = sorted(name for row in rows for name in row["logs"] or [])

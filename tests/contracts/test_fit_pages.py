@@ -3,7 +3,6 @@
 The table has one line for each command ``fit``.
 """
 
-import hashlib
 import html
 import re
 import tomllib
@@ -13,8 +12,6 @@ from typing import Final
 
 import cv2
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 import crosscue
@@ -22,9 +19,11 @@ from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval import cli
 from crosscue.replay.vehicle.vehicle import parse
-from support.fusion_runs import made_up_drive, write_empty_truth, write_run, write_truth
-from support.landmark_files import encoded, seen_from, wall
-from support.onnx_models import bright_box_model
+from support.commands import output_of
+from support.fusion_runs import write_drives
+from support.landmark_files import write_walls
+from support.lights import write_lights
+from support.refusals import refusal
 from support.sign_scenes import scene
 
 # Arguments, words of each chart's caption, and the section to paste.
@@ -62,18 +61,9 @@ def named(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, lis
     """A folder with the inputs of every fit, and the words of the table that stand for paths."""
     folder = tmp_path_factory.mktemp("fits")
     drive = write_drive(folder / "drive", DriveSettings(seed=3, blocks=2, block_m=60.0))
-    rng, runs, truths = np.random.default_rng(4), [], []
-    for i in range(12):
-        left, is_empty = i % 3 == 0, i % 6 == 5
-        evidence = made_up_drive(rng, left=left, signed=not is_empty)
-        run = write_run(folder / f"run{i}", evidence).path
-        frames = pa.table({"t_ns": [one.t_ns for one in evidence]})
-        pq.write_table(frames, run / "frames.parquet", write_page_checksum=True)
-        truth = folder / f"truth{i}"
-        truths.append(write_empty_truth(truth) if is_empty else write_truth(truth, left=left))
-        runs.append(run)
-    _write_tables(folder, rng)
-    _write_lights(folder / "lights", rng)
+    runs, truths = write_drives(folder / "beliefs", [True, False, False, True, False, None] * 2)
+    _write_tables(folder)
+    write_lights(folder / "lights", 160)
     return folder, {
         "DRIVE": [str(drive.log)],
         "CAR": [str(drive.vehicle)],
@@ -84,47 +74,18 @@ def named(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, lis
     }
 
 
-def _write_tables(folder: Path, rng: np.random.Generator) -> None:
+def _write_tables(folder: Path) -> None:
     """Write heights with ranges, pictures of signs, and pairs of pictures."""
+    rng = np.random.default_rng(4)
     heights = [f"{200 / m},{m + rng.normal()}" for m in range(5, 60)]
     (folder / "heights.csv").write_text("\n".join(["height_px,range_m", *heights]))
-    signs, pairs = ["picture,label,x0,y0,x1,y1"], ["query,known,same"]
+    signs = ["picture,label,x0,y0,x1,y1"]
     for k in range(4):
         shown = scene("one way left", k)
         cv2.imwrite(str(folder / f"sign{k}.png"), shown.grey)
         signs.append(f"sign{k}.png,{LEFT},{','.join(map(str, shown.box.tolist()))}")
-        (folder / f"{k}.png").write_bytes(encoded(wall(k)))
-        (folder / f"seen{k}.png").write_bytes(encoded(seen_from(wall(k), 3.0, 1.05, 4.0, k)))
-        pairs += [f"seen{k}.png,{other}.png,{int(k == other)}" for other in range(4)]
     (folder / "signs.csv").write_text("\n".join(signs))
-    (folder / "pairs.csv").write_text("\n".join(pairs))
-
-
-def _write_lights(folder: Path, rng: np.random.Generator) -> None:
-    """Write a run with one box a picture, of which the bright ones are more often lights."""
-    for name in ("log", "labels"):
-        (folder / name).mkdir(parents=True)
-    (folder / "labels" / "classes.txt").write_text("Traffic-Light\nvan\n")
-    for number in range(160):
-        score = rng.uniform(0.5, 1.0)
-        pixels = np.zeros((48, 64), np.uint8)
-        pixels[8:24, 16:32] = round(255 * score)
-        cv2.imwrite(str(folder / "log" / f"frame_{number}.png"), pixels)
-        row = (
-            f"0 {24 / 64} {16 / 48} {16 / 64} {16 / 48}\n"
-            if score > 0.6 + 0.1 * rng.normal()
-            else ""
-        )
-        (folder / "labels" / f"frame_{number}.txt").write_text(row)
-    (folder / "log" / "timestamps.txt").write_text("rate_hz: 10\n")
-    weights = bright_box_model(by_brightness=True)
-    (folder / "net.onnx").write_bytes(weights)
-    (folder / "net.toml").write_text(
-        f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(weights).hexdigest()}"\n'
-        "[input]\nwidth_px = 64\nheight_px = 48\n"
-        '[output]\nkind = "end-to-end"\nclasses = ["traffic light", "bench"]\nscore = 0.3\n'
-    )
-    crosscue.detect_drive(folder / "log", folder / "run", detectors=[f"{folder}/net.toml"])
+    write_walls(folder)
 
 
 def test_every_fit_is_in_the_table() -> None:
@@ -137,7 +98,6 @@ def test_page_of_fit_shows_data_fit_losses_and_section(
     named: tuple[Path, dict[str, list[str]]],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
 ) -> None:
     folder, words_of = named
     monkeypatch.chdir(folder)
@@ -145,9 +105,7 @@ def test_page_of_fit_shows_data_fit_losses_and_section(
     given = [one for word in line.split() for one in words_of.get(word, [word])]
     page = tmp_path / "fit.html"
 
-    assert cli.run([*name.split(), *given, "--page", str(page)]) == 0
-
-    printed = capsys.readouterr().out
+    printed = output_of(*name.split(), *given, "--page", page)
     text = page.read_text()
     (report,) = re.findall('<pre class="lines">(.*?)</pre>', text, re.DOTALL)
     assert printed.startswith(html.unescape(report).rstrip())
@@ -164,8 +122,9 @@ def test_page_of_fit_shows_data_fit_losses_and_section(
     assert page.stat().st_size < 3_000_000
 
     # An existing page is refused before any work.
-    assert cli.run([*name.split(), *given, "--page", str(page)]) == 1
-    assert "exists; give another name or --overwrite" in capsys.readouterr().err
+    assert "exists; give another name or --overwrite" in refusal(
+        1, *name.split(), *given, "--page", page
+    )
     assert page.read_text() == text
 
 

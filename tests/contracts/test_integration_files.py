@@ -102,10 +102,6 @@ def _missing_paths(text: str) -> list[str]:
     return [name for name in names if not (ROOT / name).exists()]
 
 
-def _is_pinned(action: str) -> bool:
-    return action == "./" or re.fullmatch(r"[\w/-]+@v\d+(\.\d+)*", action) is not None
-
-
 def test_dockerfile_copies_what_exists_and_starts_a_command(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -154,7 +150,8 @@ def test_workflow_runs_commands_and_files_that_exist(
         steps = job["steps"]
         assert {*re.findall(r"steps\.(\w+)\.", text)} <= {one.get("id") for one in steps}
         for step in steps:
-            assert _is_pinned(step.get("uses", "./")), step
+            # A version is pinned.
+            assert re.fullmatch(r"\./|[\w/-]+@v\d+(\.\d+)*", step.get("uses", "./")), step
             for line in step.get("run", "").splitlines():
                 assert _missing_paths(line) == []
                 if line.startswith("crosscue"):
@@ -176,11 +173,3 @@ def test_shell_scripts_of_the_repository_parse() -> None:
     for script in (SCRIPT, ROOT / ".ci/run", ROOT / ".ci/lowest"):
         assert script.stat().st_mode & 0o100 or script is SCRIPT, script
         assert subprocess.run(["bash", "-n", script], check=False).returncode == 0
-
-
-def test_checks_of_integration_files_can_fail(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "--colour" in _command_fault("crosscue demo --colour", capsys)
-    assert _command_fault("crosscue drive", capsys) == "no command: crosscue drive"
-    assert _missing_paths("pip install -c requirement.lock .") == ["requirement.lock"]
-    assert _missing_paths(".ci/runs") == [".ci/runs"]
-    assert not _is_pinned("actions/checkout@main")

@@ -15,7 +15,7 @@ from crosscue.results import Result
 from support.coco import stop_signs
 from support.gap_drive import BEGIN, ROW, SIZE, Clock, write_drive
 from support.kitti_drive import raw_drive
-from support.landmark_files import database_of, encoded, seen_from, wall
+from support.landmark_files import database_of, write_walls
 from support.onnx_models import bright_box_model
 from support.pictures import picture
 from support.scenes import shorten
@@ -193,17 +193,11 @@ def _run(
 def _write_photos(folder: Path) -> None:
     """Write two pictures of each of four walls, and one table of each kind about them."""
     folder.mkdir()
-    places, pairs = ["image,x_m,y_m,sd_m"], ["query,known,same"]
-    for k in range(4):
-        picture_of = wall(k)
-        (folder / f"{k}.png").write_bytes(encoded(picture_of))
-        seen = seen_from(picture_of, 3.0, 1.05, 4.0, k)
-        (folder / f"seen{k}.png").write_bytes(encoded(seen))
-        places.append(f"{k}.png,{100 * k},0,1")
-        pairs += [f"seen{k}.png,{other}.png,{int(k == other)}" for other in range(4)]
+    write_walls(folder)
+    places = ["image,x_m,y_m,sd_m", *(f"{k}.png,{100 * k},0,1" for k in range(4))]
     heights = ["height_px,range_m", *(f"{200 / m},{m}" for m in range(5, 60))]
     labels = ["picture,label,x0,y0,x1,y1", "0.png,yield,1,1,40,40", "seen0.png,,,,,"]
-    tables = {"places": places, "pairs": pairs, "heights": heights, "labels": labels}
+    tables = {"places": places, "heights": heights, "labels": labels}
     for name, rows in tables.items():
         (folder / f"{name}.csv").write_text("\n".join(rows) + "\n")
 

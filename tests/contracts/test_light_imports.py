@@ -1,6 +1,5 @@
 """Reading, decoding, replaying and scoring a drive import none of the heavy libraries."""
 
-import hashlib
 import json
 from pathlib import Path
 from typing import Final
@@ -10,7 +9,7 @@ import pytest
 
 from support.child import python
 from support.gap_drive import Clock, write_drive
-from support.onnx_models import bright_box_model
+from support.onnx_models import bright_box_model, write_card
 
 HEAVY: Final = ("torch", "torchvision", "rerun", "ray", "matplotlib")
 COMPILER: Final = (*HEAVY, "numba", "llvmlite")
@@ -34,24 +33,10 @@ for line in sys.argv[1:]:
 # What takes longer to import than a small log to read.
 SLOW: Final = (*COMPILER, "pydantic", "pyarrow", "tomllib", "email", "fsspec")
 COMMAND: Final = "from crosscue.eval.cli import main; main(sys.argv[1:])"
-CARD: Final = """\
-version = 1
-weights = "net.onnx"
-sha256 = "{sha256}"
-[input]
-width_px = 160
-height_px = 90
-fit = "stretch"
-[output]
-kind = "end-to-end"
-classes = ["stop sign"]
-score = 0.5
-overlap = 1.0
-"""
 VEHICLE: Final = """
 [detectors.bright]
 kind = "model"
-card = "card.toml"
+card = "net.toml"
 """
 
 
@@ -69,10 +54,8 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A drive with camera, CAN and truth; its vehicle file names a small network as detector."""
     folder = tmp_path_factory.mktemp("light")
     log = write_drive(folder, Clock())
-    network = bright_box_model()
-    (folder / "net.onnx").write_bytes(network)
-    card = CARD.format(sha256=hashlib.sha256(network).hexdigest())
-    (folder / "card.toml").write_text(card, encoding="utf-8")
+    output = 'kind = "end-to-end"\nclasses = ["stop sign"]\nscore = 0.5\noverlap = 1.0'
+    write_card(folder, bright_box_model(), output, (160, 90), 'fit = "stretch"')
     with (folder / "car.toml").open("a", encoding="utf-8") as stream:
         stream.write(VEHICLE)
     return log
@@ -92,38 +75,6 @@ def test_info_of_log_without_odometry_imports_neither_vehicle_file_nor_tables(
     options: tuple[str, ...], drive: Path
 ) -> None:
     assert "/can" in run_without(SLOW, COMMAND, "info", str(drive), *options)
-
-
-def test_replay_without_detectors_imports_only_what_it_uses(drive: Path) -> None:
-    unused = (
-        "crosscue.detectors.decoders",
-        "crosscue.eval.scoring",
-        "crosscue.datasets.truth",
-        "crosscue.detectors.base",
-        "crosscue.detectors.registry",
-        "crosscue.detectors.runner",
-        "crosscue.detectors.cues.rules",
-        "crosscue.detectors.signs",
-        "crosscue.eval.batch.jobs",
-        "crosscue.eval.batch.merge",
-        "crosscue.eval.pipeline.detect.",
-        "crosscue.eval.pipeline.landmarks",
-        "crosscue.eval.pipeline.scene",
-        "crosscue.eval.pipeline.visual",
-        "crosscue.fusion",
-        "crosscue.localization.landmarks.database",
-        "crosscue.localization.visual_odometry",
-        "crosscue.replay.mobileye.",
-        "numpy.ma.",
-        "sqlite3",
-    )
-    code = f"""{CHAIN}
-found = [name for name in sys.modules if f"{{name}}.".startswith({unused})]
-assert not found, found
-"""
-    line = "replay drive.mcap -o bare --vehicle car.toml --detectors none -q"
-    # pyarrow imports pandas for its first array, if it is installed.
-    run_without((*HEAVY, "pandas", "multiprocessing"), code, line, folder=drive.parent)
 
 
 def test_replay_and_estimate_with_detector_do_not_import_pandas(drive: Path) -> None:

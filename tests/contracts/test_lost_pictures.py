@@ -23,6 +23,7 @@ from crosscue.replay.losses import losses_heard
 from crosscue.replay.vehicle.drafting.camera import Intrinsics
 from crosscue.replay.vehicle.drafting.series import Series
 from support.coco import stop_signs
+from support.commands import json_of
 from support.failures import table_of_failures
 from support.gap_drive import (
     BEGIN,
@@ -184,13 +185,11 @@ def test_unusable_picture_of_log_is_dropped_row(
 
 
 def test_picture_that_two_stages_drop_is_counted_once(
-    names: dict[str, Path | str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    names: dict[str, Path | str], tmp_path: Path
 ) -> None:
     line = LOOKS_AT_A_LOG["eval/pipeline/landmarks.py"]["replay --landmarks"]
 
-    assert cli.run([*line.format(**names, out=tmp_path / "out").split(), "--json"]) == 3
-
-    account = json.loads(capsys.readouterr().out)["account"]
+    account = json_of(*line.format(**names, out=tmp_path / "out").split(), status=3)["account"]
     (log,) = account["reading"]
     camera = log["topics"]["camera"]
     assert (camera["in"], camera["used"], camera["dropped"]) == (40, 38, {"picture not decoded": 2})

@@ -3,7 +3,6 @@
 Options that name a file are in ``test_auxiliary_files.py``.
 """
 
-import argparse
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -105,19 +104,16 @@ def _options() -> Iterator[tuple[str, str]]:
             kind = getattr(action.type, "__name__", "")
             is_free = action.nargs != 0 and not action.choices and kind not in NUMBERS
             is_file = action.type is Path or action.metavar == "NETWORK"
-            if action.option_strings and is_free and not is_file and not _is_help(action):
+            if (
+                action.option_strings
+                and is_free
+                and not is_file
+                and "--help" not in action.option_strings
+            ):
                 yield name, action.option_strings[-1]
 
 
-def _is_help(action: argparse.Action) -> bool:
-    return "--help" in action.option_strings
-
-
 OPTIONS: Final = tuple(_options())
-
-
-def _base(name: str, option: str) -> str:
-    return OTHER_BASE.get((name, option), BASE.get(name, ""))
 
 
 CASES: Final = [
@@ -173,7 +169,8 @@ def test_option_that_names_nonexistent_thing_is_refused_before_log_is_read(
     monkeypatch.chdir(tmp_path)
     known = {**names, "log": names[log], "out": tmp_path / "out"}
     word = spelling.format(**known)
-    argv = [*name.split(), *_base(name, option).format(**known).split(), option, word]
+    base = OTHER_BASE.get((name, option), BASE.get(name, ""))
+    argv = [*name.split(), *base.format(**known).split(), option, word]
 
     with opened_files() as opened:
         error = refusal((2, 4), *argv)

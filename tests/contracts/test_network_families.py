@@ -13,12 +13,7 @@ import pytest
 
 import crosscue
 from crosscue.detectors.base import Detections, Frame
-from crosscue.detectors.catalog.recognise import (
-    guesses,
-    input_settings,
-    plausible,
-    read_interface,
-)
+from crosscue.detectors.catalog.recognise import guesses, input_settings, plausible, read_interface
 from crosscue.detectors.decoders.base import Guess, Size, cell_grid, decoder_name
 from crosscue.detectors.decoders.table import DECODERS
 from crosscue.detectors.networks.model_detector import build

@@ -69,11 +69,6 @@ def _content(folder: Path) -> dict[str, str]:
     }
 
 
-def _parsers() -> dict[str, argparse.ArgumentParser]:
-    """Return the parser of every command in the table of commands."""
-    return {name: cli.parser_of(name)[1] for name in cli.COMMANDS}
-
-
 def _writes_folder(parser: argparse.ArgumentParser) -> bool:
     options = {option: one for one in parser._actions for option in one.option_strings}
     output = options.get("--output") or options.get("-o")
@@ -82,7 +77,7 @@ def _writes_folder(parser: argparse.ArgumentParser) -> bool:
 
 
 def test_every_command_that_replaces_folder_has_case() -> None:
-    writing = {name for name, parser in _parsers().items() if _writes_folder(parser)}
+    writing = {name for name in cli.COMMANDS if _writes_folder(cli.parser_of(name)[1])}
 
     assert writing - WRITING.keys() == {n for n in writing if n.split()[0] in BY_NAME}
     assert writing >= WRITING.keys()
@@ -140,11 +135,7 @@ def made(names: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> di
 @pytest.mark.parametrize("command", WRITING)
 @pytest.mark.parametrize("foreign", HAND_MADE)
 def test_result_with_one_file_of_user_keeps_everything(
-    foreign: str,
-    command: str,
-    names: dict[str, Path],
-    made: dict[str, Path],
-    tmp_path: Path,
+    foreign: str, command: str, names: dict[str, Path], made: dict[str, Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     shutil.copytree(made[command], out)

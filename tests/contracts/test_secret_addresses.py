@@ -1,6 +1,5 @@
 """Secrets in addresses of logs: no command prints, stores or names them."""
 
-import argparse
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -106,16 +105,12 @@ def check_nothing_kept(folder: Path, printed: str) -> None:
                 assert SECRET not in repr(rest), path
 
 
-def is_log(action: argparse.Action) -> bool:
-    return action.metavar == "LOG"
-
-
 def test_every_command_that_takes_a_log_is_tested() -> None:
     takes_text = {
         name
         for name in COMMANDS
         for action in parser_of(name)[1]._actions
-        if is_log(action) and action.type is None
+        if action.metavar == "LOG" and action.type is None
     }
 
     assert takes_text == FINE.keys() | LOCAL

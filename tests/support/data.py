@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from crosscue.eval.cli import run
+
 _ROOT = Path(__file__).parents[2]
 
 
@@ -15,3 +17,10 @@ def shared(*parts: str) -> Path:
     if not path.exists():
         pytest.skip(f"real data missing: {path}; set CROSSCUE_DATA")
     return path
+
+
+def fetch_networks(patch: pytest.MonkeyPatch, models: Path, *names: str) -> None:
+    """Fetch networks from the data folder into a folder of models, which commands then use."""
+    patch.setenv("CROSSCUE_DATA", str(shared("weights").parent))
+    patch.setenv("CROSSCUE_MODELS", str(models))
+    assert run(["model", "fetch", *names]) == 0

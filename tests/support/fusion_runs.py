@@ -4,6 +4,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from crosscue.datasets.truth.truth import Approach, Features, Truth, save
 from crosscue.eval.pipeline.scene.stage import scene_columns
@@ -67,6 +69,19 @@ def write_run(
         )
     write_manifest(run, estimated(settings=vehicle))
     return run
+
+
+def write_drives(folder: Path, roads: Iterable[bool | None]) -> tuple[list[Path], list[Path]]:
+    """Write runs and truths of drives with and without a road to the left, or an intersection."""
+    rng, runs, truths = np.random.default_rng(4), [], []
+    for i, left in enumerate(roads):
+        evidence = made_up_drive(rng, left=bool(left), signed=left is not None)
+        run, truth = write_run(folder / f"run{i}", evidence).path, folder / f"truth{i}"
+        frames = pa.table({"t_ns": [one.t_ns for one in evidence]})
+        pq.write_table(frames, run / "frames.parquet", write_page_checksum=True)
+        runs.append(run)
+        truths.append(write_empty_truth(truth) if left is None else write_truth(truth, left=left))
+    return runs, truths
 
 
 def _write_steps(run: RunFolder, steps: list[Step]) -> None:

@@ -64,6 +64,17 @@ def encoded(picture: Bytes, suffix: str = ".png") -> bytes:
     return found.tobytes()
 
 
+def write_walls(folder: Path, count: int = 4, size: tuple[int, int] = (640, 480)) -> None:
+    """Write ``0.png``..., the same walls again as ``seen0.png``..., and all pairs of them."""
+    pairs = ["query,known,same"]
+    for k in range(count):
+        known = wall(k, *size)
+        (folder / f"{k}.png").write_bytes(encoded(known))
+        (folder / f"seen{k}.png").write_bytes(encoded(seen_from(known, 3.0, 1.05, 4.0, k)))
+        pairs += [f"seen{k}.png,{other}.png,{int(k == other)}" for other in range(count)]
+    (folder / "pairs.csv").write_text("\n".join(pairs) + "\n")
+
+
 class ShadeMatcher:
     """A custom matcher, which scores the similarity of mean brightness."""
 

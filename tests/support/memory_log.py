@@ -51,6 +51,15 @@ def wheel_block(t_ns: Sequence[int], speed_mps: Sequence[float]) -> Block:
     return Block("wheels", np.asarray(t_ns, np.int64), Table(dict.fromkeys(names, speed)))
 
 
+def driven_blocks(seconds: int, speed_mps: float, yaw_rate_radps: float = 0.0) -> list[Block]:
+    """Ten rows of a gyro and ten of wheel speeds for each second."""
+    blocks: list[Block] = []
+    for second in range(seconds):
+        t_ns = [second * 1_000_000_000 + i * 100_000_000 for i in range(10)]
+        blocks += [gyro_block(t_ns, [yaw_rate_radps] * 10), wheel_block(t_ns, [speed_mps] * 10)]
+    return blocks
+
+
 def gyro_block(t_ns: Sequence[int], yaw_rate_radps: Sequence[float]) -> Block:
     column: Floats = np.asarray(yaw_rate_radps, np.float64)
     return Block("gyro", np.asarray(t_ns, np.int64), Table({"gyro_z_radps": column}))

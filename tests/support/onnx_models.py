@@ -1,6 +1,8 @@
 """Small ONNX networks with known outputs."""
 
+import hashlib
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -108,6 +110,27 @@ def bright_box_model(*, by_brightness: bool = False) -> bytes:
     given = helper.make_tensor_value_info("images", TensorProto.FLOAT, ["n", 3, "h", "w"])
     out = helper.make_tensor_value_info("boxes", TensorProto.FLOAT, ["n", 1, 6])
     return _file(helper.make_graph(nodes, "bright box", [given], [out]))
+
+
+def write_card(
+    folder: Path, model: bytes, output: str, size: tuple[int, int] = (64, 48), more: str = ""
+) -> Path:
+    """Write ``net.onnx`` and its card ``net.toml``, whose path is returned.
+
+    Args:
+        folder: An existing folder.
+        model: The network.
+        output: Lines of the section output.
+        size: Width and height of the input in pixels.
+        more: Further lines of the section input.
+    """
+    (folder / "net.onnx").write_bytes(model)
+    path = folder / "net.toml"
+    path.write_text(
+        f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(model).hexdigest()}"\n'
+        f"[input]\nwidth_px = {size[0]}\nheight_px = {size[1]}\n{more}\n[output]\n{output}\n"
+    )
+    return path
 
 
 def _scalar(value: float) -> TensorProto:

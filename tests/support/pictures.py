@@ -1,13 +1,15 @@
 """Small simulated pictures, encoded."""
 
+import shutil
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 SIDE_PX: Final = 60_000
 
@@ -30,6 +32,20 @@ def picture_folder(
         (folder / f"frame_{number}{suffix}").write_bytes(picture(number, suffix))
     if times is not None:
         (folder / "timestamps.txt").write_text(times, encoding="utf-8")
+    return folder
+
+
+def picture_log(
+    folder: Path, pictures: Iterable[Path | NDArray[np.uint8]], rate_hz: float = 10.0
+) -> Path:
+    """Write files under their names and pixels as ``frame_0.png``..., at a rate."""
+    folder.mkdir(parents=True)
+    for number, one in enumerate(pictures):
+        if isinstance(one, Path):
+            shutil.copy(one, folder)
+        else:
+            cv2.imwrite(str(folder / f"frame_{number}.png"), one)
+    (folder / "timestamps.txt").write_text(f"rate_hz: {rate_hz}\n")
     return folder
 
 

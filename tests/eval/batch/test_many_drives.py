@@ -167,7 +167,9 @@ def test_signal_to_the_parent_stops_all_workers(
         start_new_session=True,
     )
     with parent:
-        pids = _pids_of_two_workers(tmp_path / "drives")
+        drives = tmp_path / "drives"
+        _wait_until(lambda: len([p for p in drives.glob("*.begun") if p.read_text()]) == 2)
+        pids = [int(path.read_text()) for path in drives.glob("*.begun")]
         parent.send_signal(number)
         stderr_text = parent.communicate(timeout=20)[1].decode()
 
@@ -181,11 +183,6 @@ def test_signal_to_the_parent_stops_all_workers(
         log.write_text("healed")
     again = run_many(write_jobs(tmp_path / "drives", ["healed"] * 3), letters, in_turn)
     assert [(done.error, done.attempts) for done in again] == [(None, 1)] * 3
-
-
-def _pids_of_two_workers(folder: Path) -> list[int]:
-    _wait_until(lambda: len([p for p in folder.glob("*.begun") if p.read_text()]) == 2)
-    return [int(path.read_text()) for path in folder.glob("*.begun")]
 
 
 def _wait_until(condition: Callable[[], bool]) -> None:

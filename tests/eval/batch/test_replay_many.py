@@ -9,6 +9,7 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.cli import run
+from support.commands import json_of
 from support.refusals import refusal
 
 pytestmark = pytest.mark.slow
@@ -25,9 +26,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_merged_shards_equal_one_batch(
-    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_merged_shards_equal_one_batch(drives: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     shutil.copytree(drives, elsewhere)
     quick = ["--to", "2.0", "-q"]
@@ -39,8 +38,7 @@ def test_merged_shards_equal_one_batch(
         arguments = ["replay", str(elsewhere), "-o", folders[-1], "--shard", f"{number}/3", *quick]
         assert run(arguments) in (0, 3, 4)
         assert not Path(folders[-1], "merged").exists()
-    assert run(["status", *folders, "--json"]) == 3
-    seen = json.loads(capsys.readouterr().out)
+    seen = json_of("status", *folders, status=3)
     assert (seen["done"], seen["failed"], len(seen["drives"])) == (2, 1, 3)
     assert run(["merge", *folders, "-o", str(tmp_path / "merged"), "-q"]) == 3
 

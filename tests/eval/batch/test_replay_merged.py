@@ -8,9 +8,9 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.eval.catalog.find_runs import runs_of
-from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.runs.manifest import MergedManifest
+from support.commands import output_of
 
 
 @pytest.fixture
@@ -22,14 +22,12 @@ def drives(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 def test_invalid_vehicle_file_fails_only_its_drive_and_edited_dbc_is_detected(
-    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    drives: Path, tmp_path: Path
 ) -> None:
     (drives / "tuesday" / "vehicle.toml").write_text("version = ")
     argv = ["replay", str(drives), "-o", str(tmp_path / "runs"), "--json"]
 
-    assert run(argv) == 3
-
-    reported = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
+    reported = {one["name"][:-9]: one for one in json.loads(output_of(*argv, status=3))["drives"]}
     assert reported["monday"]["error"] is None
     assert "not TOML" in reported["tuesday"]["error"]
     assert runs_of([str(tmp_path / "runs")]) == (tmp_path / "runs" / reported["monday"]["name"],)
@@ -45,6 +43,7 @@ def test_invalid_vehicle_file_fails_only_its_drive_and_edited_dbc_is_detected(
 
     (dbc,) = drives.joinpath("monday").glob("*.dbc")
     dbc.write_text(dbc.read_text() + "\n")
-    assert run([*argv, "-q"]) == 1
-    reported = {one["name"][:-9]: one for one in json.loads(capsys.readouterr().out)["drives"]}
+    reported = {
+        one["name"][:-9]: one for one in json.loads(output_of(*argv, "-q", status=1))["drives"]
+    }
     assert "other logs, settings or versions" in reported["monday"]["error"]

@@ -1,20 +1,16 @@
 """The index of a catalog: it saves reading and does not change the content."""
 
 import errno
-import json
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import NoReturn
 
 import pytest
-from pydantic import BaseModel
 
 import crosscue
 from crosscue.eval.batch.jobs import Job, attempt
 from crosscue.eval.catalog.query import index, records
 from crosscue.eval.catalog.query.index import NAME
-from crosscue.eval.runs import settings_hash
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.errors import UnreadableRunError
 from crosscue.replay.files.partial_file import PartialFile
@@ -134,34 +130,3 @@ def test_catalog_on_a_full_disk_works_without_index(
     assert "the disk is full" in found.notices[0]
     assert found.left_out == {}
     assert [path.name for path in runs.iterdir() if path.is_file()] == []
-
-
-def test_each_manifest_is_parsed_once_and_shared_settings_are_written_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fleet = tmp_path / "fleet"
-    for number in range(5):
-        add_run(fleet / f"drive-{number}", "same")
-    parsed: list[bytes] = []
-    parse = BaseModel.model_validate_json.__func__  # type: ignore[attr-defined]
-
-    def counted(model: type[BaseModel], content: bytes) -> object:
-        parsed.append(content)
-        return parse(model, content)
-
-    monkeypatch.setattr(BaseModel, "model_validate_json", classmethod(counted))
-    texts: list[object] = []
-    dumps = json.dumps
-
-    def written(one: object, **how: bool) -> str:
-        texts.append(one)
-        return dumps(one, sort_keys=how["sort_keys"])
-
-    monkeypatch.setattr(settings_hash, "json", SimpleNamespace(dumps=written))
-
-    found = crosscue.catalog(fleet).query("select run from runs")
-
-    assert len(found) == 5
-    assert len([one for one in parsed if b'"stage"' in one]) == 5
-    # The settings of the runs, and twice those with detectors and selection, for their hash.
-    assert len(texts) <= 3

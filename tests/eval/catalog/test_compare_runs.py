@@ -21,6 +21,7 @@ from crosscue.eval.scoring.by_drive import DriveMetric, by_drive_table
 from crosscue.replay.errors import UsageError
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
+from support.commands import json_of, output_of
 from support.manifests import estimated
 from support.refusals import refusal
 from support.scoring import (
@@ -35,11 +36,6 @@ from support.scoring import (
 )
 
 WORSE_CUES = {**CUES, "stop_sign": {frame: int(frame >= 3) for frame in range(40)}}
-
-
-def _settings(established: float) -> Vehicle:
-    """Return settings with the given threshold of established features."""
-    return Vehicle(version=1, fusion=Fusion(established=established))
 
 
 def _pair(
@@ -58,7 +54,8 @@ def _pair(
         truth_folder(folder, place=f"place {number % places}")
         (folder / "drive.mcap").write_text(f"drive {number}")
         for name, tables, established in (("a", None, 0.9), ("b", false_signs, 0.3)):
-            run = run_folder(folder / name, tables, settings=_settings(established))
+            settings = Vehicle(version=1, fusion=Fusion(established=established))
+            run = run_folder(folder / name, tables, settings=settings)
             runs[name].append(str(run.path))
     if not scored:
         return Path(runs["a"][0]), Path(runs["b"][0])
@@ -71,30 +68,25 @@ def _pair(
 
 
 @pytest.mark.slow
-def test_drives_of_one_place_count_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_drives_of_one_place_count_once(tmp_path: Path) -> None:
     good, worse = _pair(tmp_path, drives=6, places=2)
 
-    assert cli.run(["compare", str(good), str(worse), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = json_of("compare", good, worse)
     (one,) = (one for one in found["judged"] if one["path"] == "cues.stop_sign.precision")
     assert (one["verdict"], one["drives"], one["places"]) == ("too few places", 6, 2)
     assert one["more_places"] == 4
 
 
 @pytest.mark.slow
-def test_difference_in_every_drive_is_decided(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_difference_in_every_drive_is_decided(tmp_path: Path) -> None:
     good, worse = _pair(tmp_path, drives=6)
 
-    assert cli.run(["compare", str(good), str(worse)]) == 1
-    text = capsys.readouterr().out
+    text = output_of("compare", good, worse, status=1)
     assert "WORSE      cues.stop_sign.precision: 1 -> 0.945946" in text
     assert "better     cues.stop_sign.recall: 0.857143 -> 1" in text
     assert "drives     6 in both runs" in text
     # The recall is better, so the reversed comparison finds it worse.
-    assert cli.run(["compare", str(worse), str(good), "--json"]) == 1
-    found = json.loads(capsys.readouterr().out)
+    found = json_of("compare", worse, good, status=1)
     assert (found["worse"], found["better"]) == (
         ["cues.stop_sign.recall"],
         ["cues.stop_sign.precision"],
@@ -106,14 +98,11 @@ def test_difference_in_every_drive_is_decided(
         assert cli.run(argv) == status
 
 
-def test_drives_of_only_one_run_are_counted_and_left_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_drives_of_only_one_run_are_counted_and_left_out(tmp_path: Path) -> None:
     good, worse = _pair(tmp_path, drives=3)
     one = tmp_path / "1" / "b"
 
-    assert cli.run(["compare", str(good), str(one)]) == 0
-    text = capsys.readouterr().out
+    text = output_of("compare", good, one)
     assert "drives     1 in both runs; 2 only in the first, 0 only in the second" in text
     assert "not a run folder" in refusal(4, "compare", good, tmp_path)
     assert worse.exists()
@@ -154,9 +143,7 @@ def test_losses_in_either_run_exit_3(tmp_path: Path, lossy: str) -> None:
     assert cli.run(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "-q"]) == 3
 
 
-def test_control_characters_in_names_are_not_printed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_control_characters_in_names_are_not_printed(tmp_path: Path) -> None:
     runs = [
         run_folder(
             tmp_path / name,
@@ -166,8 +153,7 @@ def test_control_characters_in_names_are_not_printed(
         for name, value in (("a", 1), ("b", 2))
     ]
 
-    assert cli.run(["compare", *(str(run.path) for run in runs)]) == 1
-    assert "\x1b" not in capsys.readouterr().out
+    assert "\x1b" not in output_of("compare", *(str(run.path) for run in runs), status=1)
 
 
 def test_metrics_of_unpaired_drives_are_not_compared(tmp_path: Path) -> None:
@@ -222,14 +208,10 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 QUERIES = ("--runs", "run like 'after/%'", "--against", "run like 'before/%'")
 
 
-def test_queries_select_the_compared_runs(
-    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_queries_select_the_compared_runs(fleet: Path, tmp_path: Path) -> None:
     junit = tmp_path / "junit.xml"
 
-    assert cli.run(["compare", str(fleet), *QUERIES, "--json", "--junit", str(junit)]) == 1
-
-    found = json.loads(capsys.readouterr().out)
+    found = json_of("compare", fleet, *QUERIES, "--junit", junit, status=1)
     assert found["worse"] == [RECALL, DUSK]
     assert found["drives"] == [8, 0, 0]
     root = ET.fromstring(junit.read_text())
@@ -257,13 +239,10 @@ def test_remote_runs_compare_like_local_runs(
         crosscue.compare_runs("memory://compared/before", "memory://compared/after")
 
 
-def test_markdown_option_prints_a_table(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["compare", str(fleet), *QUERIES, "--markdown", "--tolerance", "0.9"]) == 0
-
-    text = capsys.readouterr().out
+def test_markdown_option_prints_a_table(fleet: Path) -> None:
+    text = output_of("compare", fleet, *QUERIES, "--markdown", "--tolerance", "0.9")
     assert "**0 worse, 0 better, 2 undecided**, 0 equal, over 8 drives" in text
-    assert cli.run(["compare", str(fleet), *QUERIES, "--markdown"]) == 1
-    lines = capsys.readouterr().out.splitlines()
+    lines = output_of("compare", fleet, *QUERIES, "--markdown", status=1).splitlines()
     assert "**2 worse, 0 better, 0 undecided**" in lines[0]
     assert any(line.startswith(f"| `{RECALL}` | 0.9437 | 0.65 |") for line in lines)
     assert all(line.count("|") == 7 for line in lines if line.startswith("|"))

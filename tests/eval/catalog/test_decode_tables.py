@@ -1,6 +1,5 @@
 """``crosscue decode``: every stream as a Parquet file, every frame accounted for."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,16 +34,11 @@ def _mobileye_drive() -> list[Block]:
     return [encode_tables(bursts_of(image_ns, objects, settings, bus="eye"), settings, "eye")]
 
 
-def _tables(path: Path, topics: Sequence[Topic], blocks: list[Block], vehicle: Vehicle) -> Path:
-    log = MemoryLog(tuple(topics), blocks, path=Path(__file__))
-    decode_tables(Drive([log], vehicle), create(path, overwrite=False))
-    return path
-
-
 def test_mobileye_frames_decode_to_obstacles_relative_to_rear_axle(tmp_path: Path) -> None:
     vehicle = Vehicle(version=1, mobileye=Mobileye(bus="eye", x_m=2.0))
 
-    folder = _tables(tmp_path / "out", [EYE], _mobileye_drive(), vehicle)
+    folder, log = tmp_path / "out", MemoryLog((EYE,), _mobileye_drive(), path=Path(__file__))
+    decode_tables(Drive([log], vehicle), create(folder, overwrite=False))
 
     table = pq.read_table(folder / "eye_mobileye_obstacles.parquet")
     np.testing.assert_allclose(table["x_m"], 80.0 - np.arange(30), atol=1 / 32)

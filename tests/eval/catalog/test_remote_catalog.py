@@ -1,7 +1,6 @@
 """A catalog on an object store, runs named on the command line, and the queries of the page."""
 
 import io
-import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -63,14 +62,6 @@ class CountedStore(MemoryFileSystem):  # type: ignore[misc]
         return super()._open(path, mode, **more)
 
 
-def _put(folder: Path, bucket: str) -> str:
-    system = fsspec.filesystem("counted")
-    for path in folder.rglob("*"):
-        if path.is_file() and not path.name.startswith("."):
-            system.pipe_file(f"/{bucket}/{path.relative_to(folder)}", path.read_bytes())
-    return f"counted://{bucket}"
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two drives, each with two settings; one has a long pose table of many row groups."""
@@ -92,13 +83,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def url(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The same runs on a store."""
     fsspec.register_implementation("counted", CountedStore, clobber=True)
-    before = os.environ.get("XDG_CACHE_HOME")
-    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
-    yield _put(folder, "fleet")
-    if before is None:
-        del os.environ["XDG_CACHE_HOME"]
-    else:
-        os.environ["XDG_CACHE_HOME"] = before
+    system = fsspec.filesystem("counted")
+    for path in folder.rglob("*"):
+        if path.is_file() and not path.name.startswith("."):
+            system.pipe_file(f"/fleet/{path.relative_to(folder)}", path.read_bytes())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield "counted://fleet"
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import pytest
 from crosscue.eval import cli
 from crosscue.replay.errors import CrosscueError, LogError, UsageError
 from crosscue.results import Result
+from support.commands import output_of
 from support.refusals import refusal
 
 
@@ -83,17 +84,15 @@ def test_path_of_the_wrong_kind_is_unreadable_input(verb: str, tmp_path: Path) -
         assert f"{file}: no manifest.json: not a run folder" in refusal(4, verb, file, *more)
 
 
-def test_help_is_a_command_too(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_is_a_command_too() -> None:
     for given, same in (
         (["help"], ["--help"]),
         (["help", "all"], ["--help", "all"]),
         (["help", "fit"], ["fit", "--help"]),
         (["help", "fit", "signs"], ["fit", "signs", "--help"]),
     ):
-        assert cli.run(given) == 0
-        printed = capsys.readouterr().out
-        assert cli.run(same) == 0
-        assert capsys.readouterr().out == printed
+        printed = output_of(*given)
+        assert output_of(*same) == printed
 
 
 def test_control_characters_in_an_error_are_escaped(
@@ -105,23 +104,9 @@ def test_control_characters_in_an_error_are_escaped(
     assert capsys.readouterr().err == "crosscue: \\x1b[31mred\\x07 /t\\udcff\n"
 
 
-@pytest.mark.parametrize("name", sorted(cli.COMMANDS))
-def test_help_of_each_command_has_example_and_exit_status(
-    name: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run([*name.split(), "--help"]) == 0
-    help_text = capsys.readouterr().out
-    assert "example" in help_text
-    assert "exit status" in help_text
-
-
-def test_help_lists_eight_commands_and_help_all_the_rest(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert cli.run(["--help"]) == 0
-    short = capsys.readouterr().out
-    assert cli.run(["--help", "all"]) == 0
-    whole = capsys.readouterr().out
+def test_help_lists_eight_commands_and_help_all_the_rest() -> None:
+    short = output_of("--help")
+    whole = output_of("--help", "all")
 
     names = re.compile(r"^  ([a-z][a-z -]*?)  +[a-z]", re.MULTILINE)
     front = {"demo", "info", "check", "replay", "score", "compare", "view", "query"}
@@ -132,11 +117,8 @@ def test_help_lists_eight_commands_and_help_all_the_rest(
 
 
 @pytest.mark.parametrize("group", ["fit", "landmarks", "model", "study", "train", "vehicle"])
-def test_help_of_a_group_has_an_example_of_each_command(
-    group: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run([group, "--help"]) == 0
-    examples = capsys.readouterr().out.partition("examples:")[2]
+def test_help_of_a_group_has_an_example_of_each_command(group: str) -> None:
+    examples = output_of(group, "--help").partition("examples:")[2]
 
     for name in (name for name in cli.COMMANDS if name.startswith(f"{group} ")):
         assert re.search(rf"^  crosscue {name}\b", examples, re.MULTILINE), name

@@ -22,6 +22,7 @@ from crosscue.replay.logs.log_summary import summarise_log
 from crosscue.replay.safe_text import table, terminal_cells, visible, wrapped
 from crosscue.results import plain
 from support.clock_streams import START_NS, Stream, table_of
+from support.commands import json_of
 from support.data import shared
 from support.gap_drive import Clock, write_drive
 from support.memory_log import MemoryLog
@@ -180,5 +181,4 @@ def test_time_segments_are_listed_and_several_exit_3(
     text = capsys.readouterr().out
     assert all(cause in text for cause in causes[1:])
     assert ("2 time segments" in text) is (len(causes) == 2)
-    assert run([*words, "--quick", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["time"] is None
+    assert json_of(*words, "--quick")["time"] is None

@@ -140,13 +140,10 @@ def test_failed_write_anywhere_leaves_no_partial_files(
         ended = faults.failing_from(run, operation, argv, once=once)
         _check_message(ended)
         assert "the disk is full" in ended.said
-        _check_clean(run, drive)
-
-
-def _check_clean(run: Path, drive: Drive) -> None:
-    if run.exists():
-        assert not [p.name for p in run.iterdir() if p.suffix == ".partial" or p.name == ".lock"]
-        _check_complete_or_marked(run, drive.complete)
+        if run.exists():
+            names = {path.name for path in run.iterdir()}
+            assert not {one for one in names if one.endswith(".partial") or one == ".lock"}
+            _check_complete_or_marked(run, drive.complete)
 
 
 def test_locked_run_is_refused_and_names_the_process(drive: Drive, tmp_path: Path) -> None:

@@ -19,53 +19,32 @@ from crosscue.detectors.networks.backends import load_network
 from crosscue.detectors.networks.openvino import import_openvino
 from crosscue.detectors.networks.weights import Weights
 from crosscue.eval.cli import run
+from support.commands import output_of
+from support.decoder_samples import CLASSES, SAMPLES, SIZE, export
 from support.onnx_models import Array, bright_box_model, constant_model
 from support.pictures import picture
 from support.refusals import refusal
 
-ULTRALYTICS = {"names": "{0: 'person', 1: 'car', 2: 'stop-sign'}", "imgsz": "[64, 128]"}
+ULTRALYTICS = {"names": str(dict(enumerate(CLASSES))), "imgsz": str([SIZE[1], SIZE[0]])}
+LAYOUTS = (
+    "yolov8",
+    "yolov5",
+    "yolov8-seg",
+    "end-to-end",
+    "detr",
+    "torchvision",
+    "ssd",
+    "ssd-tensorflow",
+)
 
 
 def _zeros(*shape: int) -> Array:
     return np.zeros(shape, np.float32)
 
 
-LAYOUTS: dict[str, tuple[tuple[int, ...], Mapping[str, Array], bool]] = {
-    "yolov8": ((1, 3, 64, 128), {"output0": _zeros(1, 7, 168)}, True),
-    "yolov5": ((1, 3, 64, 128), {"output0": _zeros(1, 504, 8)}, True),
-    "yolov8-seg": (
-        (1, 3, 64, 128),
-        {"output0": _zeros(1, 39, 168), "output1": _zeros(1, 32, 16, 32)},
-        True,
-    ),
-    "end-to-end": ((1, 3, 64, 128), {"output0": _zeros(1, 300, 6)}, True),
-    "detr": ((1, 3, 64, 128), {"dets": _zeros(1, 50, 4), "labels": _zeros(1, 50, 3)}, True),
-    "torchvision": (
-        (3, 64, 128),
-        {"boxes": _zeros(2, 4), "labels": np.ones(2, np.int64), "scores": _zeros(2)},
-        True,
-    ),
-    "ssd": ((1, 3, 64, 128), {"detection_out": -np.ones((1, 1, 9, 7), np.float32)}, True),
-    "ssd-tensorflow": (
-        (1, 64, 128, 3),
-        {
-            "detection_boxes": _zeros(1, 9, 4),
-            "detection_classes": _zeros(1, 9) + 1,
-            "detection_scores": _zeros(1, 9),
-        },
-        True,
-    ),
-}
-
-
 def _write_export(folder: Path, kind: str, metadata: Mapping[str, str]) -> Path:
-    shape, outputs, _ = LAYOUTS[kind]
-    model = onnx.load_model_from_string(constant_model(shape, outputs))
-    if kind == "ssd-tensorflow":
-        model.graph.input[0].type.tensor_type.elem_type = onnx.TensorProto.UINT8
-    for key, value in metadata.items():
-        entry = model.metadata_props.add()
-        entry.key, entry.value = key, value
+    model = onnx.load_model_from_string(export(SAMPLES[kind]()))
+    onnx.helper.set_model_props(model, dict(metadata))
     path = folder / "my.onnx"
     path.write_bytes(model.SerializeToString())
     return path
@@ -80,10 +59,9 @@ def _openvino_file(folder: Path, labels: list[str] | None = None) -> Path:
         pytest.skip("the extra openvino is not installed")
     ov = import_openvino()
     op: Any = ov.opset13
-    shape, outputs, _ = LAYOUTS["yolov8"]
-    given = op.parameter(shape, np.float32, name="images")
+    given = op.parameter((1, 3, 64, 128), np.float32, name="images")
     zero = op.multiply(op.reduce_max(given, op.constant([0, 1, 2, 3])), np.float32(0.0))
-    rows = op.add(op.constant(outputs["output0"]), zero)
+    rows = op.add(op.constant(_zeros(1, 7, 168)), zero)
     rows.output(0).set_names({"output0"})
     model = ov.Model([rows], [given])
     if labels is not None:
@@ -258,34 +236,25 @@ def test_check_picture_is_not_written_to_an_image_log(
 
 
 @pytest.mark.parametrize("kind", LAYOUTS)
-def test_export_of_each_layout_gets_a_working_card(
-    tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_export_of_each_layout_gets_a_working_card(tmp_path: Path, kind: str) -> None:
     path = _write_export(tmp_path, kind, ULTRALYTICS)
 
-    assert run(["model", "init", str(path)]) == 0
-
-    message = capsys.readouterr().out
+    message = output_of("model", "init", path)
     assert f"my.toml: {kind}; the network runs with it" in message
     card = read_card(tmp_path / "my.toml")
     assert card.output.kind == kind
-    assert card.output.classes == ("person", "car", "stop-sign")
-    assert card.meaning(2) == "stop sign"
-    assert (card.input.width_px, card.input.height_px) == (128, 64)
+    assert card.output.classes == CLASSES
+    assert (card.input.width_px, card.input.height_px) == SIZE
     assert run(["check", str(tmp_path / "my.toml")]) == 0
 
 
-def test_assumptions_are_reported_and_written_to_the_card(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_assumptions_are_reported_and_written_to_the_card(tmp_path: Path) -> None:
     path = _write_export(tmp_path, "detr", {})
     names = tmp_path / "names.txt"
     names.write_text("person\ncar\nstop sign\n", encoding="utf-8")
 
     assert "3 classes without names" in refusal(2, "model", "init", path)
-    assert run(["model", "init", str(path), "--class-names", str(names)]) == 0
-
-    message = capsys.readouterr().out
+    message = output_of("model", "init", path, "--class-names", names)
     assert "assumed    logits become scores by the logistic function" in message
     text = (tmp_path / "my.toml").read_text(encoding="utf-8")
     assert "# Assumed, please check: logits become scores" in text

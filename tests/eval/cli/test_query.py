@@ -14,6 +14,7 @@ from crosscue.eval import cli
 from crosscue.replay.errors import UsageError
 from support.catalog_runs import runs_below
 from support.child import python
+from support.commands import json_of, output_of
 from support.refusals import refusal
 from support.trees import tree
 
@@ -26,13 +27,9 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return runs_below(tmp_path_factory.mktemp("fleet"))
 
 
-def test_all_output_formats_contain_the_same_rows(
-    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.run(["query", str(runs), SQL, "--json"]) == 0
-    records = json.loads(capsys.readouterr().out)
-    assert cli.run(["query", str(runs), SQL, "--csv"]) == 0
-    printed = list(csv.DictReader(capsys.readouterr().out.splitlines()))
+def test_all_output_formats_contain_the_same_rows(runs: Path, tmp_path: Path) -> None:
+    records = json_of("query", runs, SQL)
+    printed = list(csv.DictReader(output_of("query", runs, SQL, "--csv").splitlines()))
     for suffix in ("parquet", "csv", "json"):
         assert cli.run(["query", str(runs), SQL, "-o", str(tmp_path / f"x.{suffix}"), "-q"]) == 0
 
@@ -43,10 +40,8 @@ def test_all_output_formats_contain_the_same_rows(
     assert pq.read_table(tmp_path / "x.parquet").equals(crosscue.catalog(runs).query(SQL))
 
 
-def test_schema_lists_tables_and_columns(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["query", str(runs), "--schema", "--json"]) == 0
-
-    listed = {(row["table"], row["column"]) for row in json.loads(capsys.readouterr().out)}
+def test_schema_lists_tables_and_columns(runs: Path) -> None:
+    listed = {(row["table"], row["column"]) for row in json_of("query", runs, "--schema")}
     for table in ("runs", "approaches", "cues", "scores", "belief", "range", "pose", "dropped"):
         assert (table, "run") in listed
     assert ("frames", "run, ...") in listed

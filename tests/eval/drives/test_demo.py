@@ -1,6 +1,5 @@
 """The demonstration on a recorded drive: download, checksums, replay and score."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,8 +11,10 @@ from crosscue.detectors import registry
 from crosscue.detectors.catalog import places
 from crosscue.eval.cli import run
 from crosscue.eval.drives.demo import fetch_drive
+from support.commands import json_of, output_of
 from support.data import shared
 from support.range_server import serving
+from support.refusals import refusal
 from support.stand_in import StandIn, stand_in
 
 PICTURE = "drive/camera/front_camera/03.jpg"
@@ -26,11 +27,8 @@ def stand_in_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[
         yield stand_in(tmp_path / "stand_in", server, monkeypatch)
 
 
-def test_real_demo_is_fetched_once_replayed_and_scored(
-    stand_in_drive: StandIn, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["demo", "--real"]) == 0
-    printed = capsys.readouterr().out
+def test_real_demo_is_fetched_once_replayed_and_scored(stand_in_drive: StandIn) -> None:
+    printed = output_of("demo", "--real")
     requests = len(stand_in_drive.server.gets)
 
     assert requests == len(stand_in_drive.known.files) + 1
@@ -41,23 +39,18 @@ def test_real_demo_is_fetched_once_replayed_and_scored(
         (named,) = [one for one in printed.splitlines() if one.startswith(line)]
         assert Path(named.removeprefix(line)).is_file()
 
-    assert run(["demo", "--real", "--overwrite", "--json"]) == 0
-    tree = json.loads(capsys.readouterr().out)
+    tree = json_of("demo", "--real", "--overwrite")
     assert len(stand_in_drive.server.gets) == requests
     assert Path(tree["log"]) == recordings.recording_folder(stand_in_drive.known)
     assert tree["metrics"]["coverage"]
 
 
-def test_simulated_demo_prints_25_lines(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_simulated_demo_prints_25_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With those printed while it runs; the files to open are last."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "EMBEDDED", "signs")
 
-    assert run(["demo", "--width", "64"]) == 0
-
-    printed = capsys.readouterr().out.splitlines()
+    printed = output_of("demo", "--width", "64").splitlines()
     assert printed[0].startswith("simulating a drive")
     assert len(printed) <= 25
     assert printed[-1].split() == ["look", "at", "it", "with:", "crosscue", "view", "demo/run"]
@@ -76,24 +69,22 @@ def test_file_of_wrong_checksum_is_not_kept(stand_in_drive: StandIn, name: str) 
 
 
 def test_fetch_writes_the_recording_and_never_replaces_another_file(
-    stand_in_drive: StandIn, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    stand_in_drive: StandIn, tmp_path: Path
 ) -> None:
     place, name = tmp_path / "mine", PICTURE.removeprefix("drive/")
     stand_in_drive.server.failing = 1
 
     assert run(["fetch", "pandaset_002", "-o", str(place)]) == 1
-    capsys.readouterr()
-    assert run(["fetch", "pandaset_002", "-o", str(place)]) == 0
-    assert f"crosscue info {place}" in capsys.readouterr().out
+    assert f"crosscue info {place}" in output_of("fetch", "pandaset_002", "-o", place)
     files = {one.name for one in stand_in_drive.known.files}
     assert {p.relative_to(place).as_posix() for p in place.rglob("*") if p.is_file()} == files
     assert run(["info", str(place)]) == 0
     for other in (place / name, place / "notes.txt"):
         before = other.read_bytes() if other.exists() else b""
         other.write_bytes(b"my own")
-        capsys.readouterr()
-        assert run(["fetch", "pandaset_002", "-o", str(place)]) == 1
-        assert f"holds {other.relative_to(place)}, which is not of" in capsys.readouterr().err
+        assert f"holds {other.relative_to(place)}, which is not of" in refusal(
+            1, "fetch", "pandaset_002", "-o", place
+        )
         assert other.read_bytes() == b"my own"
         other.write_bytes(before)
 
@@ -140,14 +131,10 @@ def test_real_demo_on_recorded_drive_meets_precision_and_recall(
     assert "PandaSet" in repr(made)
 
 
-def test_start_of_a_folder_with_one_drive_names_the_drive(
-    stand_in_drive: StandIn, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_start_of_a_folder_with_one_drive_names_the_drive(stand_in_drive: StandIn) -> None:
     sequences = stand_in_drive.folder / "sequences"
     assert run(["truth", str(sequences / "pandaset_002"), "-o", "truth"]) == 0
 
-    assert run(["replay", str(sequences), "--start", "truth", "-o", "run"]) == 2
-
-    printed = capsys.readouterr().err
+    printed = refusal(2, "replay", sequences, "--start", "truth", "-o", "run")
     assert "is a folder or list of 1; name the drive itself, such as" in printed
     assert str(sequences / "pandaset_002") in printed

@@ -13,6 +13,8 @@ from crosscue.eval import cli
 from crosscue.eval.failures.approach_level import flips_without_truth
 from crosscue.eval.failures.record import Failure, distance_bin, read_failures, write_failures
 from crosscue.eval.scoring.columns import BeliefRows
+from support.commands import output_of
+from support.refusals import refusal
 from support.scene_run import scene_run
 from support.scoring import at, truth_folder
 
@@ -146,17 +148,12 @@ def test_result_is_available_as_table_text_and_dict(
     assert found.as_dict()["found"] == found.found
 
 
-def test_where_option_selects_runs(
-    drive: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_where_option_selects_runs(drive: tuple[Path, Path]) -> None:
     line = ["failures", str(drive[0].parent), "--truth", str(drive[1]), "--json"]
 
-    assert cli.run(line) == 0
-    everything = capsys.readouterr().out
-    assert cli.run([*line, "--where", "stage = 'estimate'"]) == 0
-    assert capsys.readouterr().out == everything
-    assert cli.run([*line, "--where", "false"]) == 1
-    assert "no run where false" in capsys.readouterr().err
+    everything = output_of(*line)
+    assert output_of(*line, "--where", "stage = 'estimate'") == everything
+    assert "no run where false" in refusal(1, *line, "--where", "false")
     assert cli.run([*line, str(drive[0]), "--where", "true"]) == 2
 
 

@@ -1,10 +1,8 @@
 """Thresholds with valid bounds, calibrations, and a card that changes a cue."""
 
-import hashlib
 import re
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -13,15 +11,13 @@ from crosscue.datasets.truth.box_labels import read_box_labels
 from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.class_scores import Platt
 from crosscue.detectors.training.operating_point import fit_platt
-from crosscue.eval.fit.detector.class_fit import (
-    TRIED,
-    bounded_threshold,
-    fewest_detections,
-)
+from crosscue.eval.fit.detector.class_fit import TRIED, bounded_threshold, fewest_detections
 from crosscue.eval.scoring.boxes.reliability import class_calibration
 from crosscue.eval.scoring.intervals import lower_bound
 from crosscue.replay.errors import FitError, SchemaError, UsageError
-from support.onnx_models import bright_box_model, constant_model
+from support.lights import boxes, write_lights
+from support.onnx_models import constant_model, write_card
+from support.pictures import picture_log
 
 
 def test_lower_bound_equals_clopper_pearson() -> None:
@@ -74,42 +70,12 @@ def test_calibrated_scores_are_probabilities_in_the_same_order() -> None:
 
 
 PICTURES = 700
-SIZE = (64, 48)
 
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write simulated pictures of one box; bright boxes are more often traffic lights."""
-    folder = tmp_path_factory.mktemp("lights")
-    (folder / "log").mkdir()
-    (folder / "labels").mkdir()
-    (folder / "labels" / "classes.txt").write_text("Traffic-Light\nvan\n")
-    rng = np.random.default_rng(4)
-    for number in range(PICTURES):
-        score = rng.uniform(0.5, 1.0)
-        pixels = np.zeros((SIZE[1], SIZE[0]), np.uint8)
-        pixels[8:24, 16:32] = round(255 * score)
-        cv2.imwrite(str(folder / "log" / f"frame_{number}.png"), pixels)
-        is_light = rng.random() < 1.0 / (1.0 + np.exp(-25.0 * (score - 0.65)))
-        row = f"0 {24 / 64} {16 / 48} {16 / 64} {16 / 48}\n" if is_light else ""
-        (folder / "labels" / f"frame_{number}.txt").write_text(row)
-    (folder / "log" / "timestamps.txt").write_text("rate_hz: 10\n")
-    weights = bright_box_model(by_brightness=True)
-    (folder / "net.onnx").write_bytes(weights)
-    (folder / "net.toml").write_text(
-        f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(weights).hexdigest()}"\n'
-        f"[input]\nwidth_px = {SIZE[0]}\nheight_px = {SIZE[1]}\n"
-        '[output]\nkind = "end-to-end"\nclasses = ["traffic light", "bench"]\nscore = 0.3\n'
-    )
-    detect_with_card(folder, "net")
-    return folder
-
-
-def detect_with_card(folder: Path, card: str) -> crosscue.Run:
-    """Detect with a card's network, and write the run to a folder named after the card."""
-    return crosscue.detect_drive(
-        folder / "log", folder / card.replace("net", "run"), detectors=[f"{folder}/{card}.toml"]
-    )
+    return write_lights(tmp_path_factory.mktemp("lights"), PICTURES)
 
 
 @pytest.mark.slow
@@ -204,15 +170,6 @@ def test_class_without_labelled_box_is_not_labelled(tmp_path: Path) -> None:
     assert "truck 0.000" not in found.report.read_text()
 
 
-def test_page_of_run_without_detections_says_that_there_are_none(tmp_path: Path) -> None:
-    run, labels = two_labels_on_one_object(tmp_path, 0.1), car_labels(tmp_path)
-
-    page = crosscue.score_detector(run, labels, has_figures=False).report.read_text()
-
-    assert "the detections stored in the run, of which there are none. Precision" in page
-    assert "a score of at least" not in page
-
-
 @pytest.mark.parametrize(
     ("rows", "meanings", "error", "message"),
     [
@@ -256,26 +213,14 @@ def test_invalid_labels_are_refused_in_one_line_without_output(
     assert not out.exists()
 
 
-def two_labels_on_one_object(folder: Path, factor: float = 1.0) -> crosscue.Run:
-    """Run a network that reports a car (0.9) and a truck (0.8) on one object, and another car.
-
-    Scores are multiplied by ``factor``.
-    """
+def two_labels_on_one_object(folder: Path) -> crosscue.Run:
+    """Run a network that reports a car (0.9) and a truck (0.8) on one object, and another car."""
     rows = np.array([[[8, 8, 24, 24, 0.9, 0], [9, 8, 24, 24, 0.8, 1], [40, 8, 60, 24, 0.7, 0]]])
-    rows[..., 4] *= factor
-    weights = constant_model((1, 3, SIZE[1], SIZE[0]), {"rows": rows.astype(np.float32)})
-    (folder / "net.onnx").write_bytes(weights)
-    (folder / "net.toml").write_text(
-        f'version = 1\nweights = "net.onnx"\nsha256 = "{hashlib.sha256(weights).hexdigest()}"\n'
-        f"[input]\nwidth_px = {SIZE[0]}\nheight_px = {SIZE[1]}\n"
-        '[output]\nkind = "end-to-end"\nclasses = ["car", "truck"]\noverlap = 1.0\n'
-    )
-    (folder / "log").mkdir()
-    for number in range(3):
-        pixels = np.full((SIZE[1], SIZE[0]), number, np.uint8)
-        cv2.imwrite(str(folder / "log" / f"frame_{number}.png"), pixels)
-    (folder / "log" / "timestamps.txt").write_text("rate_hz: 10\n")
-    return detect_with_card(folder, "net")
+    model = constant_model((1, 3, 48, 64), {"rows": rows.astype(np.float32)})
+    output = 'kind = "end-to-end"\nclasses = ["car", "truck"]\noverlap = 1.0'
+    card = write_card(folder, model, output)
+    log = picture_log(folder / "log", [np.full((48, 64), i, np.uint8) for i in range(3)])
+    return crosscue.detect_drive(log, folder / "run", detectors=[str(card)])
 
 
 def car_labels(folder: Path) -> Path:
@@ -411,15 +356,8 @@ def test_pictures_without_an_object_are_labels_to_test_on(tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_recall_is_said_where_nothing_is_above_the_threshold(drive: Path, tmp_path: Path) -> None:
     """The run to test on has three lights, all with low scores."""
-    (tmp_path / "log").mkdir()
-    for number in range(3):
-        pixels = np.zeros((SIZE[1], SIZE[0]), np.uint8)
-        pixels[8:24, 16:32] = 140 + number
-        cv2.imwrite(str(tmp_path / "log" / f"frame_{number}.png"), pixels)
-    (tmp_path / "log" / "timestamps.txt").write_text("rate_hz: 10\n")
-    dark = crosscue.detect_drive(
-        tmp_path / "log", tmp_path / "run", detectors=[str(drive / "net.toml")]
-    )
+    log = picture_log(tmp_path / "log", boxes([140, 141, 142]))
+    dark = crosscue.detect_drive(log, tmp_path / "run", detectors=[str(drive / "net.toml")])
     labels = tmp_path / "dark.csv"
     labels.write_text("picture,traffic light\n" + "".join(f"frame_{i}.png,1\n" for i in range(3)))
 

@@ -25,9 +25,8 @@ from crosscue.replay.columns import Block, Floats, Table, Topic
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.pose import Gnss, GnssUse, Odometry, Start
 from crosscue.replay.vehicle.vehicle import Vehicle
-from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
+from support.memory_log import GYRO, WHEELS, MemoryLog, driven_blocks
 
-SECOND = 1_000_000_000
 HEADING_RAD = 2.1
 PLACE = (48.137, 11.575, 520.0)
 SPEED_MPS = 8.0
@@ -51,15 +50,10 @@ def gnss_positions(t_s: Floats, speed_mps: float) -> Table:
 
 
 def straight_drive(speed_mps: float = SPEED_MPS, seconds: int = 30) -> MemoryLog:
-    blocks: list[Block] = []
-    for second in range(seconds):
-        t = [second * SECOND + i * SECOND // 10 for i in range(10)]
-        blocks.append(gyro_block(t, [0.0] * 10))
-        blocks.append(wheel_block(t, [speed_mps] * 10))
-        at = np.array([second * SECOND], np.int64)
-        blocks.append(
-            Block("/gnss", at, gnss_positions(np.asarray(at * 1e-9, np.float64), speed_mps))
-        )
+    t_ns = np.arange(seconds, dtype=np.int64) * 10**9
+    fixes = [Block("/gnss", at, gnss_positions(at * 1e-9, speed_mps)) for at in t_ns[:, None]]
+    rest = driven_blocks(seconds, speed_mps)
+    blocks = [one for i, fix in enumerate(fixes) for one in (*rest[2 * i : 2 * i + 2], fix)]
     return MemoryLog((WHEELS, GYRO, GNSS), blocks, path=Path(__file__))
 
 

@@ -1,15 +1,14 @@
 """Fit of the landmark threshold: required rates, intervals, pairs from tables."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from crosscue.eval import cli
 from crosscue.eval.fit.landmarks.threshold import Rate, ScoredPairs, fit_threshold
 from crosscue.replay.vehicle.vehicle import load
-from support.landmark_files import encoded, seen_from, wall
+from support.commands import json_of, output_of
+from support.landmark_files import write_walls
 
 
 def simulated_pairs(seed: int, false: int = 4000, same: int = 400) -> ScoredPairs:
@@ -42,22 +41,13 @@ def test_intervals_equal_published_values() -> None:
     assert fitted.fitted_found == fitted.held_out_found == Rate(0, 0, 0.0, 1.0)
 
 
-def test_threshold_fitted_to_a_table_of_pairs_is_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_threshold_fitted_to_a_table_of_pairs_is_written(tmp_path: Path) -> None:
     """Eight simulated walls, each observed again, compared with all eight."""
-    for i in range(8):
-        (tmp_path / f"a{i}.png").write_bytes(encoded(wall(i, 320, 240)))
-        again = seen_from(wall(i, 320, 240), 6.0, 1.1, 5.0, i)
-        (tmp_path / f"b{i}.png").write_bytes(encoded(again))
-    rows = [f"b{i}.png,a{j}.png,{int(i == j)}" for i in range(8) for j in range(8)]
-    (tmp_path / "pairs.csv").write_text("query,known,same\n" + "\n".join(rows) + "\n")
+    write_walls(tmp_path, 8, (320, 240))
     car = tmp_path / "car.toml"
     car.write_text("version = 1 # mine\n")
     command = ["fit", "landmarks", "--pairs", str(tmp_path / "pairs.csv"), "--vehicle", str(car)]
-    assert cli.run([*command, "-o", str(car), "--json"]) == 0
-
-    fitted = json.loads(capsys.readouterr().out)
+    fitted = json_of(*command, "-o", car)
     assert (fitted["held_out_found"]["hits"], fitted["held_out_found"]["of"]) == (4, 4)
     # OpenCV 4.14 and 5.0 match features differently: one of the 28 passes, or none.
     assert fitted["held_out_false"]["of"] == 28
@@ -65,5 +55,4 @@ def test_threshold_fitted_to_a_table_of_pairs_is_written(
     assert not fitted["is_shown"]
     assert load(car).landmarks.min_score == fitted["min_score"]
     assert "# mine" in car.read_text()
-    assert cli.run(command) == 0
-    assert "28 held-out pairs cannot show a rate of 0.001" in capsys.readouterr().out
+    assert "28 held-out pairs cannot show a rate of 0.001" in output_of(*command)

@@ -1,12 +1,9 @@
 """Fits of beliefs from run folders and truth files, up to the command line."""
 
-import json
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from crosscue.datasets.truth.truth import read_truth, save
@@ -16,23 +13,24 @@ from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.scoring.truth import read_scored_truth
 from crosscue.fusion.fit.annotated_approach import AnnotatedApproach
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
-from support.fusion_runs import made_up_drive, write_empty_truth, write_run, write_truth
+from support.commands import json_of, output_of
+from support.fusion_runs import (
+    made_up_drive,
+    write_drives,
+    write_empty_truth,
+    write_run,
+    write_truth,
+)
+from support.refusals import refusal
 
 DRIVES = 16
+Drives = tuple[list[Path], list[Path]]
 
 
 @pytest.fixture(scope="module")
-def drives(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], list[Path]]:
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Drives:
     """Run folders and truth files, half with a road to the left."""
-    folder = tmp_path_factory.mktemp("drives")
-    rng = np.random.default_rng(4)
-    runs, truths = [], []
-    for i in range(DRIVES):
-        left = i % 2 == 0
-        evidence = made_up_drive(rng, left=left, signed=True)
-        runs.append(write_run(folder / f"run{i}", evidence).path)
-        truths.append(write_truth(folder / f"truth{i}", left=left))
-    return runs, truths
+    return write_drives(tmp_path_factory.mktemp("drives"), [True, False] * (DRIVES // 2))
 
 
 def annotated_run(run: RunFolder, truth: Path) -> tuple[list[AnnotatedApproach], Counter[str]]:
@@ -40,9 +38,7 @@ def annotated_run(run: RunFolder, truth: Path) -> tuple[list[AnnotatedApproach],
     return list(annotated_approaches(run, known, Vehicle(version=1), used)), used
 
 
-def test_approach_has_features_of_truth_and_ends_at_intersection(
-    drives: tuple[list[Path], list[Path]],
-) -> None:
+def test_approach_has_features_of_truth_and_ends_at_intersection(drives: Drives) -> None:
     (one,), used = annotated_run(open_run(drives[0][0]), drives[1][0])
 
     assert one.features == {"intersection": True, "left": True, "right": True, "straight": True}
@@ -92,16 +88,12 @@ def test_approach_with_unknown_roads_is_left_out(tmp_path: Path) -> None:
     assert used == {"to an intersection with unknown roads, left out": 1}
 
 
-def test_command_writes_a_section_for_the_vehicle_file(
-    drives: tuple[list[Path], list[Path]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_a_section_for_the_vehicle_file(drives: Drives, tmp_path: Path) -> None:
     runs, truths = drives
     section = tmp_path / "calibrated.toml"
     command = ["fit", "messages", *map(str, runs), "--truth", *map(str, truths)]
 
-    assert crosscue([*command, "-o", str(section)]) == 0
-
-    reported = capsys.readouterr().out
+    reported = output_of(*command, "-o", section)
     assert f"{DRIVES} annotated approaches" in reported
     assert "road_left -> left, near" in reported
     assert "stop_sign -> intersection, far: 16 places with it, 0 without, 16 positive" in reported
@@ -115,16 +107,12 @@ def test_command_writes_a_section_for_the_vehicle_file(
     assert set(by_place) == {("road_left", "left", near) for near in (False, True)}
 
 
-def test_section_is_printed_without_output_option(
-    drives: tuple[list[Path], list[Path]], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_section_is_printed_without_output_option(drives: Drives) -> None:
     runs, truths = drives
     command = ["fit", "messages", *map(str, runs), "--truth", *map(str, truths)]
 
-    assert crosscue(command) == 0
-    assert "\n[fusion.calibrated]\nrates = [\n" in capsys.readouterr().out
-    assert crosscue([*command, "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
+    assert "\n[fusion.calibrated]\nrates = [\n" in output_of(*command)
+    printed = json_of(*command)
     assert printed["approaches"] == DRIVES
     (rate,) = [
         one
@@ -136,25 +124,10 @@ def test_section_is_printed_without_output_option(
         assert low < rate["there"]["rate"] < high
 
 
-Drives = tuple[list[Path], list[Path]]
-
-
 @pytest.fixture(scope="module")
 def timed_drives(tmp_path_factory: pytest.TempPathFactory) -> Drives:
     """Run folders and truth files with and without a road to the left, or an intersection."""
-    folder = tmp_path_factory.mktemp("drives")
-    rng = np.random.default_rng(4)
-    runs, truths = [], []
-    for i in range(9):
-        left, is_empty = i % 3 == 0, i % 3 == 2
-        evidence = made_up_drive(rng, left=left, signed=not is_empty)
-        run = write_run(folder / f"run{i}", evidence).path
-        frames = pa.table({"t_ns": [one.t_ns for one in evidence]})
-        pq.write_table(frames, run / "frames.parquet", write_page_checksum=True)
-        runs.append(run)
-        truth = folder / f"truth{i}"
-        truths.append(write_empty_truth(truth) if is_empty else write_truth(truth, left=left))
-    return runs, truths
+    return write_drives(tmp_path_factory.mktemp("drives"), [True, False, None] * 3)
 
 
 def test_drive_is_divided_at_the_intersection(timed_drives: Drives) -> None:
@@ -169,15 +142,13 @@ def test_drive_is_divided_at_the_intersection(timed_drives: Drives) -> None:
 
 
 def test_fit_of_chains_writes_a_section_for_the_vehicle_file(
-    timed_drives: Drives, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    timed_drives: Drives, tmp_path: Path
 ) -> None:
     runs, truths = timed_drives
     section = tmp_path / "temporal.toml"
     command = ["fit", "temporal", *map(str, runs), "--truth", *map(str, truths)]
 
-    assert crosscue([*command, "-o", str(section), "--json"]) == 0
-
-    reported = json.loads(capsys.readouterr().out)
+    reported = json_of(*command, "-o", section)
     assert reported["runs"] == 9
     fusion = parse("version = 1\n" + section.read_text(), "car.toml").fusion
     assert fusion.kind == "combined"
@@ -189,16 +160,12 @@ def test_fit_of_chains_writes_a_section_for_the_vehicle_file(
     assert weights["stop_sign"] > 0.0
 
 
-def test_threshold_for_a_rate_is_fitted_on_request(
-    timed_drives: Drives, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_threshold_for_a_rate_is_fitted_on_request(timed_drives: Drives, tmp_path: Path) -> None:
     runs, truths = timed_drives
     section = tmp_path / "fusion.toml"
     command = ["fit", "temporal", *map(str, runs), "--truth", *map(str, truths)]
 
-    assert crosscue([*command, "--false-features", "0.1", "-o", str(section), "--json"]) == 0
-
-    reported = json.loads(capsys.readouterr().out)
+    reported = json_of(*command, "--false-features", "0.1", "-o", section)
     fusion = parse("version = 1\n" + section.read_text(), "car.toml").fusion
     assert fusion.kind == "combined"
     assert fusion.established >= min(reported["threshold"]["threshold"], 0.9999)
@@ -206,9 +173,7 @@ def test_threshold_for_a_rate_is_fitted_on_request(
     assert crosscue([*command, "--false-features", "-1"]) == 2
 
 
-def test_drives_are_grouped_by_place_as_in_scores(
-    timed_drives: Drives, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_drives_are_grouped_by_place_as_in_scores(timed_drives: Drives, tmp_path: Path) -> None:
     """Positions within 50 m are one place, whatever the names of their intersections."""
     runs, truths = timed_drives
     placed = []
@@ -219,8 +184,6 @@ def test_drives_are_grouped_by_place_as_in_scores(
         folder.mkdir()
         placed.append(str(save(known, folder)))
 
-    assert crosscue(["fit", "temporal", *map(str, runs), "--truth", *placed, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["places"] == 2
+    assert json_of("fit", "temporal", *runs, "--truth", *placed)["places"] == 2
     messages = ["fit", "messages", *map(str, runs), "--truth", *placed]
-    assert crosscue(messages) == 1
-    assert "too few to learn from" in capsys.readouterr().err
+    assert "too few to learn from" in refusal(1, *messages)

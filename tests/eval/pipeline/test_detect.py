@@ -1,7 +1,6 @@
 """``crosscue detect``: from a camera log to a run folder with detections."""
 
 import json
-import shutil
 from pathlib import Path
 
 import cv2
@@ -13,8 +12,9 @@ from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import open_run
 from crosscue.replay.files.made_of import SIMULATED
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR
+from support.commands import output_of
 from support.data import shared
-from support.pictures import picture_folder
+from support.pictures import picture_log
 from support.refusals import refusal
 
 BRIGHT = "support.detecting:build"
@@ -74,15 +74,10 @@ classes = {json.dumps(CITY.split(","))}
 
 
 def _folder(tmp_path: Path, count: int = 5) -> Path:
-    folder = picture_folder(tmp_path / "cam", count, "rate_hz: 10\n", ".jpg")
-    for i in range(count):
-        grey = np.zeros((48, 64), np.uint8)
+    greys = np.zeros((count, 48, 64), np.uint8)
+    for i, grey in enumerate(greys):
         grey[10:20, 8 + i : 24 + i] = 255
-        ok, encoded = cv2.imencode(".png", grey)
-        assert ok
-        (folder / f"frame_{i}.jpg").unlink()
-        (folder / f"frame_{i}.png").write_bytes(encoded.tobytes())
-    return folder
+    return picture_log(tmp_path / "cam", greys)
 
 
 @pytest.mark.parametrize(
@@ -112,15 +107,12 @@ def test_notice_names_rules_that_use_boxes_instead_of_masks(
     assert len(notices) == (message is not None)
 
 
-def test_second_run_reads_cache_and_writes_same_detections(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_second_run_reads_cache_and_writes_same_detections(tmp_path: Path) -> None:
     log, cache = _folder(tmp_path), str(tmp_path / "cache.sqlite")
     reported = []
     for name in ("a", "b"):
         args = ["-o", str(tmp_path / name), "--detectors", BRIGHT, "--cache", cache, "--json"]
-        assert run(["detect", str(log), *args]) == 0
-        reported.append(json.loads(capsys.readouterr().out))
+        reported.append(json.loads(output_of("detect", log, *args)))
 
     assert reported[0]["ran"] == {BRIGHT: 5}
     assert reported[1]["ran"] == {BRIGHT: 0}
@@ -133,9 +125,7 @@ def test_change_of_picture_size_is_handled_and_reported(tmp_path: Path) -> None:
     log = _folder(tmp_path)
     wide = np.zeros((96, 128), np.uint8)
     wide[50:60, 10:20] = 255
-    ok, encoded = cv2.imencode(".png", wide)
-    assert ok
-    (log / "frame_4.png").write_bytes(encoded.tobytes())
+    cv2.imwrite(str(log / "frame_4.png"), wide)
     out = tmp_path / "run"
 
     assert run(["detect", str(log), "-o", str(out), "--detectors", BRIGHT, "--no-cache", "-q"]) == 0
@@ -171,9 +161,7 @@ def test_intrinsics_for_another_image_size_are_refused(tmp_path: Path, camera: s
 
 def test_later_picture_not_matching_intrinsics_is_dropped(tmp_path: Path) -> None:
     log, vehicle, out = _folder(tmp_path), tmp_path / "vehicle.toml", tmp_path / "run"
-    ok, encoded = cv2.imencode(".png", np.zeros((96, 128), np.uint8))
-    assert ok
-    (log / "frame_4.png").write_bytes(encoded.tobytes())
+    cv2.imwrite(str(log / "frame_4.png"), np.zeros((96, 128), np.uint8))
     vehicle.write_text("version = 1\n[camera]\nfocal_px = 60.0\n")
     command = ["detect", str(log), "--vehicle", str(vehicle), "-o", str(out), "--no-cache", "-q"]
 
@@ -232,10 +220,7 @@ def test_real_segmentation_network_finds_road_ahead_but_not_in_sky(
         "version = 1\n[regions]\nstraight = [[0.5, 0.7], [0.65, 0.7], [0.75, 0.85], [0.5, 0.85]]\n"
         "left = [[0.0, 0.0], [0.3, 0.0], [0.3, 0.3], [0.0, 0.3]]\n"
     )
-    log = tmp_path / "us"
-    log.mkdir()
-    shutil.copy(picture, log / picture.name)
-    (log / "timestamps.txt").write_text("rate_hz: 15\n")
+    log = picture_log(tmp_path / "us", [picture])
     args = ["--detectors", str(card), "--vehicle", str(vehicle), "--no-cache", "-q"]
 
     assert run(["replay", str(log), "-o", str(tmp_path / "run"), *args]) == 0

@@ -3,14 +3,13 @@
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from crosscue.datasets.scenes.drive import write_scene
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
-from crosscue.eval.cli import run
+from support.commands import output_of
 from support.scenes import shorten
 
 pytestmark = pytest.mark.slow
@@ -41,23 +40,13 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     text = (folder / "vehicle.toml").read_text()
     text = text[: text.index("[camera]")] if "[ranges" in text else text
     (folder / "vehicle.toml").write_text(text + DETECTORS.format(objects=folder / "objects.json"))
-    _replay(folder, folder / "run")
+    line = f"replay {folder}/drive.mcap --vehicle {folder}/vehicle.toml -o {folder}/run -q"
+    output_of(*line.split(), "--cache", folder / "cache.sqlite")
     return folder
 
 
-def _replay(folder: Path, out: Path, *more: str) -> None:
-    line = f"replay {folder}/drive.mcap --vehicle {folder}/vehicle.toml -o {out} -q"
-    arguments = [*line.split(), "--cache", str(folder / "cache.sqlite"), *more]
-    assert run(arguments) == 0
-
-
-def _manifest(run_path: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((run_path / "manifest.json").read_text())
-    return found
-
-
 def test_rejected_candidates_are_explained_in_manifest_and_summary(
-    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    drive: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(drive / "run", tmp_path / "run")
     text = (drive / "vehicle.toml").read_text()
@@ -66,10 +55,8 @@ def test_rejected_candidates_are_explained_in_manifest_and_summary(
     (tmp_path / "v.toml").write_text(text.replace(curve, "") + none_passes)
     shutil.copy(drive / "simulated_car.dbc", tmp_path)
     arguments = ["estimate", str(tmp_path / "run"), "--logs", str(drive), "--vehicle"]
-    assert run([*arguments, str(tmp_path / "v.toml")]) == 0
-
-    printed = " ".join(capsys.readouterr().out.split())
-    scene = _manifest(tmp_path / "run")["scene"]
+    printed = " ".join(output_of(*arguments, tmp_path / "v.toml").split())
+    scene = json.loads((tmp_path / "run" / "manifest.json").read_text())["scene"]
     for one in (*scene["candidates"].values(), *scene["ranged"].values()):
         assert one["seen"] == one["used"] + sum(one["skipped"].values())
     cars = scene["candidates"]["parked_left"]
@@ -80,9 +67,7 @@ def test_rejected_candidates_are_explained_in_manifest_and_summary(
     assert f"range: {signs:,} stop signs measured, no curve" in printed
 
 
-def test_only_detector_with_changed_settings_runs_again(
-    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_only_detector_with_changed_settings_runs_again(drive: Path, tmp_path: Path) -> None:
     text = (drive / "vehicle.toml").read_text()
     slower = 'kind = "signs"\n[detectors.signs.settings]\nmin_votes = 9'
     (tmp_path / "v.toml").write_text(text.replace('kind = "signs"', slower))
@@ -92,7 +77,5 @@ def test_only_detector_with_changed_settings_runs_again(
         f"replay {drive / 'drive.mcap'} --vehicle {tmp_path / 'v.toml'} -o "
         f"{tmp_path / 'run'} --cache {drive / 'cache.sqlite'} --json"
     ).split()
-    assert run(arguments) == 0
-
-    reported = json.loads(capsys.readouterr().out)["detected"]
+    reported = json.loads(output_of(*arguments))["detected"]
     assert reported["ran"] == {"oracle": 0, "signs": reported["frames"]}

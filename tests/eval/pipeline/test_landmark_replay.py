@@ -25,6 +25,7 @@ from crosscue.localization.landmarks.update import best_candidate
 from crosscue.replay.columns import Block, Bytes, Floats, Images, Messages
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.vehicle.vehicle import Vehicle
+from support.commands import json_of, output_of
 from support.data import shared
 from support.landmark_files import database_of, encoded, seen_from, wall
 from support.manifests import estimate_manifest
@@ -135,29 +136,22 @@ def test_landmarks_correct_a_drifting_pose(
     assert axis[-1] < 0.7 * without.table("pose")["major_axis_m"].to_numpy()[-1]
 
 
-def test_landmarks_list_and_match_report_stored_landmarks(
-    town: Town, capsys: pytest.CaptureFixture[str]
-) -> None:
-    capsys.readouterr()
-    assert cli.run(["landmarks", "list", str(town.database), "--json"]) == 0
-    listed = json.loads(capsys.readouterr().out)
+def test_landmarks_list_and_match_report_stored_landmarks(town: Town) -> None:
+    listed = json_of("landmarks", "list", town.database)
     first = listed["listed"][0]
     x, y = first["xy_m"]
     assert listed["landmarks"] == len(listed["listed"]) > 10
     assert np.array(first["cov_m2"]) == pytest.approx(4.0 * np.eye(2))
 
     near = f"--near={x},{y},1"
-    assert cli.run(["landmarks", "list", str(town.database), near]) == 0
-    assert first["name"] in capsys.readouterr().out
+    assert first["name"] in output_of("landmarks", "list", town.database, near)
 
     picture = sorted(town.survey.glob("*.png"))[0]
-    assert cli.run(["landmarks", "match", str(town.database), str(picture), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = json_of("landmarks", "match", town.database, picture)
     assert found["compared"] == listed["landmarks"]
     assert (found["best"][0]["name"], found["best"][0]["is_match"]) == (first["name"], True)
     assert not found["best"][3]["is_match"]
-    assert cli.run(["landmarks", "match", str(town.database), str(picture), near]) == 0
-    assert "1 landmarks compared" in capsys.readouterr().out
+    assert "1 landmarks compared" in output_of("landmarks", "match", town.database, picture, near)
 
 
 def photos(folder: Path, table: str) -> tuple[Path, Path]:
@@ -244,17 +238,11 @@ def test_real_frames_match_nearest_landmarks_of_kitti_turn(tmp_path: Path) -> No
     assert max(offsets_m) < 4.5
 
 
-def test_score_compares_filter_with_batch_smoother(
-    town: Town, found: RunFolder, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_score_compares_filter_with_batch_smoother(town: Town, found: RunFolder) -> None:
     command = ["score", str(found.path), "--truth", str(town.drive.truth), "--smoother"]
-    capsys.readouterr()
-    assert cli.run([*command, "--json"]) == 0
-
-    smoother = json.loads(capsys.readouterr().out)["metrics"]["smoother"]
+    smoother = json_of(*command)["metrics"]["smoother"]
     assert smoother["poses"] > 20
     assert smoother["smoother_rmse_m"] < smoother["filter_rmse_m"]
     assert abs(smoother["smoother_end_m"] - smoother["filter_end_m"]) < 0.5
     assert json.loads((found.path / "score" / "smoother.json").read_text()) == smoother
-    assert cli.run(command) == 0
-    assert "filter against batch smoother" in capsys.readouterr().out
+    assert "filter against batch smoother" in output_of(*command)

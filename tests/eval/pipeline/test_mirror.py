@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,8 +21,9 @@ from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.eval.runs.manifest import DetectManifest
 from crosscue.replay.vehicle.vehicle import BUILTIN_CUES, CUES
-from support.data import shared
+from support.data import fetch_networks, shared
 from support.mirrored import Mirror, Rows, differences, exchanged, observed, rows_of, vehicle_of
+from support.pictures import picture_log
 from support.scenes import shorten
 
 SCENE: Final = SceneSettings("L0", camera=SceneCamera(width_px=192, height_px=108))
@@ -151,10 +151,6 @@ def both(drive_run: RunFolder, changes: Mapping[str, Any]) -> tuple[Rows, Rows]:
     return rows_of(straight, size_px[0]), mirrored
 
 
-def positive(rows: Rows) -> set[str]:
-    return {row["cue"] for row in rows["cues"] if row["count"]}
-
-
 CHANGES: Final[dict[str, dict[str, Any]]] = {
     "published rules": {},
     "tracks": {
@@ -173,7 +169,7 @@ def test_simulated_drive_in_a_mirror_is_mirrored_and_shows_every_cue(simulated: 
         expected, mirrored = both(simulated, changes)
         assert expected["belief"], name
         assert differences(expected, mirrored) == [], name
-        seen |= positive(mirrored)
+        seen |= {row["cue"] for row in mirrored["cues"] if row["count"]}
 
     # Cars beyond an intersection and in its legs need one whose range is known: see real drives.
     unseen = BUILTIN_CUES.keys() - seen
@@ -229,16 +225,11 @@ def test_real_drive_in_a_mirror_is_mirrored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, pictures: str, camera: str
 ) -> None:
     pytest.importorskip("openvino")
-    weights = shared("weights", "road-segmentation-adas-0001")
-    monkeypatch.setenv("CROSSCUE_DATA", str(weights.parents[1]))
-    monkeypatch.setenv("CROSSCUE_MODELS", str(tmp_path / "models"))
     # Without a focal length no road is seen.
     names = ["yolox-nano", "road-segmentation-adas-0001"][: 2 if camera else 1]
-    assert run(["model", "fetch", *names]) == 0
-    (tmp_path / "front").mkdir()
-    for path in sorted(shared("sequences", folder).glob(pictures))[:52:2]:
-        shutil.copy(path, tmp_path / "front")
-    (tmp_path / "front" / "timestamps.txt").write_text("rate_hz: 5\n")
+    fetch_networks(monkeypatch, tmp_path / "models", *names)
+    every = sorted(shared("sequences", folder).glob(pictures))
+    picture_log(tmp_path / "front", every[:52:2], 5.0)
     (tmp_path / "car.toml").write_text(f"version = 1\n{camera}")
     argv = ["replay", str(tmp_path / "front"), "--vehicle", str(tmp_path / "car.toml")]
     argv += ["--detectors", ",".join(names), "--no-cache", "-o", str(tmp_path / "run")]

@@ -12,7 +12,6 @@ import pytest
 from crosscue.datasets.truth.truth import Truth, save
 from crosscue.detectors.base import Detections
 from crosscue.detectors.ranging.control_tracks import ControlTracks
-from crosscue.detectors.ranging.height_to_range import FAMILIES, fit_range, range_of
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.detectors.ranging.usable import CUT
 from crosscue.eval.cli import run
@@ -23,8 +22,9 @@ from crosscue.eval.runs.folder import RunFolder, open_run
 from crosscue.fusion.evidence import RangePosterior
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.columns import Floats
-from crosscue.replay.vehicle.vehicle import RangeCurve, Ranges, Vehicle, parse
-from support.data import shared
+from crosscue.replay.vehicle.vehicle import Ranges, Vehicle, parse
+from support.commands import json_of, output_of
+from support.data import fetch_networks, shared
 
 SIZE = (1920, 1080)
 AHEAD = CarStep(1.0, 0.0, 0.0, 0.1)
@@ -155,25 +155,6 @@ def test_boxes_cut_by_image_edge_yield_no_range_and_are_counted() -> None:
     assert counted.by_cue["traffic_light"].skipped == {CUT: 1}
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_fit_recovers_curve_and_residual_of_generated_pairs(family: str) -> None:
-    parameters = {"pinhole": (750.0,), "pinhole-offset": (700.0, 2.5), "power": (600.0, -0.9)}
-    curve = RangeCurve(
-        family=family,  # type: ignore[arg-type]
-        parameters=parameters[family],
-        residual_sd_m=1.0,
-    )
-    height = np.linspace(9.0, 90.0, 80)
-    noise = np.random.default_rng(3).normal(0.0, 1.7, 80)
-
-    fitted = fit_range(height, range_of(height, curve) + noise, curve.family)
-
-    truth = range_of(height, curve)
-    assert np.abs(range_of(height, fitted.curve) - truth).max() < 2.0
-    assert fitted.curve.residual_sd_m == pytest.approx(1.7, rel=0.2)
-    assert sum(b.pairs for b in fitted.bins) == 80
-
-
 HEIGHTS = {"stop_sign": 750.0, "traffic_light": 1000.0}
 
 
@@ -224,25 +205,20 @@ def test_signs_pair_with_start_and_lights_with_end(cue: str, tmp_path: Path) -> 
     np.testing.assert_allclose(pairs.height_px * pairs.range_m, HEIGHTS[cue])
 
 
-def test_fitted_curve_is_evaluated_on_other_drives(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fitted_curve_is_evaluated_on_other_drives(tmp_path: Path) -> None:
     fitted, other = annotated_drive(tmp_path / "a"), annotated_drive(tmp_path / "b", noise_m=1.0)
     page = tmp_path / "f.html"
     argv = (
         f"fit ranges --cue stop_sign --truth {fitted} --test {other} --page {page} --family pinhole"
     ).split()
 
-    assert run([*argv, "--json"]) == 0
-
-    reported = json.loads(capsys.readouterr().out)
+    reported = json_of(*argv)
     assert reported["fits"][0]["residual_sd_m"] < 0.01
     assert reported["tested"]["residual_sd_m"] == pytest.approx(1.0, rel=0.3)
     assert reported["tested"]["pairs"] == 60
     assert "other drives" in page.read_text()
     assert run(argv) == 1  # the page already exists
-    assert run([*argv, "--overwrite"]) == 0
-    assert "on other drives, 60 pairs" in capsys.readouterr().out
+    assert "on other drives, 60 pairs" in output_of(*argv, "--overwrite")
 
 
 def test_confident_detections_of_run_are_paired_with_truth_ranges(tmp_path: Path) -> None:
@@ -278,15 +254,13 @@ TRUTH_M = {"end": 79.0, "start": 59.0}
 
 @pytest.fixture(scope="module")
 def real_drive(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    log, weights = shared("sequences", "pandaset_002"), shared("weights", "yolox_nano")
+    log = shared("sequences", "pandaset_002")
     folder = tmp_path_factory.mktemp("real")
     (folder / "car.toml").write_text(CAR)
     argv = ["replay", str(log), "--vehicle", str(folder / "car.toml"), "-o", str(folder / "run")]
     cache = ["--cache", str(folder / "cache.sqlite")]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CROSSCUE_DATA", str(weights.parents[1]))
-        patch.setenv("CROSSCUE_MODELS", str(folder / "models"))
-        assert run(["model", "fetch", "yolox-nano"]) == 0
+        fetch_networks(patch, folder / "models", "yolox-nano")
         assert run([*argv, "--detectors", "yolox-nano", *cache]) == 0
     return open_run(folder / "run")
 

@@ -1,7 +1,6 @@
 """Lights and stop signs of real pictures, decided over frames and by a second look."""
 
 import csv
-import shutil
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +14,8 @@ from crosscue.detectors.registry import make
 from crosscue.detectors.signs.second_look import OTHER_SIGNS, with_looks
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import RunFolder, open_run
-from support.data import shared
+from support.data import fetch_networks, shared
+from support.pictures import picture_log
 
 CAR = 'version = 1\n[cars]\nlabels = ["car", "truck", "bus"]\n'
 SIGN = ("stop sign",)
@@ -23,20 +23,14 @@ SIGN = ("stop sign",)
 
 @pytest.fixture(scope="module")
 def network(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Detector]:
-    weights = shared("weights", "yolox_nano")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CROSSCUE_DATA", str(weights.parents[1]))
-        patch.setenv("CROSSCUE_MODELS", str(tmp_path_factory.mktemp("models")))
-        assert run(["model", "fetch", "yolox-nano"]) == 0
+        fetch_networks(patch, tmp_path_factory.mktemp("models"), "yolox-nano")
         yield make(DetectorChoice("yolox-nano", "yolox-nano"))
 
 
 def replayed(folder: Path, pictures: list[Path], rate_hz: float) -> RunFolder:
     """A run over pictures alone."""
-    (folder / "front").mkdir()
-    for path in pictures:
-        shutil.copy(path, folder / "front")
-    (folder / "front" / "timestamps.txt").write_text(f"rate_hz: {rate_hz}\n")
+    picture_log(folder / "front", pictures, rate_hz)
     (folder / "car.toml").write_text(CAR)
     argv = ["replay", str(folder / "front"), "--vehicle", str(folder / "car.toml"), "--no-cache"]
     assert run([*argv, "-o", str(folder / "run"), "--detectors", "yolox-nano"]) == 0

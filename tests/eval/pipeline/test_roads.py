@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -19,6 +18,7 @@ from crosscue.fusion.evidence import FrameEvidence, RangePosterior
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.camera import Camera
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle, parse
+from support.pictures import picture_log
 from support.road_masks import LEFT, RIGHT, ROAD, seen_from
 
 CAMERA = Camera(focal_px=700.0, z_m=1.6)
@@ -131,11 +131,8 @@ class Streets:
 
 
 def test_streets_that_a_car_passes_without_known_motion_are_believed_apart(tmp_path: Path) -> None:
-    log = tmp_path / "log"
-    log.mkdir()
-    for i in range(len(Streets.areas)):
-        cv2.imwrite(str(log / f"{i:02}.png"), np.full(SIZE_PX[::-1], 5 * i, np.uint8))
-    (log / "timestamps.txt").write_text("rate_hz: 10\n")
+    greys = [np.full(SIZE_PX[::-1], 5 * i, np.uint8) for i in range(len(Streets.areas))]
+    log = picture_log(tmp_path / "log", greys)
     (tmp_path / "car.toml").write_text("version = 1\n")
 
     run = crosscue.replay_drive(log, tmp_path / "run", tmp_path / "car.toml", [Streets])

@@ -16,7 +16,6 @@ from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.whole_run import replay_drive
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
-from crosscue.localization.ekf import PoseBelief
 from crosscue.localization.gap import GapSettings, cross_gap
 from crosscue.localization.landmarks.database import (
     LandmarkDatabase,
@@ -28,6 +27,7 @@ from crosscue.replay.columns import Block, Floats
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.vehicle.pose import Start
 from crosscue.replay.vehicle.vehicle import Vehicle, load
+from support.commands import output_of
 from support.gap_drive import (
     BEGIN,
     BUS,
@@ -124,15 +124,12 @@ def test_single_stray_stamp_is_skipped_and_reported(tmp_path: Path, by_s: int) -
     assert any("is far" in sentence for sentence in outcome.ledgers[0].notices)
 
 
-def _belief(speed_mps: float) -> PoseBelief:
-    return start_belief(0, 0.0, 0.0, 0.0, speed_mps, 1.0, 0.01, 0.1)
-
-
 @pytest.mark.parametrize("gap_s", [1.5, 4.0, 20.0, 1200.0])
 def test_any_motion_in_gap_is_within_three_sigma(gap_s: float) -> None:
     limits = GapSettings()
     rng = np.random.default_rng(3)
-    crossed = cross_gap(_belief(15.0), round(gap_s * 1e9), limits).belief
+    before = start_belief(0, 0.0, 0.0, 0.0, 15.0, 1.0, 0.01, 0.1)
+    crossed = cross_gap(before, round(gap_s * 1e9), limits).belief
     for _ in range(200):
         accel = rng.uniform(-limits.max_accel_mps2, limits.max_accel_mps2)
         turn = rng.uniform(-limits.max_turn_rate_radps, limits.max_turn_rate_radps)
@@ -328,11 +325,6 @@ def test_clock_set_back_in_camera_log_leaves_odometry_unchanged(tmp_path: Path) 
     assert frames["segment"].to_pylist() == [0] * 60 + [1] * 80
 
 
-def _replayed_part(folder: Path, log: Path, run: str, *part: str) -> tuple[int, RunFolder]:
-    argv = ["replay", str(log), "--vehicle", str(folder / "car.toml"), "-o", str(folder / run)]
-    return cli.run([*argv, "--no-cache", *part]), RunFolder(folder / run)
-
-
 @pytest.mark.parametrize(
     ("part", "status", "rows", "way_m"),
     [
@@ -346,9 +338,9 @@ def test_selected_part_of_log_has_only_its_gaps(
 ) -> None:
     log = write_drive(tmp_path, Clock(pause_s=(5.0, 8.0)))
 
-    ended, run = _replayed_part(tmp_path, log, "run", *part)
+    run, car = RunFolder(tmp_path / "run"), tmp_path / "car.toml"
+    output_of("replay", log, "--vehicle", car, "-o", run.path, "--no-cache", *part, status=status)
 
-    assert ended == status
     numbers = run.table("frames")["segment"].to_pylist()
     assert [numbers.count(n) for n in sorted(set(numbers))] == rows
     assert _column(run, "pose", "travelled_m")[-1] == pytest.approx(way_m, abs=0.01)

@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -19,6 +18,7 @@ from crosscue.eval.report.frame_pictures import draw_pictures
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import EstimateManifest, SceneSummary
 from support.data import shared
+from support.pictures import picture_log
 from support.plane_pictures import CAMERA, SIZE_PX, arc, picture
 
 STEP_M = 0.8
@@ -68,12 +68,8 @@ def scene_of(run: Run) -> tuple[EstimateManifest, SceneSummary]:
 
 def replayed(folder: Path, more: str = "", detector: object = Nothing) -> Run:
     """Replay a rendered drive: three pictures standing, then six steps of a gentle turn."""
-    log = folder / "log"
-    log.mkdir()
     poses = [(0.0, 0.0, 0.0)] * 2 + arc(STEP_M, math.radians(1.0), 6)
-    for i, pose in enumerate(poses):
-        cv2.imwrite(str(log / f"{i:02}.png"), picture(*pose))
-    (log / "timestamps.txt").write_text("rate_hz: 10\n")
+    log = picture_log(folder / "log", [picture(*pose) for pose in poses])
     (folder / "car.toml").write_text(SETUP + more)
     return crosscue.replay_drive(log, folder / "run", folder / "car.toml", [detector])
 
@@ -174,11 +170,7 @@ def test_a_real_side_street_is_believed_from_pictures_alone(
     monkeypatch.setenv("CROSSCUE_MODELS", str(tmp_path / "models"))
     fetch_weights(ROADS, shared("weights") / ROADS)
     pictures = shared("sequences") / "kitti_t_junction" / "image_0"
-    log = tmp_path / "log"
-    log.mkdir()
-    for path in sorted(pictures.iterdir())[22:42]:
-        (log / path.name).write_bytes(path.read_bytes())
-    (log / "timestamps.txt").write_text("rate_hz: 9.64\n")
+    log = picture_log(tmp_path / "log", sorted(pictures.iterdir())[22:42], 9.64)
     (tmp_path / "car.toml").write_text(
         "version = 1\n[camera]\nfocal_px = 707.0912\ncenter_px = [601.8873, 183.1104]\n"
         f'x_m = 1.03\nz_m = 1.65\n[detectors.road]\nkind = "{ROADS}"\n'

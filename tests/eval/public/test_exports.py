@@ -5,14 +5,12 @@ import re
 import pytest
 
 import crosscue
-from crosscue.eval import cli
 from crosscue.replay import errors as replay_errors
+from support.commands import output_of
 
 
-def test_version_equals_output_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["--version"]) == 0
-
-    assert capsys.readouterr().out == f"crosscue {crosscue.__version__}\n"
+def test_version_equals_output_of_the_command() -> None:
+    assert output_of("--version") == f"crosscue {crosscue.__version__}\n"
     assert re.fullmatch(r"\d+\.\d+.*", crosscue.__version__)
 
 

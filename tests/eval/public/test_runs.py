@@ -35,14 +35,6 @@ def test_run_exposes_its_tables_and_notices(run: crosscue.Run) -> None:
         run["nonsense"]
 
 
-def test_manifest_is_printed_with_one_field_per_line(run: crosscue.Run) -> None:
-    head, *lines = repr(run.manifest).splitlines()
-
-    assert head == "EstimateManifest"
-    assert [line.split()[0] for line in lines] == [*type(run.manifest).model_fields]
-    assert max(map(len, lines)) < 130
-
-
 def test_run_is_scored_and_printed(drive: DriveFiles, run: crosscue.Run) -> None:
     scored = crosscue.score_run(run, drive.truth, has_figures=False)
 

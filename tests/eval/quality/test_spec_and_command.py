@@ -18,6 +18,7 @@ from crosscue.replay.columns import Block, CanFrames, Messages, Table
 from crosscue.replay.errors import UnknownFormatError, UsageError
 from crosscue.replay.logs.log_summary import LogSummary, copies, summarise_log
 from crosscue.replay.losses import losses_heard
+from support.commands import output_of
 from support.kitti_odometry_drive import kitti_odometry_drive
 from support.quality_logs import Drive, Streams, log_of, streams_of
 
@@ -102,18 +103,17 @@ def test_verdict_spec_and_junit_of_a_data_set_two_levels_down(
 
 
 def test_info_open_vehicle_init_and_truth_descend_to_the_only_log(
-    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kitti: Path, tmp_path: Path
 ) -> None:
     folder = str(tmp_path / "set")
 
     with crosscue.open(folder) as log:
         assert "odometry" in log.topics
         assert log.paths == (str(kitti),)
-    assert cli.run(["info", folder, "--quick"]) == 0
-    assert cli.run(["vehicle", "init", folder]) == 0
-    assert cli.run(["truth", folder, "-o", str(tmp_path / "truth")]) == 0
     # A long path is broken at the width of the terminal.
-    assert str(kitti) in capsys.readouterr().out.replace("\n", "")
+    assert str(kitti) in output_of("info", folder, "--quick").replace("\n", "")
+    output_of("vehicle", "init", folder)
+    output_of("truth", folder, "-o", tmp_path / "truth")
 
 
 def test_several_logs_below_a_folder_are_named(kitti: Path, tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.replay.colours import QUIET, TRUTH
 from crosscue.replay.errors import LogError, UsageError
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
+from support.recordings import cells
 from support.refusals import refusal
 from support.scene_run import FRAMES, LABEL, scene_run
 from support.scoring import at, good_truth, truth_folder
@@ -49,14 +50,7 @@ def _rows(path: Path) -> Counter[str]:
 
 
 def _cells(path: Path, entity: str, component: str) -> list[Any]:
-    """Return the values of a component over time, one list for each row."""
-    cells: list[Any] = []
-    for chunk in RrdReader(path).stream():
-        if chunk.entity_path == entity and not chunk.is_static:
-            batch = chunk.to_record_batch()
-            name = next(n for n in batch.schema.names if n.endswith(component))
-            cells += batch[name].to_pylist()
-    return cells
+    return [value for _, value in cells(path, entity, component)]
 
 
 def _saved_recording(tmp_path: Path, **more: Any) -> Path:
@@ -200,26 +194,6 @@ def test_used_landmarks_are_labelled_on_the_map(tmp_path: Path) -> None:
         if chunk.entity_path == "/plan/landmarks"
     ]
     assert "wall 1" in str(found)
-
-
-def test_states_have_no_text_and_small_or_unsure_boxes_no_label(tmp_path: Path) -> None:
-    run = scene_run(tmp_path / "drive")
-    save_rrd(run, tmp_path / "run.rrd")
-
-    hidden = ("/camera/cars", "/ahead/mobileye_objects")
-    labels = {"/cues/stop_sign": ":labels"} | dict.fromkeys(hidden, ":show_labels")
-    found: dict[str, list[object]] = {}
-    for chunk in RrdReader(tmp_path / "run.rrd").stream():
-        ending = labels.get(chunk.entity_path)
-        if ending is not None and chunk.is_static:
-            batch = chunk.to_record_batch()
-            names = [name for name in batch.schema.names if name.endswith(ending)]
-            found.setdefault(chunk.entity_path, []).extend(
-                batch[name].to_pylist() for name in names
-            )
-    # The viewer would cut text off in short bars, and labels of neighbours would cover each other.
-    assert found["/cues/stop_sign"] == [[[" "]]]
-    assert [found[entity] for entity in hidden] == [[[[False]]]] * 2
 
 
 @pytest.fixture(scope="module")

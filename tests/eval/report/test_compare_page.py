@@ -10,6 +10,7 @@ import crosscue
 from crosscue.eval import cli
 from crosscue.eval.fleet.compare_page import differences_of
 from crosscue.eval.runs.folder import open_run
+from support.refusals import refusal
 from support.scene_run import scene_run
 from support.scoring import CUES, at, cue_table, truth_folder
 
@@ -34,7 +35,7 @@ def test_frames_in_which_runs_differ_are_found(sides: tuple[Path, Path]) -> None
 
 
 def test_compare_writes_a_page_with_pairs_of_pictures(
-    sides: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    sides: tuple[Path, Path], tmp_path: Path
 ) -> None:
     page = tmp_path / "compare.html"
     words = ["compare", *map(str, sides), "-o", str(page)]
@@ -47,7 +48,5 @@ def test_compare_writes_a_page_with_pairs_of_pictures(
     for run in sides:
         assert f"<code>crosscue view {run} --at 1.500</code>" in text
     assert page.stat().st_size < 3_000_000
-    capsys.readouterr()
-    assert cli.run(words) == 1
-    assert "exists; give another name or --overwrite" in capsys.readouterr().err
+    assert "exists; give another name or --overwrite" in refusal(1, *words)
     assert cli.run([*words, "--overwrite"]) in (0, 1, 3)

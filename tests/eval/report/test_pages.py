@@ -17,7 +17,7 @@ from crosscue.detectors.overlay import NOTHING_TRUE, TrueMarks, draw_frame
 from crosscue.eval import cli
 from crosscue.eval.recording.notes import COLOURS
 from crosscue.eval.report.frame_pictures import draw_pictures
-from crosscue.eval.report.html import page_style, template_text
+from crosscue.eval.report.html import page_style
 from crosscue.eval.report.page import write_report_without_truth
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.truth import true_marks
@@ -26,21 +26,7 @@ from crosscue.replay.files.tree_text import strict_json
 from support.scene_run import SIZE, scene_run
 from support.scoring import at, truth_folder
 
-TEMPLATES = sorted(
-    path.name
-    for path in (Path(crosscue.__file__).parent / "eval/report/templates").glob("*.html.j2")
-    if path.name not in ("base.html.j2", "parts.html.j2")
-)
 MAX_BYTES = 3_000_000
-
-
-@pytest.mark.parametrize("name", TEMPLATES)
-def test_every_template_is_a_section_of_the_one_page(name: str) -> None:
-    text = template_text(name)
-
-    assert text.startswith('{% extends "base.html.j2" %}')
-    assert "<style" not in text
-    assert "<html" not in text
 
 
 def _near(pixels: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], colour: colours.Colour) -> int:

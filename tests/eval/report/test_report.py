@@ -2,7 +2,6 @@
 
 import base64
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,7 +14,6 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rerun.chunk import RrdReader
 
 from crosscue.eval import cli
 from crosscue.eval.drives.score import mistakes_of
@@ -28,10 +26,11 @@ from crosscue.eval.report.scene_figures import draw_belief
 from crosscue.eval.report.svg_plot import ticks
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.moments import moment_ns
-from crosscue.eval.runs.tables.log_time import ClockGap, gaps_of
+from crosscue.eval.runs.tables.log_time import gaps_of
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS
 from crosscue.eval.scoring.runs import RunScored, judge_run, metrics_of, pooled_scores
 from support.gap_drive import Clock, replayed, write_drive
+from support.recordings import cells
 from support.scene_run import SIZE, scene_run
 from support.scoring import approach, at, good_truth, span, truth, truth_folder
 
@@ -234,32 +233,6 @@ def test_tile_without_a_distance_says_never(tmp_path: Path) -> None:
     assert "<b>never</b>" in _report_text(tmp_path, one, approaches=none)
 
 
-def _needed_px(table: str) -> float:
-    """Least width of a table in a browser: that of its longest lines, and of its padding."""
-    rows = [
-        [
-            max(len(part) for part in re.split(r"<small>| " if "text" in kind else "<small>", cell))
-            for kind, cell in re.findall(r"<t[dh]([^>]*)>(.*?)</t[dh]>", row)
-        ]
-        for row in table.replace("&emsp;", "  ").replace("</small>", "").split("<tr")[1:]
-    ]
-    widths: list[int] = [max(column) for column in zip(*rows, strict=True)]
-    return sum(7.7 * width + 17.6 for width in widths)
-
-
-def test_tables_beside_figures_fit_their_columns(tmp_path: Path) -> None:
-    """At 1400 px, the column of a pair is 585 px wide; what does not fit is cut off."""
-    scored = [_scored(tmp_path / name, name) for name in "ABCDE"]
-    page = _report_text(tmp_path, scored[0])
-
-    for text in (page, _report_text(tmp_path / "all", *scored)):
-        pairs = text.split('<div class="pair">')[1:]
-        tables = [one.partition("<table>")[2].partition("</table>")[0] for one in pairs]
-        assert len(tables) == 2
-        assert [table for table in tables if _needed_px(table) > 585] == []
-    assert "))" not in page.partition('<div class="tiles">')[2].partition("<table>")[0]
-
-
 def test_pictures_of_a_report_leave_out_unlikely_detections(tmp_path: Path) -> None:
     run = _scored(tmp_path / "drive").run
     path = run.file("detections.parquet")
@@ -289,24 +262,6 @@ def paused(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return replayed(folder, write_drive(folder, PAUSE))
 
 
-def _rows(path: Path, entity: str, component: str) -> list[tuple[int, Any]]:
-    """Return time and value of each row of an entity of a recording."""
-    found: list[tuple[int, Any]] = []
-    for chunk in RrdReader(path).stream():
-        if chunk.entity_path == entity and not chunk.is_static:
-            batch = chunk.to_record_batch()
-            name = next(n for n in batch.schema.names if n.endswith(component))
-            times = batch["drive"].cast("int64").to_pylist()
-            found += zip(times, batch[name].to_pylist(), strict=True)
-    return sorted(found, key=lambda row: row[0])
-
-
-def _crosses(rows: Sequence[tuple[int, Any]], gap: ClockGap) -> bool:
-    """Return True if a line crosses the gap."""
-    before = [value for t_ns, value in rows if t_ns < gap.middle_ns]
-    return bool(np.isfinite(before[-1][0]))
-
-
 def test_lines_of_a_recording_break_at_gaps(paused: RunFolder, tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     save_rrd(paused, path)
@@ -320,18 +275,13 @@ def test_lines_of_a_recording_break_at_gaps(paused: RunFolder, tmp_path: Path) -
         "/plots/ellipse/major_axis_m",
     ]
     for entity in lines:
-        rows = _rows(path, entity, "scalars")
+        rows = cells(path, entity, "scalars")
         assert len(rows) > 50, entity
-        assert not _crosses(rows, gap), entity
-    states = _rows(path, "/cues/stop_sign", "state")
+        before = [value for t_ns, value in rows if t_ns < gap.middle_ns]
+        assert np.isnan(before[-1][0]), entity
+    states = cells(path, "/cues/stop_sign", "state")
     assert [bool(value) for t_ns, value in states if t_ns < gap.middle_ns][-1] is False
-    strips = [
-        chunk.to_record_batch()
-        for chunk in RrdReader(path).stream()
-        if chunk.entity_path == "/plan/estimate"
-    ]
-    name = next(n for n in strips[0].schema.names if n.endswith("strips"))
-    assert len(strips[0][name].to_pylist()[0]) == 2
+    assert len(cells(path, "/plan/estimate", "strips", is_static=True)[0][1]) == 2
 
 
 def test_moments_of_a_drive_whose_clock_was_set_have_pictures_and_open(tmp_path: Path) -> None:

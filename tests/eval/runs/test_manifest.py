@@ -17,6 +17,7 @@ from crosscue.replay.errors import OutputError, RunError, UnreadableRunError, Us
 from crosscue.replay.files.whole_file import write_text, write_whole
 from crosscue.replay.time.segments import Cause, Epoch, EpochMarks, LogClock, TimeSegment
 from support.catalog_runs import add_run, runs_below
+from support.commands import output_of
 from support.manifests import detected, estimated, log_account
 from support.refusals import refusal
 from support.trees import tree
@@ -93,9 +94,8 @@ def test_invalid_manifest_is_refused_in_one_line(
     assert "\n" not in str(error.value)
 
 
-def test_schema_of_the_truth_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.run(["truth", "schema"]) == 0
-    assert json.loads(capsys.readouterr().out)["title"] == "Truth"
+def test_schema_of_the_truth_is_printed() -> None:
+    assert json.loads(output_of("truth", "schema"))["title"] == "Truth"
 
 
 def test_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
@@ -127,8 +127,7 @@ def test_tags_are_set_listed_and_removed(runs: Path, capsys: pytest.CaptureFixtu
 
     assert cli.run(["tag", monday, "weather=dry", "--remove", "route", "-q"]) == 0
     capsys.readouterr()
-    assert cli.run(["tag", str(runs / "a")]) == 0
-    assert capsys.readouterr().out.splitlines() == [
+    assert output_of("tag", runs / "a").splitlines() == [
         f"{monday}  weather=dry",
         f"{tuesday}  route=5 = north weather=rain",
     ]

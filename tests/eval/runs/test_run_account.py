@@ -38,6 +38,7 @@ from crosscue.replay.ledger import (
     NOT_ASKED_TOPIC,
     Ledger,
 )
+from support.commands import json_of, output_of
 from support.manifests import log_account
 from support.pictures import picture_folder
 
@@ -77,7 +78,7 @@ def _checked_account(run: Path, printed: dict[str, Any]) -> Account:
 
 
 def test_account_of_truncated_log_balances_for_replay_and_estimate(
-    damaged: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    damaged: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:
     _, log, vehicle = damaged
     run = tmp_path / ("long_" * 12) / "run"
@@ -87,16 +88,14 @@ def test_account_of_truncated_log_balances_for_replay_and_estimate(
         f"replay {log} --vehicle {vehicle} -o {run} --json --overwrite --from 1 --to 8".split(),
         ["estimate", str(run), "--json"],
     ):
-        assert cli.run(argv) == 3
-        found = _checked_account(run, json.loads(capsys.readouterr().out))
+        found = _checked_account(run, json.loads(output_of(*argv, status=3)))
         assert {stage for stage, _, _ in found.lines()} == {"reading", "estimating"}
         assert not found.is_whole
         assert found.estimating["wheel speeds"].used > 0
 
     assert cli.run(["view", str(run), "-o", str(tmp_path / "x.rrd"), "-q"]) == 3
     assert cli.run(["compare", str(run), str(run), "-q"]) == 3
-    assert cli.run(["estimate", str(run)]) == 3
-    text = capsys.readouterr().out
+    text = output_of("estimate", run, status=3)
     assert text.count("account  ") == 1
     # A path is in one line, however long it is, so that it can be copied.
     assert text.splitlines()[0] == f"run      {run}"
@@ -104,9 +103,7 @@ def test_account_of_truncated_log_balances_for_replay_and_estimate(
     assert sum(one.used for at, _, one in found.lines() if at == "reading") > 0
 
 
-def test_account_of_undecodable_pictures_balances_for_detect(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_account_of_undecodable_pictures_balances_for_detect(tmp_path: Path) -> None:
     log, run = picture_folder(tmp_path / "cam", 6, "rate_hz: 10\n"), tmp_path / "run"
     pictures = sorted(log.glob("*.png"))
     content = bytearray(pictures[2].read_bytes())
@@ -116,9 +113,7 @@ def test_account_of_undecodable_pictures_balances_for_detect(
     pictures[4].write_bytes(b"")
 
     argv = ["detect", str(log), "-o", str(run), "--detectors", BRIGHT, "--no-cache", "--json"]
-    assert cli.run(argv) == 3
-
-    found = _checked_account(run, json.loads(capsys.readouterr().out))
+    found = _checked_account(run, json.loads(output_of(*argv, status=3)))
     ((name, frames),) = found.detecting.items()
     topics = found.reading[0].topics
     assert (frames.entered, frames.used) == (6, 4)
@@ -143,19 +138,15 @@ def test_rows_beyond_the_kept_details_are_summed(tmp_path: Path) -> None:
     assert [row["count"] for row in rows if row["reason"] == "who knows"] == [None]
 
 
-def _account() -> Account:
-    return account(
-        [log_account("a", "/t", used=7, skipped={"dull": 2}, dropped={"cut": 1})],
-        {"/cam": line(5, 4, {}, {"not decoded": 1})},
-        {"headings": line(9, 6, {"rejected by the gate": 3})},
-    )
-
-
 @pytest.mark.parametrize("stage", ["reading", "detecting", "estimating"])
 @pytest.mark.parametrize("by", [-1, 1])
 @pytest.mark.parametrize("what", ["entered", "used", "skipped", "dropped"])
 def test_unbalanced_account_raises_an_error(stage: str, by: int, what: str) -> None:
-    wrong = _account()
+    wrong = account(
+        [log_account("a", "/t", used=7, skipped={"dull": 2}, dropped={"cut": 1})],
+        {"/cam": line(5, 4, {}, {"not decoded": 1})},
+        {"headings": line(9, 6, {"rejected by the gate": 3})},
+    )
     (one,) = [one for at, _, one in wrong.lines() if at == stage]
     if what in ("entered", "used"):
         object.__setattr__(one, what, getattr(one, what) + by)
@@ -183,7 +174,7 @@ def test_single_row_beyond_the_kept_details_is_counted(tmp_path: Path) -> None:
 
 
 def test_account_includes_headings_of_the_first_pose(
-    damaged: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    damaged: tuple[Path, Path, Path], tmp_path: Path
 ) -> None:
     _, log, vehicle = damaged
     text = "\n".join(row for row in vehicle.read_text().splitlines() if "heading_rad" not in row)
@@ -192,14 +183,7 @@ def test_account_includes_headings_of_the_first_pose(
     (tmp_path / "car.toml").write_text(text)
     run = tmp_path / "run"
 
-    assert (
-        cli.run(
-            ["replay", str(log), "--vehicle", str(tmp_path / "car.toml"), "-o", str(run), "--json"]
-        )
-        == 3
-    )
-
-    printed = json.loads(capsys.readouterr().out)
+    printed = json_of("replay", log, "--vehicle", tmp_path / "car.toml", "-o", run, status=3)
     assert any("start heading" in sentence for sentence in printed["notices"])
     headings = _checked_account(run, printed).estimating["headings"]
     assert headings.entered == headings.used + sum(headings.skipped.values())

@@ -23,7 +23,7 @@ from crosscue.eval.scoring.intervals import (
 )
 from crosscue.eval.scoring.places import group_drives, group_places, places_of
 from crosscue.eval.scoring.truth import DriveTruth, read_scored_truth
-from crosscue.eval.studies.intervals import mean_of, range_at, ratio_of, ratio_of_means
+from crosscue.eval.studies.intervals import fraction_of, mean_of, range_at, ratio_of, ratio_of_means
 from crosscue.replay.columns import Int64s
 from support.scoring import approach, good_tables, good_truth, truth_folder
 
@@ -124,6 +124,8 @@ def test_intervals_stay_within_bounds_and_need_six_clusters() -> None:
     assert np.isnan(mean_by_cluster(np.ones(500), drives[:500])).all()
     assert np.isnan(mean_of(np.ones(5)).low)
     assert np.isnan(range_at(np.arange(5.0), np.ones(5), 0.8).low)
+    assert fraction_of(8, 10).value == 0.8
+    assert fraction_of(0, 0).low == 0.0
 
 
 def test_ratio_interval_covers_and_equals_ratio_of_means_over_all_drives() -> None:

@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from hypothesis import strategies as st
 from crosscue.datasets.truth.tum import Trajectory, planar
 from crosscue.eval.scoring import consistency as chi_square
 from crosscue.eval.scoring.pose.errors import (
-    Alignment,
     Coverage,
     Paired,
     align,
@@ -128,16 +128,6 @@ def test_alignment_equals_evo(seed: int) -> None:
         np.testing.assert_allclose(found, errors, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("how", ["none", "origin", "yaw"])
-def test_trajectory_compared_with_itself_has_no_error(how: Alignment) -> None:
-    truth = random_walk(3)
-    same = align(truth, truth, how)
-
-    assert ape(truth, same).translation_m.max() < 1e-12
-    assert ape(truth, same).rotation_rad.max() < 1e-7
-    assert rpe(truth, same, 5.0).translation_m.max() < 1e-12
-
-
 @given(seed=SEEDS, yaw=st.floats(-3.1, 3.1), x=st.floats(-50, 50), z=st.floats(-5, 5))
 @settings(max_examples=25)
 def test_yaw_alignment_recovers_rotation_about_vertical(
@@ -151,18 +141,6 @@ def test_yaw_alignment_recovers_rotation_about_vertical(
 
     assert ape(truth, back).translation_m.max() < 1e-9
     assert ape(truth, back).rotation_rad.max() < 1e-7
-
-
-@given(seed=SEEDS, turn_seed=SEEDS)
-@settings(max_examples=20)
-def test_rpe_is_invariant_under_rigid_transform(seed: int, turn_seed: int) -> None:
-    truth = random_walk(seed)
-    estimate = with_errors(truth, seed + 1)
-    moved = with_errors(estimate, turn_seed, sd_m=0.0, sd_rad=0.0)
-
-    ours, theirs = rpe(truth, estimate, 3.0), rpe(truth, moved, 3.0)
-    np.testing.assert_allclose(ours.translation_m, theirs.translation_m, atol=1e-9)
-    np.testing.assert_allclose(ours.rotation_rad, theirs.rotation_rad, atol=1e-9)
 
 
 def test_coverage_accounts_for_every_true_pose() -> None:
@@ -229,17 +207,13 @@ def stationary_track() -> Trajectory:
     return planar(np.arange(5, dtype=np.int64), np.ones(5), np.ones(5), np.zeros(5))
 
 
-def later_track() -> Trajectory:
-    moved = random_walk(1)
-    return Trajectory(moved.t_ns + 10, moved.xyz_m, moved.quat_wxyz)
-
-
 def straight_track() -> Trajectory:
     return planar(np.arange(5, dtype=np.int64), np.arange(5.0), np.zeros(5), np.zeros(5))
 
 
 NO_COVERAGE = Coverage(0, 0, 0, 0, 0)
 TRACK = random_walk(1)
+LATER = replace(TRACK, t_ns=TRACK.t_ns + 10)
 
 
 @pytest.mark.parametrize(
@@ -248,7 +222,7 @@ TRACK = random_walk(1)
         (lambda: align(stationary_track(), stationary_track(), "yaw"), "do not determine yaw"),
         (lambda: rpe(straight_track(), straight_track(), 9.0), "no two of 5"),
         (lambda: rpe(straight_track(), straight_track(), 0.0), "expected > 0"),
-        (lambda: pair_poses(later_track(), stationary_track(), 1), "no true pose has an estimate"),
+        (lambda: pair_poses(LATER, stationary_track(), 1), "no true pose has an estimate"),
         (lambda: pair_poses(random_walk(1, 0), stationary_track(), 1), "0 true and 5 estimated"),
         (lambda: pair_poses(TRACK, TRACK, 1, np.zeros((3, 6))), r"expected \(60, 6\)"),
         (lambda: squared_errors(Paired(TRACK, TRACK, None, NO_COVERAGE), 2), "needed for NEES"),

@@ -204,18 +204,6 @@ def test_approaches_are_associated_one_to_one_by_overlap() -> None:
     assert associate([first, second], {}) == {}
 
 
-def test_association_is_invariant_under_time_shift() -> None:
-    ones = [approach(id=i, start_ns=at(20 * i), enter_ns=at(20 * i + 15)) for i in range(3)]
-    spans = {i: (at(20 * i + 3), at(20 * i + 17)) for i in range(3)}
-    later = [
-        one.model_copy(update={"start_ns": one.start_ns + 77, "enter_ns": one.enter_ns + 77})
-        for one in ones
-    ]
-
-    moved = {number: (a + 77, b + 77) for number, (a, b) in spans.items()}
-    assert associate(ones, spans) == associate(later, moved) == {0: 0, 1: 1, 2: 2}
-
-
 def test_extra_and_split_approaches_are_counted() -> None:
     import pyarrow as pa
 

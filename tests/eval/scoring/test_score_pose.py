@@ -10,32 +10,20 @@ from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, write_tum
 from crosscue.eval.drives.score import score_run
 from crosscue.eval.pipeline.whole_run import replay_drive
-from crosscue.eval.recording import save_rrd as save_recording
 from crosscue.eval.report.opening import judged_sentences
 from crosscue.eval.report.summary import pose_summary, scores_text
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
-from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
+from crosscue.eval.scoring.pose.score import PoseScore, load_truth
 from crosscue.eval.scoring.runs import pooled_scores
 from crosscue.eval.studies.town.replayed import score_pose
-from crosscue.replay.columns import Block
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.vehicle.pose import Start
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
-from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
+from support.memory_log import GYRO, WHEELS, MemoryLog, driven_blocks
 
-SECOND = 1_000_000_000
 SPEED_MPS = 10.0
 YAW_RATE_RADPS = 0.1
-
-
-def _blocks(seconds: int = 30) -> list[Block]:
-    blocks: list[Block] = []
-    for second in range(seconds):
-        t = [second * SECOND + i * SECOND // 10 for i in range(10)]
-        blocks.append(gyro_block(t, [YAW_RATE_RADPS] * 10))
-        blocks.append(wheel_block(t, [SPEED_MPS] * 10))
-    return blocks
 
 
 def _circle(t_s: np.ndarray[tuple[int], np.dtype[np.float64]], ahead_m: float = 0.0) -> Trajectory:
@@ -47,7 +35,9 @@ def _circle(t_s: np.ndarray[tuple[int], np.dtype[np.float64]], ahead_m: float = 
 
 
 def _run(folder: Path, vehicle: Vehicle | None = None) -> RunFolder:
-    log = MemoryLog((WHEELS, GYRO), _blocks(), path=Path(__file__))
+    log = MemoryLog(
+        (WHEELS, GYRO), driven_blocks(30, SPEED_MPS, YAW_RATE_RADPS), path=Path(__file__)
+    )
     vehicle = vehicle or Vehicle(version=1, start=Start(heading_rad=0.0))
     return replay_drive(Drive([log], vehicle), create(folder, overwrite=False)).run
 
@@ -148,15 +138,6 @@ def test_malformed_truth_is_refused(tmp_path: Path, text: str, message: str) -> 
 
     with pytest.raises(SchemaError, match=message):
         load_truth(tmp_path / "truth.json")
-
-
-def test_recording_with_truth_is_larger_than_without(tmp_path: Path) -> None:
-    run, path, _ = _scored(tmp_path)
-    save_recording(run, tmp_path / "plain.rrd")
-    save_recording(run, tmp_path / "truth.rrd", truth_track(path, run))
-
-    sizes = [(tmp_path / f"{name}.rrd").stat().st_size for name in ("plain", "truth")]
-    assert 10_000 < sizes[0] < sizes[1]
 
 
 def test_nees_is_not_computed_without_common_frame(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.eval.scoring.truth import read_scored_truth
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.files.tree_text import strict_json
+from support.commands import json_of, output_of
 from support.refusals import refusal
 from support.scene_run import scene_run
 from support.scoring import (
@@ -51,13 +52,10 @@ def _one(tmp_path: Path, name: str = "one") -> Path:
     return tmp_path / name / "run"
 
 
-def test_score_finds_truth_next_to_log_and_writes_files(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_score_finds_truth_next_to_log_and_writes_files(tmp_path: Path) -> None:
     run = _one(tmp_path)
 
-    assert cli.run(["score", str(run), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = json_of("score", run)
     assert json.loads((run / "score" / "metrics.json").read_text()) == found["metrics"]
     assert found["metrics"]["cues"]["stop_sign"]["precision"]["value"] == 1.0
     assert found["metrics"]["approaches"]["full_m"]["value"] == 15.0
@@ -228,17 +226,14 @@ def test_invalid_tables_are_refused_with_reason(tmp_path: Path) -> None:
         assert message in refusal(4, "score", run.path)
 
 
-def test_run_with_nothing_to_score_reports_reasons(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_with_nothing_to_score_reports_reasons(tmp_path: Path) -> None:
     truth_folder(tmp_path)
     bare = run_folder(tmp_path / "bare", {"frames": frame_table(5)})
     only_cues = run_folder(tmp_path / "cues", {"cues": cue_table(CUES)})
 
     line = refusal(1, "score", bare.path)
     assert "the run has no cues; the run has no belief; the run has no range" in line
-    assert cli.run(["score", str(only_cues.path)]) == 0
-    assert "not scored belief: the run has no belief" in capsys.readouterr().out
+    assert "not scored belief: the run has no belief" in output_of("score", only_cues.path)
 
 
 def _log_of(folder: Path, run: Path) -> tuple[LogRow, ...]:
@@ -266,9 +261,7 @@ def test_run_that_cannot_be_scored_does_not_stop_others(
     assert list(pooled["coverage"]["failed"]) == [str(tmp_path / "runs" / "b")]
 
 
-def test_scores_of_many_runs_begin_with_the_result_in_25_lines(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_scores_of_many_runs_begin_with_the_result_in_25_lines(tmp_path: Path) -> None:
     for name in "abc":
         drive, run = tmp_path / "drives" / name, tmp_path / "runs" / name
         truth_folder(drive)
@@ -276,35 +269,25 @@ def test_scores_of_many_runs_begin_with_the_result_in_25_lines(
         run_folder(run, logs=_log_of(drive, run))
     argv = ["score", str(tmp_path / "runs"), "-o", str(tmp_path / "all"), "--without-figures"]
 
-    assert cli.run(argv) == 0
-    printed = capsys.readouterr().out.splitlines()
+    printed = output_of(*argv).splitlines()
     assert printed[0].startswith("approaches 3 true")
     assert len(printed) <= 25
     assert printed[-1] == f"written to {tmp_path / 'all' / 'report.html'}"
 
-    assert cli.run([*argv, "-v"]) == 0
-    printed = capsys.readouterr().out.splitlines()
+    printed = output_of(*argv, "-v").splitlines()
     assert [one for one in printed if one.startswith(f"{tmp_path}/runs/a: detected")]
 
 
-def test_score_of_one_run_is_also_written_to_output_folder(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_score_of_one_run_is_also_written_to_output_folder(tmp_path: Path) -> None:
     run, out = _one(tmp_path), tmp_path / "scored"
 
-    assert cli.run(["score", str(run), "-o", str(out)]) == 0
-    assert f"written to {out}" in capsys.readouterr().out.replace("\n", " ")
+    assert f"written to {out}" in output_of("score", run, "-o", out).replace("\n", " ")
     for name in ("metrics.json", "curves.parquet", "cue_frames.parquet"):
         assert (out / name).read_bytes() == (run / "score" / name).read_bytes()
     assert (out / "report.html").exists()
 
 
 SECTIONS = ("cues", "approaches", "belief", "range")
-
-
-def _metrics(scores: object) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(strict_json(as_metrics(scores)))  # type: ignore[arg-type]
-    return found
 
 
 def test_scores_of_tables_are_those_of_their_run(
@@ -324,9 +307,8 @@ def test_scores_of_tables_are_those_of_their_run(
 
     monkeypatch.setattr(builtins, "open", closed)
     monkeypatch.setattr(io, "open", closed)
-    scores = crosscue.score(tables, truth)
+    found = json.loads(strict_json(as_metrics(crosscue.score(tables, truth))))
 
-    found = _metrics(scores)
     assert {name: found[name] for name in SECTIONS} == {name: of_run[name] for name in SECTIONS}
 
 

@@ -14,10 +14,6 @@ from crosscue.eval.scoring.runs import pooled_scores
 from support.gap_drive import Clock, replayed, write_drive
 
 
-def _replayed(folder: Path, clock: Clock) -> RunFolder:
-    return replayed(folder, write_drive(folder, clock))
-
-
 def _ambiguous_rows(run: RunFolder, name: str) -> int:
     """Return the number of rows whose stamp also occurs in the other segment."""
     timeline = run.drive_manifest().timeline
@@ -27,7 +23,7 @@ def _ambiguous_rows(run: RunFolder, name: str) -> int:
 
 
 def test_rows_with_repeated_log_time_are_counted_in_all_scores(tmp_path: Path) -> None:
-    run = _replayed(tmp_path, Clock(set_at_s=6, by_s=-3))
+    run = replayed(tmp_path, write_drive(tmp_path, Clock(set_at_s=6, by_s=-3)))
     frames, belief, ranges = (_ambiguous_rows(run, name) for name in ("frames", "belief", "range"))
     assert min(frames, belief, ranges) > 0
 

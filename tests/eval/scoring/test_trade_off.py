@@ -49,20 +49,6 @@ def test_each_rate_has_the_lowest_threshold_that_keeps_to_it() -> None:
     assert half.full.of == 10
 
 
-def test_belief_that_ranks_equally_has_the_same_curve() -> None:
-    """Only the ranking counts: raising a threshold is no merit of the belief."""
-    rng = np.random.default_rng(1)
-    full, false = rng.random(40), rng.random((40, 2))
-    plain = [Reached(float(a), tuple(map(float, b))) for a, b in zip(full, false, strict=True)]
-    bold = [Reached(one.full**0.1, tuple(p**0.1 for p in one.false)) for one in plain if one.full]
-
-    for one, other in zip(
-        trade_off(plain, np.arange(40)), trade_off(bold, np.arange(40)), strict=True
-    ):
-        assert one.full == other.full
-        assert one.false_features == other.false_features
-
-
 def test_short_or_missing_belief_is_never_full() -> None:
     assert reached({}, PRESENT, ABSENT, np.zeros(0, np.bool_)) == Reached(-1.0, (0.0,))
     assert reached({"left": np.ones(9)}, PRESENT, ABSENT, np.zeros(9, np.bool_)).full == -1.0

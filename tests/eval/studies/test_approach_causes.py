@@ -77,24 +77,31 @@ def test_feature_established_only_at_intersection_is_late() -> None:
     assert one.conditions == ("dusk",)
 
 
-def test_visible_cue_without_detections_is_reported_as_not_found() -> None:
-    (one,) = _found(
-        NO_LEFT, _cue("road_left", objects=30, positives=4), _cue("parked_left", objects=10)
-    )
-
-    assert one.cause == "not found"
-    assert "4 of 40" in one.reported
-    assert "road left 4/30" in one.reported
-    assert "parked left 0/10" in one.reported
+SEEN = {"objects": 30, "positives": 4}
 
 
-def test_more_frequent_contradicting_cue_is_reported_as_denial() -> None:
-    (one,) = _found(
-        NO_LEFT, _cue("road_left", objects=30, positives=4), _cue("one_way_right", positives=9)
-    )
+@pytest.mark.parametrize(
+    ("cues", "cause", "reported"),
+    [
+        ((_cue("road_left", **SEEN), _cue("parked_left", objects=10)), "not found", "4 of 40"),
+        ((_cue("road_left", **SEEN),), "not found", "road left 4/30"),
+        ((_cue("road_left"), _cue("parked_left", objects=10)), "not found", "parked left 0/10"),
+        (
+            (_cue("road_left", **SEEN), _cue("one_way_right", positives=9)),
+            "denied",
+            "one way right",
+        ),
+        ((_cue("road_left", objects=30, visible=0.4),), "hidden", "30 frames"),
+        ((_cue("road_left", objects=30, positives=25),), "too little", ""),
+    ],
+)
+def test_missing_feature_has_a_cause(
+    cues: tuple[CueFrames, ...], cause: str, reported: str
+) -> None:
+    (one,) = approach_findings(NO_LEFT, cues)
 
-    assert one.cause == "denied"
-    assert "one way right" in one.reported
+    assert one.cause == cause
+    assert reported in one.reported
 
 
 def test_road_found_before_presence_is_established_waits_for_presence() -> None:
@@ -124,16 +131,3 @@ def test_permanent_condition_of_intersection_does_not_exclude_good_runs() -> Non
 
     assert cost.condition == "dusk"
     assert cost.detected_m.value == pytest.approx(-10.0)
-
-
-def test_occluded_cue_is_reported_as_hidden() -> None:
-    (one,) = _found(NO_LEFT, _cue("road_left", objects=30, visible=0.4))
-
-    assert one.cause == "hidden"
-    assert "30 frames" in one.reported
-
-
-def test_counted_cue_below_threshold_is_reported_as_too_little() -> None:
-    (one,) = _found(NO_LEFT, _cue("road_left", objects=30, positives=25))
-
-    assert one.cause == "too little"

@@ -3,7 +3,6 @@
 from importlib import util
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -14,6 +13,7 @@ from crosscue.eval.cli import run
 from crosscue.eval.drives.demo import fetch_drive
 from crosscue.replay.errors import UsageError
 from support.data import shared
+from support.pictures import picture_log
 
 NAMES = ("yolox-nano", "road-segmentation-adas-0001")
 
@@ -21,12 +21,7 @@ NAMES = ("yolox-nano", "road-segmentation-adas-0001")
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
     """A folder with three pictures."""
-    folder = tmp_path / "log"
-    folder.mkdir()
-    for number in range(3):
-        cv2.imwrite(str(folder / f"{number}.png"), np.full((48, 64), 40 * number, np.uint8))
-    (folder / "timestamps.txt").write_text("rate_hz: 10\n")
-    return folder
+    return picture_log(tmp_path / "log", [np.full((48, 64), 40 * i, np.uint8) for i in range(3)])
 
 
 def test_drafted_vehicle_finds_road_and_objects(log: Path) -> None:
@@ -45,14 +40,6 @@ def test_drafted_vehicle_finds_road_and_objects(log: Path) -> None:
 
 def test_vehicle_is_drafted_without_networks_by_default(log: Path) -> None:
     assert not crosscue.draft_vehicle(log).vehicle.detectors
-
-
-def test_option_road_writes_the_same(log: Path, tmp_path: Path) -> None:
-    path = tmp_path / "car.toml"
-
-    assert run(["vehicle", "init", str(log), "--road", "-o", str(path)]) == 0
-
-    assert path.read_text().count("\n[detectors.") == 2
 
 
 def test_help_of_demo_states_cost_and_licence(capsys: pytest.CaptureFixture[str]) -> None:
