@@ -14,6 +14,7 @@ import pytest
 from crosscue.eval import cli
 from crosscue.localization.landmarks.database import LandmarkWriter
 from support.coco import stop_signs
+from support.command_lines import VALID
 from support.failures import table_of_failures
 from support.gap_drive import BEGIN, BUS, Clock, replayed, write_drive
 from support.mcap_files import McapFile
@@ -24,141 +25,39 @@ from support.refusals import refusal
 from support.street_map import write_crossing
 from support.trees import tree
 
-# Command lines in which ``{gone}`` is an input file: exit status 4.
-INPUT_FILES: Final[dict[tuple[str, str], str]] = {
-    ("info", "LOG"): "{gone}",
-    ("convert", "LOG"): "{gone} -o {out}.mcap",
-    ("decode", "LOG"): "{gone} -o {out}",
-    ("detect", "LOG"): "{gone} -o {out} --detectors signs",
-    ("replay", "LOG"): "{gone} -o {out}",
-    ("vehicle init", "LOG"): "{gone} -o {out}.toml",
-    ("check", "FILE"): "{gone}",
-    ("fit compass", "LOG"): "{gone} --vehicle {car}",
-    ("truth from-gnss", "LOG"): "{gone} -o {out}",
-    ("truth from-map", "LOG"): "{gone} {streets} -o {out}",
-    ("truth from-map", "FILE"): "{log} {gone} -o {out}",
-    ("fit odometry", "LOG"): "{gone} --vehicle {car}",
-    ("landmarks add", "LOG"): "{out}.db {gone} --poses {truth} --vehicle {car}",
-    ("truth", "LOG"): "{gone} -o {out}",
-    ("estimate", "RUN"): "{gone}",
-    ("estimate", "--start"): "{run} --start {gone}",
-    ("replay", "--start"): "{log} --vehicle {car} -o {out} --start {gone}",
-    ("score", "RUN"): "{gone} --truth {truth}",
-    ("score detector", "RUN"): "{gone} --labels {coco}",
-    ("score detector", "--labels"): "{run} --labels {gone}.json",
-    ("score detector", "--logs"): "{run} --labels {coco} --logs {gone}",
-    ("fit detector", "RUN"): "{gone} --labels {coco}",
-    ("fit detector", "--labels"): "{run} --labels {gone}.json",
-    ("fit detector", "--logs"): "{run} --labels {coco} --logs {gone}",
-    ("fit detector", "--test"): "{run} --labels {coco} --test {gone} --test-labels {coco}",
-    (
-        "fit detector",
-        "--test-labels",
-    ): "{run} --labels {coco} --test {run} --test-labels {gone}.json",
-    ("view", "RUN"): "{gone} -o {out}.rrd",
-    ("report", "RUN"): "{gone} -o {out}.html",
-    ("compare", "RUN_A"): "{gone} {run}",
-    ("compare", "RUN_B"): "{run} {gone}",
-    ("merge", "RUNS"): "{gone} -o {out}",
-    ("query", "RUNS"): "{gone} --schema",
-    ("tag", "RUN"): "{gone} weather=rain",
-    ("status", "RUNS"): "{gone}",
-    ("failures", "RUN"): "{gone}",
-    ("failures", "--truth"): "{run} --truth {gone}",
-    ("browse", "RUN"): "{gone} -o {out}",
-    ("browse", "--truth"): "{run} -o {out} --truth {gone}",
+MASKS: Final = VALID["train mask-rcnn"]
+# Lines other than the valid one with its file, or one more option, that is ``{gone}``.
+OTHER: Final[dict[tuple[str, str], str]] = {
     ("browse", "--logs"): "{failures} -o {out} --logs {gone}",
-    ("export", "FAILURES"): "{gone} -o {out}",
-    ("export", "--logs"): "{failures} -o {out} --logs {gone}",
-    ("truth import", "--export"): "{coco} --export {gone} -o {out}",
-    ("history", "RUNS"): "{gone}",
-    ("fit messages", "RUN"): "{gone} --truth {truth} -o {out}.toml",
-    ("fit signs", "LABELS"): "{gone}.csv --label stop",
-    ("fit ranges", "TABLE"): "{gone} --cue stop_sign",
-    ("landmarks add", "DB"): "{gone} --images {pictures} --coordinates {places}",
-    ("landmarks list", "DB"): "{gone}",
-    ("landmarks match", "DB"): "{gone} {picture}",
-    ("landmarks match", "IMAGE"): "{db} {gone}",
-    ("truth import", "ANNOTATIONS"): "{gone}.json --log {log} -o {out}.json",
-    ("replay", "--landmarks"): "{log} -o {out} --vehicle {car} --landmarks {gone}",
-    ("estimate", "--logs"): "{run} --logs {gone}",
-    ("score", "--truth"): "{run} --truth {gone}",
-    ("score", "--logs"): "{run} --truth {truth} --logs {gone}",
-    ("view", "--truth"): "{run} -o {out}.rrd --truth {gone}",
-    ("view", "--logs"): "{run} -o {out}.rrd --logs {gone}",
-    ("report", "--logs"): "{run} -o {out}.html --logs {gone}",
-    ("vehicle init", "--dbc"): "{log} -o {out}.toml --dbc {gone}.dbc",
-    ("fit odometry", "--truth"): "{log} --vehicle {car} --truth {gone}",
-    ("fit signs", "--test"): "{labels} --label stop --test {gone}.csv",
-    ("fit ranges", "--truth"): "--cue stop_sign --truth {gone}",
-    ("fit ranges", "--runs"): "--cue stop_sign --truth {truth} --runs {gone}",
-    ("fit ranges", "--test"): "{pairs_m} --cue stop_sign --test {gone}",
-    ("fit temporal", "RUN"): "{gone} --truth {truth} -o {out}.toml",
-    ("fit temporal", "--truth"): "{run} --truth {gone} -o {out}.toml",
-    ("fit messages", "--truth"): "{run} --truth {gone} -o {out}.toml",
-    ("fit landmarks", "--pairs"): "--pairs {gone}",
-    ("landmarks add", "--poses"): "{out}.db {log} --vehicle {car} --poses {gone}",
-    ("landmarks add", "--images"): "{out}.db --images {gone} --coordinates {places}",
-    ("landmarks add", "--coordinates"): "{out}.db --images {pictures} --coordinates {gone}",
-    ("truth import", "--log"): "{coco} --log {gone} -o {out}.json",
-    ("model init", "--picture"): "{onnx} -o {there}/new.toml --picture {gone}",
     ("check", "--picture"): "{card} --picture {gone} -o {out}.jpg",
-    ("fetch", "--data"): "pandaset_002 --data {gone} -o {out}",
-    ("demo", "--data"): "--real --data {gone} -o {out}",
-    ("train road", "--data"): "--data {gone} -o {out}.safetensors",
-    ("train mask-rcnn", "--data"): "--data {gone} --images {pictures} -o {out}.safetensors",
-    ("train mask-rcnn", "--images"): "--data {coco} --images {gone} -o {out}.safetensors",
-    (
-        "train mask-rcnn",
-        "--val-data",
-    ): "-o {out}.safetensors --data {coco} --images {pictures} --val-data {gone} "
-    "--val-images {pictures}",
-    (
-        "train mask-rcnn",
-        "--val-images",
-    ): "-o {out}.safetensors --data {coco} --images {pictures} --val-data {coco} "
-    "--val-images {gone}",
-}
-# The same for files of settings: exit status 2.
-SETTINGS_FILES: Final[dict[tuple[str, str], str]] = {
-    ("score detector", "--class-names"): "{run} --labels {coco} --class-names {gone}",
-    ("fit detector", "--class-names"): "{run} --labels {coco} --class-names {gone}",
-    ("fit detector", "--card"): "{run} --labels {coco} --card {gone}",
+    ("fit detector", "--test"): "{run} --labels {coco} --test {gone} --test-labels {coco}",
+    ("fit detector", "--test-labels"): (
+        "{run} --labels {coco} --test {run} --test-labels {gone}.json"
+    ),
+    ("fit ranges", "--runs"): "--cue stop_sign --truth {truth} --runs {gone}",
+    ("fit ranges", "--truth"): "--cue stop_sign --truth {gone}",
+    ("fit signs", "--test"): "{labels} --label stop --test {gone}.csv",
+    ("landmarks add", "--coordinates"): "{out}.db --images {pictures} --coordinates {gone}",
+    ("landmarks add", "--images"): "{out}.db --images {gone} --coordinates {places}",
+    ("landmarks add", "DB"): "{gone} --images {pictures} --coordinates {places}",
     ("model init", "MODEL"): "{gone}.onnx",
     ("model show", "MODEL"): "{gone}.toml",
-    ("info", "--vehicle"): "{log} --vehicle {gone}",
-    ("decode", "--vehicle"): "{log} -o {out} --vehicle {gone}",
-    ("detect", "--vehicle"): "{log} -o {out} --vehicle {gone}",
-    ("detect", "--detectors"): "{log} -o {out} --detectors {gone}.toml",
-    ("replay", "--vehicle"): "{log} -o {out} --vehicle {gone}",
-    ("replay", "--detectors"): "{log} -o {out} --vehicle {car} --detectors {gone}.toml",
-    ("estimate", "--vehicle"): "{run} --vehicle {gone}",
-    ("score", "--gate"): "{run} --truth {truth} --gate {gone}",
-    ("fit compass", "--vehicle"): "{log} --vehicle {gone}",
-    ("truth from-gnss", "--vehicle"): "{log} -o {out} --vehicle {gone}",
-    ("truth from-map", "--vehicle"): "{log} {streets} -o {out} --vehicle {gone}",
-    ("fit odometry", "--vehicle"): "{log} --vehicle {gone}",
-    ("fit landmarks", "--vehicle"): "--pairs {gone} --vehicle {gone}",
-    ("landmarks add", "--vehicle"): "{out}.db {log} --poses {truth} --vehicle {gone}",
-    ("landmarks match", "--vehicle"): "{db} {picture} --vehicle {gone}",
-    ("truth import", "--vehicle"): "{coco} --log {log} -o {out}.json --vehicle {gone}",
-    ("model init", "--class-names"): "{onnx} -o {there}/new.toml --class-names {gone}",
-    ("check", "--vehicle"): "{log} --vehicle {gone}",
-    ("check", "--spec"): "{log} --spec {gone}",
-    ("model fetch", "--from"): "yolox-nano --from {gone}",
-    ("study intersections", "--vehicle"): "-o {out} --vehicle {gone}",
-    ("train road", "--init"): "--data {masks} -o {out}.safetensors --init {gone}",
-    ("train road", "--measure"): "--data {masks} --measure {gone}",
-    (
-        "train mask-rcnn",
-        "--init",
-    ): "--data {coco} --images {pictures} -o {out}.safetensors --init {gone}",
     ("train mask-rcnn", "--measure"): "--data {coco} --images {pictures} --measure {gone}",
+    ("train road", "--measure"): "--data {masks} --measure {gone}",
+    ("truth import", "--export"): "{coco} --export {gone} -o {out}",
+    ("train mask-rcnn", "--val-data"): f"{MASKS} --val-data {{gone}} --val-images {{pictures}}",
+    ("train mask-rcnn", "--val-images"): f"{MASKS} --val-data {{coco}} --val-images {{gone}}",
 }
-CASES: Final = {
-    **{case: (line, 4) for case, line in INPUT_FILES.items()},
-    **{case: (line, 2) for case, line in SETTINGS_FILES.items()},
-}
+# Endings by which a file is recognised.
+ENDINGS: Final = {
+    "--labels": ".json", "ANNOTATIONS": ".json", "LABELS": ".csv", "--dbc": ".dbc",
+    "--detectors": ".toml",
+}  # fmt: skip
+# Files of settings: exit status 2, and of all others 4.
+SETTINGS: Final = {
+    "MODEL", "--card", "--class-names", "--detectors", "--from", "--gate", "--init", "--measure",
+    "--spec", "--vehicle",
+}  # fmt: skip
 # Commands that read the DBC files of a vehicle file.
 READS_DBC_FILES: Final[dict[str, str]] = {
     "decode": "{log} -o {out} --vehicle {vehicle}",
@@ -208,9 +107,24 @@ def _named_files() -> set[tuple[str, str]]:
     return {(name, option) for name, option in found if option not in {*WRITTEN, *NO_FILES}}
 
 
-def test_table_contains_every_file_argument_and_option() -> None:
-    detectors = {("detect", "--detectors"), ("replay", "--detectors")}
-    assert CASES.keys() - detectors == _named_files()
+def _line(name: str, option: str) -> str:
+    """Return a command line in which the value of one argument or option is ``{gone}``."""
+    if (name, option) in OTHER:
+        return OTHER[name, option]
+    words, gone = VALID[name].split(), f"{{gone}}{ENDINGS.get(option, '')}"
+    if option in words:
+        words[words.index(option) + 1] = gone
+    elif option.startswith("--"):
+        words += [option, gone]
+    else:
+        actions = cli.parser_of(name)[1]._actions
+        arguments = [one.metavar for one in actions if not one.option_strings]
+        words[arguments.index(option)] = gone
+    return " ".join(words)
+
+
+DETECTORS: Final = {("detect", "--detectors"), ("replay", "--detectors")}
+CASES: Final = {case: _line(*case) for case in sorted(_named_files() | DETECTORS)}
 
 
 @pytest.fixture(scope="module")
@@ -269,7 +183,7 @@ def test_unusable_input_file_is_refused_in_one_line(
 ) -> None:
     # Otherwise weights that the user has fetched would be used instead of the file.
     monkeypatch.setenv("CROSSCUE_MODELS", str(tmp_path / "models"))
-    command, (line, expected) = case[0], CASES[case]
+    command, line, expected = case[0], CASES[case], 2 if case[1] in SETTINGS else 4
     DAMAGE[damage](tmp_path / ("gone" + line.partition("{gone}")[2].partition(" ")[0]))
     if damage == "a folder" and case in FOLDERS:
         pytest.skip("expects a folder; an empty one is another error")

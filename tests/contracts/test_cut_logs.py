@@ -32,7 +32,6 @@ TIME_FILES = {
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
-    """A short simulated drive."""
     folder = tmp_path_factory.mktemp("drive")
     return write_drive(folder, DriveSettings(seed=3, blocks=1, block_m=60.0))
 

@@ -124,7 +124,6 @@ def fault_of(command: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def vehicle_of(text: str) -> Vehicle:
-    """Parse a fragment of a vehicle file."""
     return parse(text if "version =" in text else f"version = 1\n{text}", "example")
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from crosscue.eval import cli
 from support.coco import stop_signs
+from support.command_lines import VALID
 from support.empty_inputs import empty_inputs
 from support.gap_drive import BEGIN, BUS, Clock, write_drive
 from support.landmark_files import database_of
@@ -22,24 +23,7 @@ from support.refusals import refusal
 
 # A command line of each command with such options, without the option to be tested.
 BASE: Final[dict[str, str]] = {
-    "info": "{log}",
-    "convert": "{log} -o {out}.mcap",
-    "decode": "{log} -o {out} --vehicle {car}",
-    "detect": "{log} -o {out} --vehicle {car} --no-cache",
-    "replay": "{log} -o {out} --vehicle {car} --no-cache",
-    "score detector": "{run} -o {out} --labels {labels}",
-    "view": "{run} -o {out}.rrd",
-    "failures": "{run}",
-    "model init": "{weights}",
-    "fit compass": "{log} --vehicle {car}",
-    "fit odometry": "{log} --vehicle {car}",
-    "fit detector": "{run} --labels {labels}",
-    "fit landmarks": "--pairs {empty}/pairs.csv",
-    "landmarks add": "{out}.db {log} --poses {truth}",
-    "landmarks match": "{db} {empty}/a.png",
-    "truth from-gnss": "{log} -o {out}",
-    "truth from-map": "{log} {empty}/streets.osm -o {out}",
-    "truth import": "{empty}/coco.json --log {log} -o {out}.json",
+    **VALID,
     "train road": "--layouts L0 -o {out}.safetensors",
     "study intersections": "-o {out} --layouts A --runs 1 --width 160 --no-attribution",
 }
@@ -149,8 +133,12 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "empty_log": folder / "empty.mcap",
         "db": database_of(folder / "known.db", np.array([[0.0, 1.0]])),
         "runs": found["run"].parent,
-        "weights": folder / "net.onnx",
-        "labels": folder / "labels.json",
+        "onnx": folder / "net.onnx",
+        "there": folder,
+        "coco": folder / "labels.json",
+        "labels": found["empty"] / "pairs.csv",
+        "picture": found["empty"] / "a.png",
+        "streets": found["empty"] / "streets.osm",
     }
 
 

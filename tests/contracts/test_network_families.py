@@ -31,9 +31,20 @@ from support.decoder_samples import (
 )
 from support.onnx_models import bright_box_model, constant_model
 
+NAMED: Final = {"names": str(list(CLASSES))}
 SIZES: Final = pytest.mark.parametrize("size", [SIZE, TALL], ids=["wide", "tall"])
 # Families whose files another one can have as well: --kind, or the number of class names, decides.
 TWINS: Final = {"yolox": {"yolox", "yolov5"}, "pp-yoloe": {"pp-yoloe", "yolov5"}}
+
+
+def boxes_by(card: Path, size: Size, scale: int = 1) -> Detections:
+    """What a card's network finds in a black picture of a multiple of its size."""
+    width, height = scale * size[0], scale * size[1]
+    frame = Frame(0, "", np.zeros((height, width, 3), np.uint8), (width, height))
+    (found,) = build(card=str(card))([frame])
+    assert isinstance(found, Detections)
+    np.testing.assert_allclose(found.boxes_px, [scale * BOX], atol=1e-3)
+    return found
 
 
 def test_every_family_has_an_export() -> None:
@@ -68,13 +79,10 @@ def test_known_box_is_exact(tmp_path: Path, family: str, size: Size) -> None:
     net.write_bytes(export(sample, size))
 
     card = crosscue.draft_card(net, kind=sample.settings["kind"], class_names=CLASSES)
-    width, height = 2 * size[0], 2 * size[1]
-    frame = Frame(0, "", np.zeros((height, width, 3), np.uint8), (width, height))
-    (found,) = build(card=str(card.path))([frame])
 
-    assert isinstance(found, Detections)
+    found = boxes_by(card.path, size, 2)
+
     # Outputs are float32.
-    np.testing.assert_allclose(found.boxes_px, [2.0 * BOX], atol=1e-3)
     np.testing.assert_allclose(found.scores, [SCORE], atol=1e-6)
     assert found.labels == (CLASSES[CLASS],)
 
@@ -114,12 +122,7 @@ def test_number_of_coco_s_classes_decides_between_families(tmp_path: Path, size:
     card = crosscue.draft_card(net)
 
     assert card.draft.kind == "nanodet"
-    width, height = 2 * size[0], 2 * size[1]
-    frame = Frame(0, "", np.zeros((height, width, 3), np.uint8), (width, height))
-    (found,) = build(card=str(card.path))([frame])
-    assert isinstance(found, Detections)
-    np.testing.assert_allclose(found.boxes_px, [2.0 * BOX], atol=1e-3)
-    assert found.labels == ("car",)
+    assert boxes_by(card.path, size, 2).labels == ("car",)
 
 
 @pytest.mark.parametrize("shape", [(1000, 600), (600, 1000)], ids=["tall", "wide"])
@@ -198,17 +201,10 @@ def test_boxes_decide_between_corners_and_centers(
     scores = np.full((len(corner), 3), 0.01)
     scores[7, CLASS] = SCORE
     table = np.hstack([boxes, scores]).T[None].transpose(axes).astype(np.float32)
-    model = onnx.load_model_from_string(constant_model((1, 3, size[1], size[0]), {"output": table}))
-    onnx.helper.set_model_props(model, {"names": str(list(CLASSES))})
-    net.write_bytes(model.SerializeToString())
+    shape = (1, 3, size[1], size[0])
+    net.write_bytes(constant_model(shape, {"output": table}, metadata=NAMED))
 
-    card = crosscue.draft_card(net)
-    frame = Frame(0, "", np.zeros((size[1], size[0], 3), np.uint8), size)
-    (found,) = build(card=str(card.path))([frame])
-
-    assert isinstance(found, Detections)
-    np.testing.assert_allclose(found.boxes_px, [BOX], atol=1e-3)
-    assert found.labels == (CLASSES[CLASS],)
+    assert boxes_by(crosscue.draft_card(net).path, size).labels == (CLASSES[CLASS],)
 
 
 def test_padding_of_an_export_with_suppression_is_no_detection(tmp_path: Path) -> None:
@@ -219,11 +215,8 @@ def test_padding_of_an_export_with_suppression_is_no_detection(tmp_path: Path) -
     net.write_bytes(constant_model((1, 3, SIZE[1], SIZE[0]), {"output": rows}))
 
     card = crosscue.draft_card(net, kind="end-to-end", class_names=CLASSES)
-    frame = Frame(0, "", np.zeros((SIZE[1], SIZE[0], 3), np.uint8), SIZE)
-    (found,) = build(card=str(card.path))([frame])
 
-    assert isinstance(found, Detections)
-    assert found.labels == (CLASSES[CLASS],)
+    assert boxes_by(card.path, SIZE).labels == (CLASSES[CLASS],)
 
 
 @pytest.mark.parametrize("outputs", ["scores", "numbers"])
@@ -233,37 +226,32 @@ def test_task_semantic_in_the_metadata_is_a_segmentation(tmp_path: Path, outputs
     values = (
         np.zeros(shape, np.float32) if outputs == "scores" else np.zeros((1, *shape[2:]), np.int64)
     )
-    model = onnx.load_model_from_string(constant_model(shape, {"semantic_logits": values}))
-    onnx.helper.set_model_props(model, {"names": "['road', 'car', 'sky']", "task": "semantic"})
-    net.write_bytes(model.SerializeToString())
+    metadata = {"names": "['road', 'car', 'sky']", "task": "semantic"}
+    net.write_bytes(constant_model(shape, {"semantic_logits": values}, metadata=metadata))
 
     assert crosscue.draft_card(net).draft.kind == "segmentation"
 
 
-def test_decoded_yolox_with_names_gets_its_own_pixels(tmp_path: Path) -> None:
-    """LibreYOLO's YOLOX stores class names; a row for each cell is YOLOX's, not YOLOv5's."""
+@pytest.mark.parametrize(
+    ("output", "metadata", "pixels"),
+    [
+        # LibreYOLO's YOLOX stores class names; a row for each cell is YOLOX's, not YOLOv5's.
+        ("output", NAMED, {"colour": "bgr", "scale": None}),
+        # YOLOv6 has a row for each cell as YOLOX with decoding; its output is called outputs.
+        ("outputs", {}, {"colour": "rgb", "fit": "letterbox-center"}),
+    ],
+)
+def test_families_with_a_row_for_each_cell_get_their_own_pixels(
+    tmp_path: Path, output: str, metadata: dict[str, str], pixels: dict[str, str | None]
+) -> None:
     net = tmp_path / "net.onnx"
     rows = np.zeros((1, len(cell_grid(SIZE, (8, 16, 32))[0]), 8), np.float32)
-    model = onnx.load_model_from_string(constant_model((1, 3, SIZE[1], SIZE[0]), {"output": rows}))
-    onnx.helper.set_model_props(model, {"names": str(list(CLASSES))})
-    net.write_bytes(model.SerializeToString())
+    net.write_bytes(constant_model((1, 3, SIZE[1], SIZE[0]), {output: rows}, metadata=metadata))
 
     (guess,) = [one for one in guesses(read_interface(net)) if one.settings["kind"] == "yolov5"]
 
     assert guess.input is not None
-    assert (guess.input["colour"], guess.input.get("scale")) == ("bgr", None)
-
-
-def test_yolov6_gets_its_own_pixels(tmp_path: Path) -> None:
-    """YOLOv6 has a row for each cell as YOLOX with decoding; its output is called outputs."""
-    net = tmp_path / "net.onnx"
-    rows = np.zeros((1, len(cell_grid(SIZE, (8, 16, 32))[0]), 8), np.float32)
-    net.write_bytes(constant_model((1, 3, SIZE[1], SIZE[0]), {"outputs": rows}))
-
-    (guess,) = [one for one in guesses(read_interface(net)) if one.settings["kind"] == "yolov5"]
-
-    assert guess.input is not None
-    assert (guess.input["colour"], guess.input["fit"]) == ("rgb", "letterbox-center")
+    assert {name: guess.input.get(name) for name in pixels} == pixels
 
 
 @pytest.mark.parametrize("background", [0, 2])

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import pytest
 
-MODULE: Final = '''
+MODULE: Final = """
 import csv, json
 from pathlib import Path
 import numpy as np
@@ -27,53 +27,19 @@ def count(boxes, vehicle, cue):
     return sum(found.labels.count("zebra") for found in boxes)
 
 
-class Lines:
-    """A reader of ten lines: time in ns and a number in each."""
-
-
-    def __init__(self, path, limits):
-        self.path = path
-        self.format = "line-drive" if path.is_dir() else "lines"
-        self.lines = (path / "drive.lines" if path.is_dir() else path).read_text().splitlines()
-
-    @property
-    def topics(self):
-        from crosscue.replay.columns import Topic
-        return (Topic("/value", "crosscue/Table", "columns", declared=len(self.lines)),)
-
-    def read(self, ledger, selection=None):
-        from crosscue.replay.columns import Block, Table
-        from crosscue.replay.ledger import NOT_ASKED_TIME, NOT_ASKED_TOPIC
-        ledger.declare("/value", len(self.lines))
-        good = []
-        for line in self.lines:
-            try:
-                t_ns, value = line.split()
-                good.append((int(t_ns), float(value)))
-            except ValueError:
-                ledger.drop("/value", "line not understood", 1, line)
-        ledger.find("/value", len(good))
-        if selection is not None and not selection.wants("/value"):
-            ledger.skip("/value", NOT_ASKED_TOPIC, len(good))
-            return
-        start = -1 << 62 if selection is None or selection.start_ns is None else selection.start_ns
-        end = 1 << 62 if selection is None or selection.end_ns is None else selection.end_ns
-        wanted = [row for row in good if start <= row[0] < end]
-        ledger.skip("/value", NOT_ASKED_TIME, len(good) - len(wanted))
-        if wanted:
-            t_ns, values = zip(*wanted)
-            yield Block("/value", np.array(t_ns, np.int64), Table({"value": np.array(values)}))
-
-    def close(self): ...
-    def __enter__(self): return self
-    def __exit__(self, *rest): ...
+def row_of(line):
+    t_ns, value = line.split()
+    return int(t_ns), float(value)
 
 
 def open_lines(path, limits):
-    return Lines(path, limits)
+    from crosscue.replay.readers.text_log import TextLog
+    return TextLog(path, "lines", "/value", ["value"], row_of)
 
 
-open_drive = open_lines
+def open_drive(path, limits):
+    from crosscue.replay.readers.text_log import TextLog
+    return TextLog(path / "drive.lines", "line-drive", "/value", ["value"], row_of)
 
 
 def truth(log, folder):
@@ -85,7 +51,7 @@ def truth(log, folder):
 def build(**settings):
     from support.detecting import build
     return build(**settings)
-'''
+"""
 POINTS: Final = """
 [crosscue.detectors]
 bright = dummy_package:build

@@ -1,15 +1,19 @@
 """Finished runs below one folder: two made-up drives, each with two settings."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
-from crosscue.eval.runs.folder import RunFolder, write_manifest
+import pyarrow.parquet as pq
+
+from crosscue.eval.runs.folder import RunFolder, create, write_manifest
 from crosscue.eval.runs.manifest import ApproachRow, LogRow, SceneSummary
+from crosscue.eval.scoring.by_drive import DriveMetric, by_drive_table
 from crosscue.replay.files.log_identity import Identity
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .manifests import estimate_manifest
+from .manifests import estimate_manifest, estimated
 from .scoring import run_folder
 
 # Threshold ``fusion.established`` of the runs in each folder.
@@ -17,7 +21,6 @@ ESTABLISHED: Final = {"a": 0.9, "b": 0.3}
 
 
 def approach_row(number: int, detected_m: float | None) -> ApproachRow:
-    """Summary of an approach in a run."""
     return ApproachRow(
         number=number,
         start_ns=1_000_000_000,
@@ -31,7 +34,6 @@ def approach_row(number: int, detected_m: float | None) -> ApproachRow:
 
 
 def scene(*approaches: ApproachRow) -> SceneSummary:
-    """Summary of a scene with the given approaches."""
     return SceneSummary(
         frames=50,
         positive={},
@@ -63,6 +65,15 @@ def add_run(path: Path, drive: str, established: float = 0.9, **changes: Any) ->
     return run_folder(path, **(content | changes))
 
 
+def scored_run(path: Path, parts: Iterable[DriveMetric], **changes: Any) -> RunFolder:
+    """Write a run with nothing but the metrics of its drive."""
+    run = create(path, overwrite=False)
+    write_manifest(run, estimated(**changes))
+    run.file("score").mkdir()
+    pq.write_table(by_drive_table(iter(parts)), run.file("score/by_drive.parquet"))
+    return run
+
+
 def runs_below(folder: Path) -> Path:
     """Write runs ``a/monday``, ``a/tuesday``, ``b/monday`` and ``b/tuesday`` below a folder."""
     for name, established in ESTABLISHED.items():
@@ -72,5 +83,4 @@ def runs_below(folder: Path) -> Path:
 
 
 def change(run: RunFolder, **changes: Any) -> None:
-    """Replace parts of a run's manifest."""
     write_manifest(run, estimate_manifest(run).model_copy(update=changes))

@@ -430,13 +430,12 @@ SAMPLES: Final[dict[str, Callable[[], Sample]]] = {
 EVERY: Final[dict[str, Callable[[Size], Sample]]] = {**_FAMILIES, **VARIANTS}
 
 
-def export(sample: Sample, size: Size = SIZE) -> bytes:
+def export(sample: Sample, size: Size = SIZE, metadata: Mapping[str, str] | None = None) -> bytes:
     """An ONNX file with these outputs."""
     outputs = {
         name: values if values.dtype.kind == "i" else values.astype(np.float32)
         for name, values in sample.outputs.items()
     }
     shapes = {name: shape or input_shape(sample, size) for name, shape in sample.inputs.items()}
-    return constant_model(
-        input_shape(sample, size), outputs, shapes, is_bytes=sample.layout == "nhwc"
-    )
+    shape, is_bytes = input_shape(sample, size), sample.layout == "nhwc"
+    return constant_model(shape, outputs, shapes, is_bytes=is_bytes, metadata=metadata)

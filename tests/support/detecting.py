@@ -1,12 +1,13 @@
 """A simple detector, invalid variants of it, and a card for the real YOLOX-nano."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from crosscue.detectors.base import Detections, Found, Frame, View
+from crosscue.detectors.box_detector import BoxDetector, ScoredBox
 from crosscue.detectors.catalog.class_names import COCO_80
 from crosscue.detectors.settings import Settings, identity_of, settings_of
 
@@ -42,6 +43,16 @@ class BrightBlob:
         box = [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]]
         boxes = np.array(box, np.float64)
         return Detections(frame.t_ns, frame.size_px, boxes, np.ones(1), ("bright",), (b"",))
+
+
+class Nothing(BoxDetector):
+    """A detector that finds nothing."""
+
+    name, labels, view = "nothing", ("car",), View(is_grey=True)
+
+    def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
+        """Yield no box."""
+        yield from ()
 
 
 def build(**settings: object) -> BrightBlob:

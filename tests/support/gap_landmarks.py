@@ -23,5 +23,4 @@ class PlaceByNumber(NearnessMatcher):
 
 
 def matcher(_camera: CameraGeometry) -> PlaceByNumber:
-    """Build the matcher, as the vehicle file specifies."""
     return PlaceByNumber(5.0)

@@ -72,7 +72,6 @@ def detected(camera: str, detectors: dict[str, str], **changes: Any) -> DetectMa
 
 
 def estimate_manifest(run: RunFolder) -> EstimateManifest:
-    """Return the manifest of a finished run."""
     found = run.manifest()
     assert isinstance(found, EstimateManifest)
     return found

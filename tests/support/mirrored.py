@@ -59,14 +59,12 @@ def vehicle_of(vehicle: Vehicle, size_px: tuple[int, int]) -> Vehicle:
 
 
 def mask_of(mask: bytes, size_px: tuple[int, int]) -> bytes:
-    """Return a mirrored mask."""
     if not mask:
         return mask
     return rle.encode_mask(rle.decode_mask(mask, size_px)[:, ::-1], (0, 0), size_px)
 
 
 def detections_of(found: Detections) -> Detections:
-    """Return mirrored detections."""
     boxes_px = found.boxes_px.copy()
     boxes_px[:, [0, 2]] = found.size_px[0] - boxes_px[:, [2, 0]]
     return replace(
@@ -78,7 +76,6 @@ def detections_of(found: Detections) -> Detections:
 
 
 def frame_of(frame: FrameDetections) -> FrameDetections:
-    """Return a mirrored frame."""
     road = frame.road
     if isinstance(road, RoadMask):
         road = replace(road, mask=mask_of(road.mask, road.mask_size_px))
@@ -94,7 +91,6 @@ def frame_of(frame: FrameDetections) -> FrameDetections:
 
 
 def state_of(state: MobileyeState) -> MobileyeState:
-    """Return a mirrored state of a Mobileye."""
     obstacles, lanes = state.obstacles, state.lanes
     if obstacles is not None:
         obstacles = obstacles.copy()

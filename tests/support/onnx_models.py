@@ -19,6 +19,7 @@ def constant_model(
     inputs: Mapping[str, tuple[int, ...]] | None = None,
     *,
     is_bytes: bool = False,
+    metadata: Mapping[str, str] | None = None,
 ) -> bytes:
     """A network that returns the same outputs for every input of a shape.
 
@@ -27,6 +28,7 @@ def constant_model(
         outputs: Outputs by name.
         inputs: Shapes of all inputs by name, instead.
         is_bytes: True for inputs of bytes.
+        metadata: What the exporter noted, such as names of classes.
     """
     nodes = [
         helper.make_node("Constant", [], [name], value=numpy_helper.from_array(values))
@@ -43,7 +45,7 @@ def constant_model(
         helper.make_tensor_value_info(name, kind, sides)
         for name, sides in (inputs or {"images": shape}).items()
     ]
-    return _file(helper.make_graph(nodes, "constant", given, declared))
+    return _file(helper.make_graph(nodes, "constant", given, declared), metadata)
 
 
 def open_model(

@@ -160,5 +160,4 @@ def _block(name: str, stream: Stream, begins_s: float) -> Block:
 
 
 def examined(streams: Streams, vehicle: Vehicle = CAR) -> QualityDrive:
-    """The drive as the checks see it."""
     return examine_drive([log_of(streams)], vehicle, EVERYTHING)

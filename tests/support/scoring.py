@@ -26,7 +26,6 @@ ENTER: Final = 40
 
 
 def at(frame: int) -> int:
-    """Time of a frame."""
     return 1_000_000_000 + frame * STEP_NS
 
 
@@ -87,7 +86,6 @@ def true_ranges(approaches: Sequence[Approach]) -> TrueRanges:
 
 
 def _table(types: Mapping[str, str], rows: Sequence[Sequence[object]]) -> pa.Table:
-    """Return a table of rows, with the names and types of its columns."""
     schema = pa.schema([(name, pa.type_for_alias(kind)) for name, kind in types.items()])
     return pa.Table.from_pylist([dict(zip(types, row, strict=True)) for row in rows], schema)
 
@@ -177,7 +175,6 @@ CUES: Final[Mapping[str, Mapping[int, int]]] = {
 
 
 def good_tables() -> RunTables:
-    """Tables of a valid run."""
     return tables(CUES, belief_table(BELIEF), range_table(8, 45, 0.5), frames=50)
 
 

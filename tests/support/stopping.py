@@ -28,10 +28,8 @@ class Stopping:
 
 
 def interrupted() -> Stopping:
-    """Build a detector that stops like Control-C."""
     return Stopping(signal.SIGINT)
 
 
 def terminated() -> Stopping:
-    """Build a detector that stops like ``kill``."""
     return Stopping(signal.SIGTERM)

@@ -103,35 +103,24 @@ def test_unreadable_runs_are_left_out_and_reported(tmp_path: Path) -> None:
     assert {row["run"]: row["reason"] for row in listed} == found.left_out
 
 
-def test_damaged_table_is_left_out_but_its_run_is_kept(tmp_path: Path) -> None:
-    for name in ("good", "gone", "torn"):
+def test_damaged_tables_are_left_out_but_their_runs_are_kept(tmp_path: Path) -> None:
+    for name in ("good", "gone", "torn", "pages"):
         add_run(tmp_path / name, name)
     found = crosscue.catalog(tmp_path)
     (tmp_path / "gone/belief.parquet").unlink()
     (tmp_path / "torn/belief.parquet").write_bytes(b"PAR1")
-
-    rows = found.query("select distinct run from belief").to_pylist()
-
-    assert rows == [{"run": "good"}]
-    assert found.left_out.keys() == {"gone", "torn"}
-    assert "belief.parquet: deleted" in found.left_out["gone"]
-    assert len(found.select("true")) == 3
-
-
-def test_table_with_damaged_data_pages_is_left_out(tmp_path: Path) -> None:
-    for name in ("good", "torn"):
-        add_run(tmp_path / name, name)
-    path = tmp_path / "torn/belief.parquet"
+    path = tmp_path / "pages/belief.parquet"
     content = bytearray(path.read_bytes())
     content[100:160] = bytes(255 - byte for byte in content[100:160])
     path.write_bytes(content)
-    found = crosscue.catalog(tmp_path)
 
     rows = found.query('select run, count("left") as n, sum(t_ns) > 0 as ok from belief group by 1')
 
     assert rows.to_pylist() == [{"run": "good", "n": 50, "ok": True}]
-    assert found.left_out.keys() == {"torn"}
-    assert "belief.parquet: damaged" in found.left_out["torn"]
+    assert found.left_out.keys() == {"gone", "torn", "pages"}
+    assert "belief.parquet: deleted" in found.left_out["gone"]
+    assert "belief.parquet: damaged" in found.left_out["pages"]
+    assert len(found.select("true")) == 4
 
 
 def test_wall_time_comes_from_timings_file_which_may_be_missing_or_damaged(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from crosscue.eval.scoring.by_drive import DriveMetric, by_drive_table
 from crosscue.replay.errors import UsageError
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
+from support.catalog_runs import scored_run
 from support.commands import json_of, output_of
 from support.manifests import estimated
 from support.refusals import refusal
@@ -184,15 +185,11 @@ def scored_runs(folder: Path, right: Sequence[int], first: int = 0) -> list[Path
     """Write a run of each drive that found the given number of 20 signs, half at dusk."""
     found = []
     for number, count in enumerate(right, first):
-        run = create(folder / f"{folder.name}-{number}", overwrite=False)
-        write_manifest(run, estimated())
-        (run.path / "score").mkdir()
         parts = [
             DriveMetric(f"drive {number}", RECALL, "mean", float(count), 20),
             DriveMetric(f"drive {number}", DUSK, "mean", float(count // 2), 10),
         ]
-        pq.write_table(by_drive_table(iter(parts)), run.path / "score" / "by_drive.parquet")
-        found.append(run.path)
+        found.append(scored_run(folder / f"{folder.name}-{number}", parts).path)
     return found
 
 

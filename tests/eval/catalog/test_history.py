@@ -2,18 +2,18 @@
 
 import os
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from crosscue.eval import cli
-from crosscue.eval.runs.folder import create, write_manifest
+from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tags import write_tags
-from crosscue.eval.scoring.by_drive import DriveMetric, by_drive_table
+from crosscue.eval.scoring.by_drive import DriveMetric
+from support.catalog_runs import scored_run
 from support.commands import output_of
-from support.manifests import estimated
 from support.refusals import refusal
 from support.scoring import log_row
 
@@ -28,22 +28,19 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(2)
     for at, model in enumerate(MODELS):
         for drive in range(8):
-            run = create(folder / f"{9 - at}-{drive}", overwrite=False)
+            path = folder / f"{9 - at}-{drive}"
             log = folder / f"drive{drive}.mcap"
             log.write_text(f"drive {drive}")
-            write_manifest(run, estimated(logs=(log_row(log, run),)))
-            os.utime(run.path / "manifest.json", (1.7e9 + at, 1.7e9 + at))
-            write_tags(run.path, {"model": model})
-            if (model, drive) == ("m3", 7):
-                continue
             right = 70.0 + 2.0 * drive + rng.integers(0, 3) - 15.0 * (at >= 2)
             parts = [
                 DriveMetric(f"drive {drive}", RECALL, "mean", right, 100),
                 DriveMetric(f"drive {drive}", BRIER, "mean", 5.0 + rng.normal(), 100),
                 DriveMetric(f"drive {drive}", "cues.stop_sign.positives", "sum", 9.0, 1),
             ]
-            (run.path / "score").mkdir()
-            pq.write_table(by_drive_table(iter(parts)), run.path / "score" / "by_drive.parquet")
+            run = scored_run(path, parts, logs=(log_row(log, RunFolder(path)),))
+            os.utime(run.path / "manifest.json", (1.7e9 + at, 1.7e9 + at))
+            write_tags(run.path, {"model": model})
+    shutil.rmtree(run.path / "score")
     return folder
 
 

@@ -25,7 +25,6 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def kinds_of(*files: Path | str) -> list[str | None]:
-    """Return the kind of each file."""
     return [row.kind for row in crosscue.check(*files)]
 
 

@@ -43,11 +43,8 @@ def _zeros(*shape: int) -> Array:
 
 
 def _write_export(folder: Path, kind: str, metadata: Mapping[str, str]) -> Path:
-    model = onnx.load_model_from_string(export(SAMPLES[kind]()))
-    onnx.helper.set_model_props(model, dict(metadata))
-    path = folder / "my.onnx"
-    path.write_bytes(model.SerializeToString())
-    return path
+    (folder / "my.onnx").write_bytes(export(SAMPLES[kind](), metadata=metadata))
+    return folder / "my.onnx"
 
 
 METADATA = "task: detect\nimgsz:\n- 64\n- 128\nnames:\n  0: person\n  1: car\n  2: stop sign\n"

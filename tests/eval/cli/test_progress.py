@@ -29,7 +29,6 @@ def replaced_stderr(monkeypatch: pytest.MonkeyPatch) -> Terminal:
 
 
 def shown_text(line: ProgressLine, terminal: Terminal) -> str:
-    """Return the text that the terminal shows."""
     assert line._bar is not None
     terminal.truncate(0)
     line._bar.refresh()

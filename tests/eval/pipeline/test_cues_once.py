@@ -60,17 +60,14 @@ class Road:
 
 
 def first() -> GreyNumber:
-    """Build the first detector."""
     return GreyNumber()
 
 
 def second() -> Second:
-    """Build the second detector."""
     return Second()
 
 
 def road() -> Road:
-    """Build the detector of road."""
     return Road()
 
 

@@ -101,14 +101,12 @@ def replay(town: Town, run: Path, *more: str) -> RunFolder:
 
 @pytest.fixture(scope="module")
 def found(town: Town, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """The drive replayed with the landmarks."""
     run = tmp_path_factory.mktemp("found") / "run"
     return replay(town, run, "--landmarks", str(town.database))
 
 
 @pytest.fixture(scope="module")
 def without(town: Town, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
-    """The drive replayed without landmarks."""
     return replay(town, tmp_path_factory.mktemp("without") / "run")
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 
 import crosscue
-from crosscue.detectors.base import Frame, View
-from crosscue.detectors.box_detector import BoxDetector, ScoredBox
 from crosscue.eval import cli
 from crosscue.eval.fit.annotated_runs import read_annotated
 from crosscue.replay.errors import UsageError
@@ -21,21 +18,11 @@ from support.street_map import write_crossing, write_map
 SPEED = '[topics]\nodometry = "oxts/ins_speed"\n'
 
 
-class NothingSeen(BoxDetector):
-    """A detector that finds nothing, named as text below."""
-
-    name, labels, view = "nothing", ("car",), View(is_grey=True)
-
-    def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
-        """Yield no box."""
-        yield from ()
-
-
 def _replayed(folder: Path, setting: str) -> Path:
     """Replay 28 m of a drive toward a crossing with arms to the left and straight on."""
     (folder / "car.toml").write_text(f"version = 1\n{setting}\n{SPEED}")
     argv = ["replay", raw_drive(folder / "kitti"), "--vehicle", folder / "car.toml"]
-    argv += ["--detectors", f"{__name__}:NothingSeen", "--no-cache", "-q", "-o", folder / "run"]
+    argv += ["--detectors", "support.detecting:Nothing", "--no-cache", "-q", "-o", folder / "run"]
     assert cli.run([str(one) for one in argv]) in (0, 3)
     return folder / "run"
 
@@ -95,6 +82,6 @@ def test_a_map_that_cannot_be_used_is_refused_in_one_line(
     write_map(tmp_path / "streets.osm", {"a": (0.0, 0.0), "b": (9.0, 0.0)}, [("ab", "")])
     (tmp_path / "car.toml").write_text(f"version = 1\n{setting}\n{SPEED}")
     argv = ["replay", raw_drive(tmp_path / "kitti"), "--vehicle", tmp_path / "car.toml"]
-    argv += ["--detectors", f"{__name__}:NothingSeen", "--no-cache", "-o", tmp_path / "run"]
+    argv += ["--detectors", "support.detecting:Nothing", "--no-cache", "-o", tmp_path / "run"]
 
     assert said in refusal(4 if "none" in setting else 2, *argv)

@@ -103,17 +103,14 @@ class Road:
 
 
 def busy() -> Busy:
-    """Build the detector of objects."""
     return Busy()
 
 
 def signs() -> Signs:
-    """Build the detector of signs."""
     return Signs()
 
 
 def road() -> Road:
-    """Build the detector of road."""
     return Road()
 
 

@@ -1,7 +1,7 @@
 """Drives of pictures alone: odometry and roads from the pictures, through detect and estimate."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,6 @@ import pytest
 import crosscue
 from crosscue.detectors import rle
 from crosscue.detectors.base import Frame, RoadMask, View
-from crosscue.detectors.box_detector import ScoredBox
 from crosscue.detectors.catalog.fetch import fetch_weights
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.pipeline.scene.road_picture import plans_of
@@ -18,6 +17,7 @@ from crosscue.eval.report.frame_pictures import draw_pictures
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import EstimateManifest, SceneSummary
 from support.data import shared
+from support.detecting import Nothing
 from support.pictures import picture_log
 from support.plane_pictures import CAMERA, SIZE_PX, arc, picture
 
@@ -32,16 +32,6 @@ x_m = {CAMERA.x_m}
 z_m = {CAMERA.z_m}
 pitch_rad = {CAMERA.pitch_rad}
 """
-
-
-class Nothing(crosscue.BoxDetector):
-    """A detector that finds nothing."""
-
-    name, labels = "nothing", ("nothing",)
-
-    def boxes_in(self, frame: Frame) -> Iterator[ScoredBox]:
-        """Yield no boxes."""
-        yield from ()
 
 
 class LowerHalf:

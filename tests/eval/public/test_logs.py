@@ -18,7 +18,6 @@ from support.every_format import EVERY_FORMAT
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
-    """A short simulated drive."""
     return write_drive(tmp_path_factory.mktemp("drive"), DriveSettings(seed=3, blocks=1))
 
 

@@ -10,7 +10,6 @@ from crosscue.detectors.signs.templates import draw_sign
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
-    """A short simulated drive."""
     return crosscue.simulate_drive(tmp_path_factory.mktemp("drive") / "d", seed=3, blocks=2)
 
 
@@ -33,6 +32,14 @@ def test_run_exposes_its_tables_and_notices(run: crosscue.Run) -> None:
     assert lines[-len(notes) :] == notes
     with pytest.raises(crosscue.errors.RunError, match="there are: "):
         run["nonsense"]
+
+
+def test_manifest_is_printed_with_one_field_per_line(run: crosscue.Run) -> None:
+    head, *lines = repr(run.manifest).splitlines()
+
+    assert head == "EstimateManifest"
+    assert [line.split()[0] for line in lines] == [*type(run.manifest).model_fields]
+    assert max(map(len, lines)) < 130
 
 
 def test_run_is_scored_and_printed(drive: DriveFiles, run: crosscue.Run) -> None:

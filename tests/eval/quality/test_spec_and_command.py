@@ -24,12 +24,10 @@ from support.quality_logs import Drive, Streams, log_of, streams_of
 
 
 def summary_of(streams: Streams) -> LogSummary:
-    """Summary of a log in memory."""
     return summarise_log(log_of(streams))
 
 
 def faults(spec: Path, streams: Streams) -> set[str]:
-    """Requirements that do not hold."""
     return {name for name, why in spec_faults(read_spec(spec), [summary_of(streams)]) if why}
 
 

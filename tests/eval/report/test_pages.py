@@ -84,7 +84,6 @@ def test_truth_on_a_picture_names_no_cue_of_a_map(tmp_path: Path) -> None:
 
 
 def _commands(page: Path) -> list[list[str]]:
-    """Return the words of the commands that a page prints."""
     text = page.read_text(encoding="utf-8")
     found = re.findall(r"<code>(crosscue [^<]*)</code>", text)
     return [shlex.split(html.unescape(command))[1:] for command in found]

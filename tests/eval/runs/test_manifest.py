@@ -57,13 +57,6 @@ def test_single_drive_commands_refuse_merged_run_in_one_line(command: str, tmp_p
     assert "many drives" in refusal(1, command, merged)
 
 
-def _run_with_changed_manifest(run: RunFolder, **changes: Any) -> RunFolder:
-    write_manifest(run, estimated())
-    path = run.file("manifest.json")
-    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-    return run
-
-
 @pytest.mark.parametrize(("text", "message"), [("{", "unreadable"), ("[1]", "format None")])
 def test_manifest_that_is_no_object_is_refused(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "manifest.json").write_text(text)
@@ -87,7 +80,10 @@ def test_manifest_that_is_no_object_is_refused(tmp_path: Path, text: str, messag
 def test_invalid_manifest_is_refused_in_one_line(
     changes: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
-    run = _run_with_changed_manifest(create(tmp_path / "run", overwrite=False), **changes)
+    run = create(tmp_path / "run", overwrite=False)
+    write_manifest(run, estimated())
+    path = run.file("manifest.json")
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
     with pytest.raises(RunError, match=message) as error:
         open_run(run.path)

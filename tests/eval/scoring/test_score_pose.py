@@ -10,11 +10,12 @@ from crosscue.datasets.truth.truth import Truth, save
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar, write_tum
 from crosscue.eval.drives.score import score_run
 from crosscue.eval.pipeline.whole_run import replay_drive
+from crosscue.eval.recording import save_rrd as save_recording
 from crosscue.eval.report.opening import judged_sentences
 from crosscue.eval.report.summary import pose_summary, scores_text
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
-from crosscue.eval.scoring.pose.score import PoseScore, load_truth
+from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
 from crosscue.eval.scoring.runs import pooled_scores
 from crosscue.eval.studies.town.replayed import score_pose
 from crosscue.replay.errors import SchemaError
@@ -138,6 +139,15 @@ def test_malformed_truth_is_refused(tmp_path: Path, text: str, message: str) -> 
 
     with pytest.raises(SchemaError, match=message):
         load_truth(tmp_path / "truth.json")
+
+
+def test_recording_with_truth_is_larger_than_without(tmp_path: Path) -> None:
+    run, path, _ = _scored(tmp_path)
+    save_recording(run, tmp_path / "plain.rrd")
+    save_recording(run, tmp_path / "truth.rrd", truth_track(path, run))
+
+    sizes = [(tmp_path / f"{name}.rrd").stat().st_size for name in ("plain", "truth")]
+    assert 10_000 < sizes[0] < sizes[1]
 
 
 def test_nees_is_not_computed_without_common_frame(tmp_path: Path) -> None:

@@ -162,19 +162,9 @@ def test_study_has_100_layouts_with_two_drives_each() -> None:
 
 
 def beliefs(p: float) -> list[DriveBelief]:
-    n = 4
-    return [
-        DriveBelief(
-            f"M{i}-01",
-            f"M{i}",
-            dict.fromkeys(FEATURES, i % 2 == 0),
-            np.linspace(30.0, 3.0, n),
-            np.full((n, len(FEATURES)), p),
-            np.full(n, False),
-            np.full(n, False),
-        )
-        for i in range(6)
-    ]
+    one = dict.fromkeys(FEATURES, p)
+    there = [dict.fromkeys(FEATURES, i % 2 == 0) for i in range(6)]
+    return [belief(one, features, f"M{i}") for i, features in enumerate(there)]
 
 
 def scores() -> LayoutScores:

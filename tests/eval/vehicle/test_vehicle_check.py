@@ -56,7 +56,6 @@ def test_steering_is_compared_without_offset_at_a_ratio_of_15() -> None:
 
 
 def write_vehicle(path: Path, camera: str) -> Path:
-    """Write a vehicle file with a camera section."""
     path.write_text(f"version = 1\n[camera]\n{camera}\n")
     return path
 
