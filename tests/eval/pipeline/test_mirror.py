@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from crosscue.datasets.scenes.drive import write_scene
+from crosscue.datasets.scenes.faulty_labels import DETECTORS, LABEL_IMAGES
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.detectors import rle
@@ -39,6 +40,8 @@ OBJECTS: Final = (
     ("one way right", 0.85, 0.0, 0.36, 0.08, 0.06),
     ("do not enter", 0.4, 0.0, 0.34, 0.06, 0.1),
 )
+# A drive on which cars come from beyond the intersection, go there, and move in a leg.
+CARS: Final = SceneSettings("M7806", camera=SceneCamera(width_px=480, height_px=270))
 SIGNS: Final = ("one way left", "one way right", "do not enter")
 PERIOD_NS: Final = 5_000_000_000
 
@@ -127,6 +130,16 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     return open_run(folder / "run")
 
 
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
+    """A simulated drive whose objects and road are the renderer's, with faults."""
+    folder = tmp_path_factory.mktemp("labelled")
+    files = write_scene(folder / "drive", CARS, imager=LABEL_IMAGES)
+    argv = ["replay", str(files.log), "--vehicle", str(files.vehicle), "--no-cache"]
+    assert run([*argv, "--detectors", DETECTORS, "-o", str(folder / "run")]) == 0
+    return open_run(folder / "run")
+
+
 def both(drive_run: RunFolder, changes: Mapping[str, Any]) -> tuple[Rows, Rows]:
     """Rows of a run, exchanged, and those of the run in a mirror."""
     manifest = drive_run.drive_manifest()
@@ -148,6 +161,10 @@ def both(drive_run: RunFolder, changes: Mapping[str, Any]) -> tuple[Rows, Rows]:
     return rows_of(straight, size_px[0]), mirrored
 
 
+def positive(rows: Rows) -> set[str]:
+    return {row["cue"] for row in rows["cues"] if row["count"]}
+
+
 CHANGES: Final[dict[str, dict[str, Any]]] = {
     "published rules": {},
     "tracks": {
@@ -155,22 +172,36 @@ CHANGES: Final[dict[str, dict[str, Any]]] = {
         "cues": {"kind": "tracks"},
         "fusion": {"kind": "persistent"},
     },
-    "ranges from motion": {"ranges": {"kind": "motion"}},
-    "accumulated road": {"regions": {"kind": "area"}, "fusion": {"kind": "persistent"}},
+}
+REAL: Final = {
+    "regions": {"kind": "area"},
+    "cues": {"kind": "tracks"},
+    "fusion": {"kind": "persistent"},
+}
+CHANGES_OF_CARS: Final[dict[str, dict[str, Any]]] = {
+    "rules of real drives": {
+        **REAL,
+        "cars": {"kind": "tracks", "leg_traffic": True},
+        "ranges": {"kind": "motion"},
+    },
+    "road by its shape": {**REAL, "camera": {"focal_px": None}},
 }
 
 
-def test_simulated_drive_in_a_mirror_is_mirrored_and_shows_every_cue(simulated: RunFolder) -> None:
+def test_simulated_drive_in_a_mirror_is_mirrored_and_shows_every_cue(
+    simulated: RunFolder, labelled: RunFolder
+) -> None:
     seen: set[str] = set()
-    for name, changes in CHANGES.items():
-        expected, mirrored = both(simulated, changes)
-        assert expected["belief"], name
-        assert differences(expected, mirrored) == [], name
-        seen |= {row["cue"] for row in mirrored["cues"] if row["count"]}
+    for drive_run, some in ((simulated, CHANGES), (labelled, CHANGES_OF_CARS)):
+        for name, changes in some.items():
+            expected, mirrored = both(drive_run, changes)
+            assert expected["belief"], name
+            assert differences(expected, mirrored) == [], name
+            # A cue of one side is that of the other in the mirror.
+            seen |= positive(mirrored) | {exchanged(cue) for cue in positive(mirrored)}
 
-    # Cars beyond an intersection and in its legs need one whose range is known: see real drives.
-    unseen = BUILTIN_CUES.keys() - seen
-    assert {BUILTIN_CUES[cue].group for cue in unseen} <= {"cars_past", "leg_traffic", "map"}
+    # Maps have a mirror of their own, see test_road_map.
+    assert {BUILTIN_CUES[cue].group for cue in BUILTIN_CUES.keys() - seen} == {"map"}
 
 
 def test_mirror_finds_a_rule_that_assumes_a_side(
