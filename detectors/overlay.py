@@ -120,7 +120,7 @@ def draw_frame(
     picture: Encoded,
     found: Sequence[Found],
     counts: Mapping[str, int],
-    regions: Callable[[tuple[int, int]], Iterable[NDArray[np.float64] | None]],
+    regions: Callable[[tuple[int, int]], Iterable[NDArray[np.float64]]],
     width_px: int,
     truth: TrueMarks = NOTHING_TRUE,
 ) -> Bytes:
@@ -130,8 +130,8 @@ def draw_frame(
         picture: Encoded picture of the frame.
         found: Result of each detector; without any, nothing is drawn.
         counts: Number of objects of each cue.
-        regions: Returns the regions' corners, shape (N, 2) each or None, for a picture of the given
-            width and height. They are drawn only if a detector found road.
+        regions: Returns the regions' corners, shape (N, 2) each, for a picture of the given width
+            and height. They are drawn only if a detector found road.
         width_px: Displayed width of the picture; lines and text are sized to be legible there.
         truth: Drawn in the colour of the truth.
 
@@ -151,8 +151,7 @@ def draw_frame(
                     _line(canvas, line, FOUND, enlarge)
     has_road = any(isinstance(one, RoadMask) for one in found)
     for region in regions(size) if has_road else ():
-        if region is not None:
-            _line(canvas, np.vstack([region, region[:1]]), PALE, enlarge)
+        _line(canvas, np.vstack([region, region[:1]]), PALE, enlarge)
     for label, (x0, y0, x1, y1) in truth.boxes:
         corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
         _line(canvas, corners, TRUE, 2.0 * enlarge)
@@ -169,7 +168,7 @@ def _line(
 ) -> None:
     import cv2
 
-    # A region may reach far beyond the picture; OpenCV needs numbers that fit.
+    # A true box may reach far beyond the picture; OpenCV needs numbers that fit.
     far = 4.0 * max(canvas.shape[:2])
     whole = np.rint(np.clip(points, -far, far)).astype(np.int32).reshape(-1, 1, 2)
     cv2.polylines(canvas, [whole], False, colour, max(round(enlarge), 1), cv2.LINE_AA)

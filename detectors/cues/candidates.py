@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 SAME_OBJECT: Final = "found by another detector with a better score"
 BELOW_SCORE: Final = "below score"
 TOO_LITTLE_ROAD: Final = "too little road"
-REGION_NOT_SEEN: Final = "region not seen: its place unknown, or too far to be resolved"
+REGION_NOT_SEEN: Final = "not seen: hidden, too far, or never in view"
 NOT_FROM_THE_SIDE: Final = "not seen from the side"
 NOT_FOUND_BEFORE: Final = "not found in the frame before"
 OTHER_MOTION: Final = "moves or faces otherwise"

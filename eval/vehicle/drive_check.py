@@ -85,7 +85,7 @@ def _line(
     scale: float,
 ) -> None:
     high, wide = canvas.shape[:2]
-    # A polygon may extend far beyond the picture, but OpenCV's coordinates are limited.
+    # A line of the grid may extend far beyond the picture, but OpenCV's coordinates are limited.
     clipped = np.clip(points, -4.0 * max(high, wide), 4.0 * max(high, wide))
     places = np.rint(clipped * 16).astype(np.int32).reshape(-1, 1, 2)
     thick = max(1, round(2 * scale))
