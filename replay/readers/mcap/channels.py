@@ -14,7 +14,7 @@ from crosscue.replay.columns import Topic
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.chunks.rows import Definition
 
-from .records import Channel, Op, Schema, read_channel, read_schema
+from .records import BrokenRecordError, Channel, Op, Schema, read_channel, read_schema
 
 # Topic of messages whose channel is not declared.
 UNKNOWN: Final = ""
@@ -122,6 +122,17 @@ class Declarations:
             return self._channels.get(channel.id, channel) != channel
         schema = read_schema(found.content)
         return self._schemas.get(schema.id, schema) != schema
+
+    def has(self, found: Definition) -> bool:
+        """Return whether ``found`` repeats a valid schema or channel."""
+        try:
+            if found.opcode == Op.CHANNEL:
+                channel = read_channel(found.content)
+                return self._channels.get(channel.id) == channel
+            schema = read_schema(found.content)
+        except BrokenRecordError:
+            return False
+        return self._schemas.get(schema.id) == schema
 
     def declare(self, found: Definition) -> None:
         """Declare a schema or channel from here on.

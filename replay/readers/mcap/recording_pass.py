@@ -289,7 +289,7 @@ class SegmentPass:
             first.whole[first.begin : last.end],
             [(at.begin - first.begin, at.end - first.begin, of.messages) for of, at in waiting],
         )
-        if rows is None or rows.definitions:
+        if rows is None or not all(map(self._declarations.has, rows.definitions)):
             return None
         for (chunk, _), times in zip(waiting, rows.times, strict=True):
             self._count_verification(chunk, rows, times)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 
+from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 from crosscue.replay.readers.mcap.reader import McapLog
 from support.mcap_conformance import Conformance, suite
@@ -67,6 +68,19 @@ def test_one_name_with_two_types_becomes_separate_topics_with_notice(tmp_path: P
     assert types == {"/x": ("a/B", 2), "/x#2": ("c/D", 1), "/x#3": ("a/B", 1)}
     assert [payload for *_, payload in reading.messages["/x"]] == [b"1", b"3"]
     assert any("/x#2" in notice for notice in reading.ledger.notices)
+
+
+def test_chunks_are_read_together_though_the_first_one_repeats_definitions(tmp_path: Path) -> None:
+    """Writers put schemas and channels into a chunk; each block of its own costs time."""
+    chunks = [ChunkOf([message(1, at, b"x"), message(2, at, b"y")]) for at in (2, 3)]
+    first = ChunkOf([*DEFINITIONS, message(1, 1, b"x"), message(2, 1, b"y")])
+    path = tmp_path / "x.mcap"
+    path.write_bytes(McapFile([first, *chunks]).coded())
+
+    with McapLog(path, Limits()) as log:
+        sizes = [(block.topic, len(block)) for block in log.read(Ledger(str(path)))]
+
+    assert sizes == [("/a", 3), ("/b", 3)]
 
 
 @pytest.mark.parametrize("is_chunked", [True, False])

@@ -13,9 +13,9 @@ import zstandard
 
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
-from crosscue.replay.readers.mcap.chunks.inflate import inflate_prefix
+from crosscue.replay.readers.mcap.chunks.inflate import inflate_chunk, inflate_prefix
 from crosscue.replay.readers.mcap.reader import McapLog
-from crosscue.replay.readers.mcap.records import ChunkHead
+from crosscue.replay.readers.mcap.records import BrokenRecordError, ChunkHead
 from support.mcap_damage import Kind, copies, judge, sound_files, sound_parts
 from support.mcap_files import (
     MAGIC,
@@ -269,3 +269,35 @@ def test_cut_chunk_whose_frame_declares_more_than_the_chunk_has_no_message(
 
     assert found(len(records)) > 0
     assert found(len(records) - 1) == 0
+
+
+@pytest.mark.parametrize("is_linked", [True, False])
+@pytest.mark.parametrize("is_checked", [True, False])
+@pytest.mark.parametrize("block_size", [4, 5, 7])
+def test_lz4_frames_of_all_kinds_are_read_as_by_the_lz4_library(
+    is_linked: bool, is_checked: bool, block_size: int
+) -> None:
+    """Flipped bits and cuts too, without a checksum of the chunk."""
+    rng = np.random.default_rng(block_size)
+    parts = [rng.bytes(90_000), bytes(150_000), rng.bytes(50) * 2000, rng.bytes(200_000)]
+    records = b"".join(parts)
+    options = {"block_linked": is_linked, "content_checksum": is_checked}
+    whole = lz4.frame.compress(records, block_size=block_size, **options)
+    read = 0
+    for at in [0, *rng.integers(0, len(whole), 100).tolist(), *range(16)]:
+        body = bytearray(whole)
+        body[at] ^= int(rng.integers(0, 2)) << int(rng.integers(0, 8))
+        del body[len(body) if at % 3 else at :]
+        try:
+            wanted = lz4.frame.decompress(bytes(body))
+        except (RuntimeError, ValueError):
+            wanted = b""
+        head = ChunkHead(0, 0, len(records), 0, "lz4", 0, len(body))
+        room = np.empty(len(records) + 1, np.uint8)
+        try:
+            found = inflate_chunk(np.frombuffer(body, np.uint8), head, room).tobytes()
+        except BrokenRecordError:
+            found = b""
+        assert found == (wanted if len(wanted) == len(records) else b"")
+        read += len(found) > 0
+    assert read > 10

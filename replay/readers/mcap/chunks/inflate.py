@@ -19,6 +19,11 @@ if TYPE_CHECKING:
 UNKNOWN_SIZES: Final = (-1, 0)
 # Small steps keep what precedes damage. The lz4 library also allocates memory for each.
 STEP: Final = 256 << 10
+# Bits of an lz4 frame's flags and of a block's length, and the reach of a block into earlier ones.
+_LZ4_DICTIONARY: Final = 1
+_LZ4_SIZE: Final = 8
+_LZ4_STORED: Final = 1 << 31
+_LZ4_WINDOW: Final = 64 << 10
 # The zstd library copies what it decompresses once more, unless a frame's room is passed at once.
 AT_ONCE: Final = 1 << 62
 
@@ -99,24 +104,59 @@ def _decompressor() -> zstandard.ZstdDecompressor:
 
 
 def _fill_lz4(body: Bytes, size: int, room: Bytes, _: int) -> tuple[int, str]:
+    """Decompress block by block, because the library copies a frame's stored blocks twice."""
+    import lz4.block
+    import lz4.frame
+
+    done, view, out = 0, body.data, room.data
+    try:
+        frame = lz4.frame.get_frame_info(view)
+        declared, most = frame["content_size"], frame["block_size"]
+        if declared not in (*UNKNOWN_SIZES, size):
+            return 0, f"its lz4 frame declares {declared} bytes, the chunk {size}"
+        if frame["content_checksum"] or frame["block_checksum"] or view[4] & _LZ4_DICTIONARY:
+            return _stream_lz4(view, size, out)
+        window = _LZ4_WINDOW if frame["block_linked"] else 0
+        at = 15 if view[4] & _LZ4_SIZE else 7
+        while done <= size and at + 4 <= len(view):
+            length = int.from_bytes(view[at : at + 4], "little")
+            if not length:
+                return done, ""
+            is_stored, length = length & _LZ4_STORED, length & ~_LZ4_STORED
+            part: bytes | memoryview = view[at + 4 : at + 4 + length]
+            at += 4 + length
+            if length > most:
+                return done, f"lz4: a block of {length} bytes"
+            if not is_stored and at <= len(view):
+                past = out[max(0, done - window) : done]
+                part = lz4.block.decompress(part, uncompressed_size=most, dict=past)
+            elif not is_stored:
+                break
+            step = min(len(part), size + 1 - done)
+            out[done : done + step] = part[:step]
+            done += step
+    except (RuntimeError, ValueError, EOFError, lz4.block.LZ4BlockError) as error:
+        return done, f"lz4: {error}"
+    return done, f"its lz4 frame does not end after {done} bytes"
+
+
+def _stream_lz4(view: memoryview, size: int, out: memoryview) -> tuple[int, str]:
+    """Decompress a frame of any kind by the library, which verifies the frame's checksums."""
     import lz4.frame
 
     done, used, is_done = 0, 0, False
-    view, context = body.data, lz4.frame.create_decompression_context()
-    try:
-        declared = lz4.frame.get_frame_info(view)["content_size"]
-        if declared not in (*UNKNOWN_SIZES, size):
-            return 0, f"its lz4 frame declares {declared} bytes, the chunk {size}"
-        while not is_done and done <= size:
+    context = lz4.frame.create_decompression_context()
+    while not is_done and done <= size:
+        try:
             step, taken, is_done = lz4.frame.decompress_chunk(
                 context, view[used:], max_length=min(size + 1 - done, STEP)
             )
-            if not step and not taken:
-                break
-            room[done : done + len(step)] = np.frombuffer(step, dtype=np.uint8)
-            done, used = done + len(step), used + taken
-    except (RuntimeError, ValueError, EOFError) as error:
-        return done, f"lz4: {error}"
+        except (RuntimeError, ValueError, EOFError) as error:
+            return done, f"lz4: {error}"
+        if not step and not taken:
+            break
+        out[done : done + len(step)] = step
+        done, used = done + len(step), used + taken
     return done, "" if is_done else f"its lz4 frame does not end after {done} bytes"
 
 

@@ -30,7 +30,7 @@ AHEAD: Final = 2
 # Maximum total size of the groups that are loaded ahead.
 AHEAD_BYTES: Final = 32 << 20
 # Maximum total size of a group of chunks: a block of many rows takes little longer than one of few.
-GROUP_BYTES: Final = 7 << 20
+GROUP_BYTES: Final = 8 << 20
 GROUP_CHUNKS: Final = 64
 # Size up to which a checksum is computed at once.
 SMALL_BYTES: Final = 1 << 20
