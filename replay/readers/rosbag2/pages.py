@@ -39,6 +39,8 @@ _INTERIOR_HEAD: Final = 12
 _DEEPEST: Final = 20
 _LOT_BYTES: Final = BLOCK_BYTES // 2
 _CHAIN_BYTES: Final = 1 << 20
+# Half of the parts that a system call accepts.
+_CHAIN_PAGES: Final = 512
 # Number of zeros after the last page, so that a cell that exceeds its page can be examined.
 _PADDING: Final = 256
 _VARINT_BYTES: Final = 9
@@ -159,8 +161,11 @@ class _Pages:
         if self._size < 512 or self._usable < 480:
             raise _UnusualError
         self._count = os.fstat(self._file).st_size // self._size
-        self._scratch = np.empty(max(1, _CHAIN_BYTES // self._size) * self._size, np.uint8)
-        self._run = len(self._scratch) // self._size
+        self._reserved, self._room = head[20], self._usable - 4
+        self._run = min(_CHAIN_PAGES, max(1, _CHAIN_BYTES // self._size))
+        aside = np.empty((self._run, head[20] + 4), np.uint8)
+        self._asides = [row.data for row in aside for _ in range(2)]
+        self._after = aside[:, -4:].view(">u4")[:, 0]
         self._left = 3 * self._count
         self._highest = -(2**63)
 
@@ -231,11 +236,11 @@ class _Pages:
         edges = [0, *(np.flatnonzero(np.diff(leaves) != 1) + 1).tolist(), len(leaves)]
         for first, stop in pairwise(edges):
             target = buffer[first * self._size : stop * self._size]
-            self._fill(target, int(leaves[first]))
+            self._fill([target.data], (int(leaves[first]) - 1) * self._size, len(target))
         return buffer
 
-    def _fill(self, target: Bytes, page: int) -> None:
-        if os.preadv(self._file, [target.data], (page - 1) * self._size) < len(target):
+    def _fill(self, parts: list[memoryview], at: int, size: int) -> None:
+        if os.preadv(self._file, parts, at) < size:
             raise _UnusualError
 
     def _cells(self, buffer: Bytes, pages: int) -> tuple[_Cells, bool]:
@@ -323,39 +328,27 @@ class _Pages:
 
     def _follow(self, page: int, target: Bytes) -> None:
         """Fill ``target`` from a chain of pages, which are mostly consecutive in the file."""
-        room, done = self._usable - 4, 0
+        done = 0
         while done < len(target):
-            count = min(-(-(len(target) - done) // room), self._run, self._count + 1 - page)
+            left = -(-(len(target) - done) // self._room)
+            count = min(left, self._run, self._count + 1 - page)
             if page <= 1 or count < 1:
                 raise _UnusualError
-            if count == 1 and len(target) - done <= room:
-                page = self._last(page, target[done:])
-                break
-            lot = self._scratch[: count * self._size]
-            self._fill(lot, page)
-            pages = lot.reshape(count, self._size)
-            after = pages[:, :4].copy().view(">u4")[:, 0]
+            # Without a copy: each page's payload goes to its place, the next page's number aside.
+            stop = min(done + count * self._room, len(target))
+            parts = self._asides[: 2 * count]
+            parts[1::2] = [
+                target.data[at : min(at + self._room, stop)] for at in range(done, stop, self._room)
+            ]
+            size = stop - done + count * (self._size - self._room)
+            self._fill(parts, (page - 1) * self._size - self._reserved, size)
+            after = self._after[:count]
             good = min(count, _first(after != np.arange(page + 1, page + count + 1)) + 1)
-            # Row by row into the target: one copy of each payload.
-            whole = min(good, (len(target) - done) // room)
-            begin, done = done, done + whole * room
-            target[begin:done].reshape(whole, room)[:] = pages[:whole, 4 : self._usable]
-            if whole < good:
-                begin, done = done, len(target)
-                target[begin:] = pages[whole, 4 : 4 + done - begin]
+            done = min(done + good * self._room, stop)
             page = int(after[good - 1])
-            longest = len(self._scratch) // self._size
-            self._run = min(longest, 2 * self._run) if good == count else good
+            self._run = min(len(self._after), 2 * self._run) if good == count else good
         if page:
             raise _UnusualError
-
-    def _last(self, page: int, target: Bytes) -> int:
-        """Fill ``target`` from one page, and return the number of the next page."""
-        content = os.pread(self._file, self._size, (page - 1) * self._size)
-        if len(content) < self._size:
-            raise _UnusualError
-        target[:] = np.frombuffer(content, np.uint8, len(target), 4)
-        return int.from_bytes(content[:4], "big")
 
 
 def _shifted(buffer: Bytes, kind: str) -> NDArray[np.integer]:
@@ -391,6 +384,8 @@ def _integers(
     words: NDArray[np.integer], end: Int64s, size: Int64s, serial: NDArray[np.uint8]
 ) -> Int64s:
     """Parse signed integers of up to eight bytes that end at ``end``."""
+    if np.minimum.reduce(size, initial=8) == 8:
+        return words[end - 8].astype(np.int64)
     shift = 8 * (8 - np.clip(size, 1, 8))
     value = words[np.maximum(end - 8, 0)].astype(np.int64)
     value = (value << shift) >> shift
