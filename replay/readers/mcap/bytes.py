@@ -22,7 +22,7 @@ STEP: Final = 256 << 10
 # Maximum number of buffers kept for reuse.
 KEPT: Final = 8
 # Maximum size of a buffer that is kept for reuse.
-KEPT_BYTES: Final = 8 << 20
+KEPT_BYTES: Final = 17 << 20
 
 
 class Buffers:

@@ -359,7 +359,7 @@ def _shifted(buffer: Bytes, kind: str) -> NDArray[np.integer]:
 
 def _first(marked: NDArray[np.bool_]) -> int:
     """Return the index of the first True, or the length if all are False."""
-    return int(marked.argmax()) if marked.any() else len(marked)
+    return int(marked.argmax()) if np.count_nonzero(marked) else len(marked)
 
 
 def _varint(buffer: Bytes, at: Int64s) -> tuple[Int64s, Int64s]:

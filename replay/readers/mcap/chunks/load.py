@@ -29,9 +29,11 @@ WORKERS: Final = 1
 AHEAD: Final = 2
 # Maximum total size of the groups that are loaded ahead.
 AHEAD_BYTES: Final = 32 << 20
-# Maximum total size of a group of chunks: a block of many rows takes little longer than one of few.
-GROUP_BYTES: Final = 8 << 20
+# Maxima of a group of chunks: a block of many rows takes little longer than one of few, as long as
+# its columns fit into the processor's cache.
+GROUP_BYTES: Final = 16 << 20
 GROUP_CHUNKS: Final = 64
+GROUP_ROWS: Final = 1 << 15
 # Size up to which a checksum is computed at once.
 SMALL_BYTES: Final = 1 << 20
 # Compression ratio above which decompression takes longer than the handover to a thread.
@@ -60,6 +62,7 @@ class ChunkGroup:
         chunks: The chunks.
         begins: Offset of each chunk's records in ``whole``.
         size: Total size of the records in bytes.
+        rows: Number of their messages, by the indexes.
         whole: Buffer of the records, once the first chunk is loaded.
         future: The records or the error of each chunk, if another thread loads them.
     """
@@ -67,6 +70,7 @@ class ChunkGroup:
     chunks: list[UnreadChunk] = field(default_factory=list)
     begins: list[int] = field(default_factory=list)
     size: int = 0
+    rows: int = 0
     whole: Bytes | None = None
     future: Future[list[ChunkRecords | BrokenRecordError]] | None = None
 
@@ -75,6 +79,7 @@ class ChunkGroup:
         self.chunks.append(chunk)
         self.begins.append(self.size)
         self.size += _size(chunk)
+        self.rows += _rows(chunk)
 
     def has_room_for(self, chunk: UnreadChunk) -> bool:
         """Return whether ``chunk`` can be loaded together with the others."""
@@ -82,7 +87,9 @@ class ChunkGroup:
             return True
         if not _is_plain_case(chunk) or not _is_plain_case(self.chunks[-1]):
             return False
-        return len(self.chunks) < GROUP_CHUNKS and self.size + _size(chunk) <= GROUP_BYTES
+        if len(self.chunks) == GROUP_CHUNKS or self.rows + _rows(chunk) > GROUP_ROWS:
+            return False
+        return self.size + _size(chunk) <= GROUP_BYTES
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,6 +251,10 @@ class Loader:
 
 def _size(chunk: UnreadChunk) -> int:
     return 0 if chunk.head is None else chunk.head.size
+
+
+def _rows(chunk: UnreadChunk) -> int:
+    return sum(len(index.entries) for index in chunk.messages)
 
 
 def _is_plain_case(chunk: UnreadChunk) -> bool:
