@@ -242,7 +242,14 @@ class Approaches:
         ahead = evidence.roads_ahead
         gone = [ahead.get(cue) is False for cue in current.roads]
         others = any(evidence.counts.get(cue, 0) > 0 for cue in self._first if cue not in ahead)
-        if not any(gone) or others or evidence.signs or evidence.posteriors or moved.is_standing:
+        if not any(gone) or moved.is_standing:
+            return None
+        if others or evidence.signs or evidence.posteriors:
+            if all(gone) and isinstance(current.model, PersistentMessageModel):
+                # The roads were those of a street before the intersection that is still ahead.
+                undone = current.model.withdraw(current.roads | evidence.weights.keys())
+                current.belief = multiply(current.belief, undone)
+                current.roads = frozenset()
             return None
         if any(is_ahead and cue not in current.roads for cue, is_ahead in ahead.items()):
             return "another ahead"

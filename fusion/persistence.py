@@ -25,8 +25,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from crosscue.fusion.situation import Situation
@@ -78,7 +78,7 @@ class Persistence:
 
 @dataclass(slots=True)
 class _Sent:
-    """Position of one cue's last message, in units of its fade, and its greatest weight."""
+    """Position of one cue's last message, its greatest weight, and the sum of its messages."""
 
     positive_at: float = -math.inf
     heaviest: float = 0.0
@@ -135,7 +135,19 @@ class PersistentMessageModel:
             if line.sent.held_back and self._speaking - {line.cue.name}:
                 for feature, odds in line.detected:
                     out[feature] += line.sent.held_back * odds
+                line.sent.given += line.sent.held_back
                 line.sent.held_back = 0.0
+        return out
+
+    def withdraw(self, cues: Collection[str]) -> list[float]:
+        """Forget what positive cues said, which was about another place; return what undoes it."""
+        out = [0.0] * self._size
+        for i, line in enumerate(self._lines):
+            if line.cue.name in cues:
+                for feature, odds in line.detected:
+                    out[feature] -= line.sent.given * odds
+                self._lines[i] = replace(line, sent=_Sent())
+        self._speaking.difference_update(cues)
         return out
 
     def _add_messages(
@@ -158,10 +170,10 @@ class PersistentMessageModel:
             self._speaking.add(line.cue.name)
             limit, says = line.cue.at_most, log_odds(line.cue.precision)
             if limit is not None and says > 0.0 and self._speaking == {line.cue.name}:
-                room = max(log_odds(limit) - line.sent.given, 0.0)
-                wanted, worth = worth, min(worth, room / says)
+                room = max(log_odds(limit) / says - line.sent.given, 0.0)
+                wanted, worth = worth, min(worth, room)
                 line.sent.held_back += wanted - worth
-                line.sent.given += worth * says
+            line.sent.given += worth
         for feature, odds in line.detected if is_positive else line.absent:
             out[feature] += worth * odds
 
@@ -174,7 +186,7 @@ def _why_silent(cue: CueNode, situation: Situation) -> str | None:
     return None
 
 
-def _lines_of(graph: FactorGraph, dissent: float) -> tuple[_Line, ...]:
+def _lines_of(graph: FactorGraph, dissent: float) -> list[_Line]:
     place = {name: i for i, name in enumerate(graph.feature_names)}
     against = log_odds(dissent)
     lines = []
@@ -186,4 +198,4 @@ def _lines_of(graph: FactorGraph, dissent: float) -> tuple[_Line, ...]:
             (place[e.feature], against) for e in edges if cue.absence_counts and e.is_direct
         )
         lines.append(_Line(cue, detected, absent))
-    return tuple(lines)
+    return lines

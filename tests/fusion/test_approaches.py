@@ -578,6 +578,19 @@ def test_approach_goes_on_while_its_end_is_not_seen(gone: list[FrameEvidence]) -
     assert {one.approach for one in steps} == {1}
 
 
+def test_street_that_is_passed_before_a_light_is_no_leg_of_the_lights_intersection() -> None:
+    light = [by_shape(i, light=1, left=-1.0, right=-1.0) for i in range(5, 12)]
+    following = [by_shape(i, light=1, left=3.0, right=-1.0) for i in range(12, 17)]
+
+    steps = run_steps([*STREET, *light, *following], approaches(Vehicle(version=1).fusion))
+
+    assert {one.approach for one in steps} == {1}
+    assert steps[4].probabilities["left"] > 0.9
+    assert [one.probabilities["left"] for one in steps[5:12]] == pytest.approx([0.5] * 7)
+    assert steps[5].probabilities["intersection"] == pytest.approx(0.5)
+    assert steps[-1].probabilities["left"] == pytest.approx(steps[4].probabilities["left"])
+
+
 def test_light_before_which_no_road_was_seen_is_not_passed_for_want_of_roads() -> None:
     frames = [by_shape(i, light=int(i < 5), left=-1.0, right=-1.0) for i in range(12)]
     steps = run_steps(frames, approaches(Vehicle(version=1).fusion))

@@ -12,11 +12,14 @@ import crosscue
 from crosscue.detectors import rle
 from crosscue.detectors.base import Frame, RoadMask, View
 from crosscue.detectors.cues.observed import NOT_SEEN, FrameDetections, RoadFractions
+from crosscue.detectors.cues.road_layout import LogOdds
 from crosscue.detectors.cues.road_openings import Legs, Seen
 from crosscue.eval.pipeline.scene.roads import BY_SHAPE, Roads
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
+from crosscue.fusion.factor_graph import log_odds
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.camera import Camera
+from crosscue.replay.vehicle.fusion import OPENING_PRECISION
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle, parse
 from support.pictures import picture_log
 from support.road_masks import LEFT, RIGHT, ROAD, seen_from
@@ -93,6 +96,20 @@ def test_without_a_focal_length_the_mask_alone_shows_roads_and_gives_no_range() 
     assert uncalibrated.with_shape(evidence(None)).weights["road_right"] > 1.0
     uncalibrated.restart()
     assert uncalibrated.with_shape(evidence(None)) == evidence(None)
+
+
+@pytest.mark.parametrize(("odds", "is_seen"), [(1.2, False), (1.3, True), (5.0, True)])
+def test_a_road_that_the_shape_shows_is_believed(odds: float, is_seen: bool) -> None:
+    """Also just above the least log odds: a message is worth what such messages proved to be."""
+    seen = roads(camera=Camera())
+    seen._shape = LogOdds(odds, -1.0, odds + 1.0, odds)
+    found = seen.with_shape(evidence(None))
+
+    believed = {cue: log_odds(OPENING_PRECISION) * one for cue, one in found.weights.items()}
+    assert (found.roads_ahead.get("road_left") is True) is is_seen
+    assert (believed["road_left"] > log_odds(0.9)) is is_seen
+    assert believed["road_straight"] == believed["road_left"]
+    assert believed["road_left"] >= odds
 
 
 def test_an_opening_supports_the_intersection_unless_the_method_or_the_file_says_otherwise() -> (
