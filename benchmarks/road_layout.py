@@ -10,7 +10,7 @@ another order, so the file is not reproduced byte by byte.
 Longer training changes little: 480 s with this form, 6,400 steps, raise the recall of roads to the
 left and right above log odds of 2 from 0.39 and 0.35 to 0.45 and 0.39 on 2,048 other simulated
 masks, with false positives of 0.005 to 0.008 as before, and find 19 of 41 legs in place of 18 on
-the real drives kept aside. A road drawn without errors falls from 2.5 to 1.5, so the first file
+real drives, by that limit. A road drawn without errors falls from 2.5 to 1.5, so the first file
 stays.
 """
 
