@@ -234,6 +234,14 @@ class RoadMask:
     mask: bytes
     mask_size_px: tuple[int, int]
 
+    def runs(self) -> NDArray[np.int64]:
+        """Decode the lengths of the runs of other ground and road, down the columns.
+
+        Raises:
+            ValueError: As ``pixels``.
+        """
+        return rle.checked_runs(self.mask, self.mask_size_px)
+
     def pixels(self) -> NDArray[np.bool_]:
         """Decode the mask, shape (height, width); True where a pixel is road.
 

@@ -70,7 +70,7 @@ def runs(text: bytes) -> NDArray[np.int64]:
     last = np.flatnonzero(is_last)
     values: NDArray[np.int64] = ((codes[last] ^ _SIGN).astype(np.int64)) - _SIGN
     if len(last) < len(codes):
-        _prepend(values, codes, np.flatnonzero(~is_last).tolist(), text)
+        values = _joined(codes, last, text)
     values[1::2] = values[1::2].cumsum()
     values[2::2] = values[2::2].cumsum()
     if values.min() < 0:
@@ -78,26 +78,18 @@ def runs(text: bytes) -> NDArray[np.int64]:
     return values
 
 
-def _prepend(
-    values: NDArray[np.int64], codes: NDArray[np.uint8], places: list[int], text: bytes
-) -> None:
-    """Add the lower five-bit groups, at ``places``, to the group that ends each value.
-
-    Successive runs mostly differ by less than 16 pixels, so there are few such groups and a loop
-    is faster than ten calls.
-    """
-    low, groups, before = 0, 0, -1
-    for number, place in enumerate(places):
-        if place != before + 1:
-            low, groups = 0, 0
-        low |= (int(codes[place]) & 0x1F) << (5 * groups)
-        groups += 1
-        before = place
-        if groups >= _LONGEST:
-            raise ValueError(f"not a compressed mask, a run is too long: {text[:20]!r}")
-        if number + 1 == len(places) or places[number + 1] != place + 1:
-            owner = place - number
-            values[owner] = (int(values[owner]) << (5 * groups)) + low
+def _joined(codes: NDArray[np.uint8], last: NDArray[np.intp], text: bytes) -> NDArray[np.int64]:
+    """Join the five-bit groups of each value, whose last groups are at the places ``last``."""
+    first = np.zeros_like(last)
+    first[1:] = last[:-1] + 1
+    counts = last - first + 1
+    if counts.max() > _LONGEST:
+        raise ValueError(f"not a compressed mask, a run is too long: {text[:20]!r}")
+    groups = (codes & 0x1F).astype(np.int64)
+    # The last group has a sign.
+    groups[last] = (groups[last] ^ _SIGN) - _SIGN
+    groups <<= 5 * (np.arange(len(codes)) - first.repeat(counts))
+    return np.asarray(np.add.reduceat(groups, first), np.int64)
 
 
 def area_px(text: bytes) -> int:
@@ -135,12 +127,17 @@ def decode_mask(text: bytes, size_px: tuple[int, int]) -> NDArray[np.bool_]:
         ValueError: As ``column_heights_px``.
     """
     width, height = size_px
-    lengths = _checked(text, size_px)
+    lengths = checked_runs(text, size_px)
     is_object = np.arange(len(lengths)) % 2 == 1
     return np.repeat(is_object, lengths).reshape(width, height).T
 
 
-def _checked(text: bytes, size_px: tuple[int, int]) -> NDArray[np.int64]:
+def checked_runs(text: bytes, size_px: tuple[int, int]) -> NDArray[np.int64]:
+    """Decode the runs of the whole picture.
+
+    Raises:
+        ValueError: As ``column_heights_px``.
+    """
     lengths = runs(text)
     _check_pixels(int(lengths.sum()), size_px)
     return lengths

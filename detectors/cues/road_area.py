@@ -81,6 +81,7 @@ class RoadArea:
     _road: NDArray[np.float32] = field(init=False)
     _seen: NDArray[np.float32] = field(init=False)
     _xy_m: Floats = field(init=False)
+    _scratch: NDArray[np.float32] = field(init=False)
     _heading: float = 0.0
 
     def __post_init__(self) -> None:
@@ -90,6 +91,7 @@ class RoadArea:
         """Forget everything."""
         self._road = np.zeros((CELLS, CELLS), np.float32)
         self._seen = np.zeros((CELLS, CELLS), np.float32)
+        self._scratch = np.empty((6, CELLS * CELLS), np.float32)
         self._xy_m = np.zeros(2)
         self._heading = 0.0
 
@@ -118,40 +120,57 @@ class RoadArea:
         rows, columns, dx_m, dy_m = self._ahead()
         cos, sin = math.cos(self._heading), math.sin(self._heading)
         camera, (width, height) = self.camera, road.size_px
+        # Arrays of the grid's size are used again, as memory of that size is slow to get.
+        held = self._scratch[:, : len(dx_m) * len(dy_m)].reshape(-1, len(dx_m), len(dy_m))
+        ahead_m, left_m, scale, x, y, weight = held
 
-        def sums(ahead: float, left: float, up: float) -> NDArray[np.float32]:
+        def sums(ahead: float, left: float, up: float, out: NDArray[np.float32]) -> None:
             """Weighted sum of each cell's place from the camera."""
             along = (ahead * cos - left * sin) * dx_m - ahead * camera.x_m - left * camera.y_m
             across = (ahead * sin + left * cos) * dy_m - up * camera.z_m
-            return along.astype(np.float32)[:, None] + across.astype(np.float32)
+            np.add(along.astype(np.float32)[:, None], across.astype(np.float32), out=out)
 
-        ahead_m, left_m = sums(1.0, 0.0, 0.0), sums(0.0, 1.0, 0.0)
+        sums(1.0, 0.0, 0.0, ahead_m)
+        sums(0.0, 1.0, 0.0, left_m)
         in_reach = (ahead_m > NEAREST_M) & (ahead_m < self._far_m - camera.x_m)
-        in_reach &= np.abs(left_m + camera.y_m) < ASIDE_M
+        in_reach &= np.abs(np.add(left_m, camera.y_m, out=x), out=x) < ASIDE_M
         # Ground in the camera's axes, forward, left and up, and in pixels of the mask.
         forward, left, up = turned(camera.yaw_rad, pitch_rad, camera.roll_rad).T.tolist()
         plane = GroundPlane.of(camera, road.size_px)
         mask_width, mask_height = road.mask_size_px
         across, down = mask_width / width, mask_height / height
-        scale = -plane.focal_px / np.maximum(sums(*forward), 1e-3)
+        sums(*forward, scale)
+        np.divide(-plane.focal_px, np.maximum(scale, 1e-3, out=scale), out=scale)
         # A border stands for everything out of the picture.
-        x = sums(*left) * (across * scale) + (plane.center_px[0] * across + 1.0)
-        y = sums(*up) * (down * scale) + (plane.center_px[1] * down + 1.0)
-        # Rows above the ground in reach show nothing that counts. An even number of them leaves
-        # the rounding of boxes as it is.
-        top = min(max(int(y.min(where=in_reach, initial=mask_height)) - 1, 0), mask_height - 1) & ~1
-        x, y = np.clip(x, 0.0, mask_width + 1.0), np.clip(y - top, 0.0, mask_height - top + 1.0)
+        for axis, at, size, center_px, per_px in (
+            (left, x, mask_width, plane.center_px[0], across),
+            (up, y, mask_height, plane.center_px[1], down),
+        ):
+            sums(*axis, at)
+            at *= np.multiply(scale, per_px, out=weight)
+            at += center_px * per_px + 1.0
+            np.clip(at, 0.0, size + 1.0, out=at)
+        # Rows above the ground in reach show nothing that counts.
+        weight.fill(mask_height)
+        np.copyto(weight, y, where=in_reach)
+        top = min(max(int(weight.min()) - 1, 0), mask_height - 1)
         rows_px = (np.arange(mask_height) + 0.5) / down - plane.center_px[1]
         below = plane.focal_px * math.sin(pitch_rad) + rows_px * math.cos(pitch_rad)
         above_px = plane.focal_px * math.cos(pitch_rad) - rows_px * math.sin(pitch_rad)
         away_m = camera.z_m * above_px / np.maximum(below, 1e-3)
-        boxes_px = boxes_px * [across, down, across, down] - [0, top, 0, top]
-        shown = _shown(road.pixels()[top:], boxes_px, away_m[top:])
-        found = shown.take(x.astype(np.int32) * shown.shape[1] + y.astype(np.int32))
-        weight = SHARP_M**2 / np.maximum(ahead_m**2 + left_m**2, SHARP_M**2)
-        weight *= in_reach * WEIGHTS[found]
-        self._road[rows, columns] += weight * (found == SHOWS_ROAD)
+        shown = _shown(road, boxes_px * [across, down, across, down], away_m, top)
+        cells = x.astype(np.int32)
+        cells *= shown.shape[1]
+        cells += np.maximum(np.subtract(y, top, out=y), 0.0, out=y).astype(np.int32)
+        found = shown.take(cells)
+        np.multiply(ahead_m, ahead_m, out=weight)
+        weight += np.multiply(left_m, left_m, out=x)
+        np.divide(SHARP_M**2, np.maximum(weight, SHARP_M**2, out=weight), out=weight)
+        weight *= WEIGHTS.take(found, out=x, mode="clip")
+        weight *= in_reach
         self._seen[rows, columns] += weight
+        weight *= found == SHOWS_ROAD
+        self._road[rows, columns] += weight
 
     def plan(self, behind_m: float = 10.0, min_weight: float = 0.05) -> RoadPlan:
         """Return the plan view in the car's axes.
@@ -163,12 +182,16 @@ class RoadArea:
         ahead_m = np.arange(-behind_m, self.reach_m + self.camera.x_m, CELL_M) + 0.5 * CELL_M
         left_m = np.arange(ASIDE_M, -ASIDE_M, -CELL_M) - 0.5 * CELL_M
         cos, sin = math.cos(self._heading), math.sin(self._heading)
-        rows = _index((self._xy_m[0] + ahead_m * cos)[:, None] - left_m * sin)
-        columns = _index((self._xy_m[1] + ahead_m * sin)[:, None] + left_m * cos)
-        cells = rows * CELLS + columns
-        seen = self._seen.take(cells)
-        share = self._road.take(cells) / np.maximum(seen, 1e-9)
-        return RoadPlan(ahead_m, left_m, np.where(seen >= min_weight, share, np.nan))
+        at_m = self._scratch.view(np.float64)[0, : len(ahead_m) * len(left_m)]
+        at_m = at_m.reshape(len(ahead_m), len(left_m))
+        cells = _index(np.subtract.outer(self._xy_m[0] + ahead_m * cos, left_m * sin, out=at_m))
+        cells *= CELLS
+        cells += _index(np.add.outer(self._xy_m[1] + ahead_m * sin, left_m * cos, out=at_m))
+        seen, road = self._seen.take(cells), self._road.take(cells)
+        is_seen = seen >= min_weight
+        road /= np.maximum(seen, 1e-9, out=seen)
+        np.copyto(road, np.nan, where=~is_seen)
+        return RoadPlan(ahead_m, left_m, road)
 
     @property
     def _far_m(self) -> float:
@@ -188,37 +211,45 @@ class RoadArea:
 
 
 def _index(at_m: Floats) -> NDArray[np.int32]:
-    return np.clip((at_m + HALF_M) / CELL_M, 0, CELLS - 1).astype(np.int32)
+    """Row or column of the grid; places are changed."""
+    at_m += HALF_M
+    at_m *= 1.0 / CELL_M
+    found = at_m.astype(np.int32)
+    return np.clip(found, 0, CELLS - 1, out=found)
 
 
-def _shown(is_road: NDArray[np.bool_], boxes_px: Floats, away_m: Floats) -> NDArray[np.uint8]:
+def _shown(road: RoadMask, boxes_px: Floats, away_m: Floats, top: int = 0) -> NDArray[np.uint8]:
     """What pixels show: columns of the mask, with a border of one pixel.
 
     Args:
-        is_road: The mask.
+        road: The mask.
         boxes_px: Shape (N, 4): boxes of vehicles in its pixels.
         away_m: Distance of level ground by row.
+        top: Number of rows at the top to leave out.
     """
-    height, width = is_road.shape
-    columns = np.ascontiguousarray(is_road.T)
-    framed = np.zeros((width + 2, height + 2), np.uint8)
-    shown = framed[1:-1, 1:-1]
-    np.add(columns, np.uint8(SHOWS_GROUND), out=shown)
-    # Row after each pixel's run of pixels without road; 0 for road.
-    pixels = columns.ravel()
-    is_last = np.append(pixels[1:] != pixels[:-1], True)
-    is_last[height - 1 :: height] = True
-    stops = np.flatnonzero(is_last) + 1
-    lengths = np.diff(stops, prepend=0)
-    after = np.where(pixels[stops - 1], 0, (stops - 1) % height + 1).astype(np.uint16)
-    road_below = np.repeat(after, lengths).reshape(columns.shape)
-    # First row that is too much nearer than a row above it; so are all rows further down.
+    width, height = road.mask_size_px
+    # Runs of pixels end at the end of their column, too. Places are doubled; odd ones turn to road
+    # or back.
+    turns = 2 * road.runs().cumsum()[:-1] + 1
+    keys = np.concatenate([turns, 2 * height * np.arange(width)])
+    keys.sort()
+    starts, is_road = keys >> 1, (keys & 1).cumsum() & 1 > 0
+    first = starts % height
+    stop = first + np.diff(starts, append=width * height)
+    # For each end of a run without road, first row that is not too far behind it.
     falling_m = np.maximum.accumulate(away_m[::-1])[::-1]
-    nearer = np.searchsorted(-falling_m, BESIDE_M - away_m, side="right").astype(np.uint16)
-    shown += (road_below > nearer).view(np.uint8) * np.uint8(SHOWS_BEHIND - SHOWS_GROUND)
+    until = np.searchsorted(BESIDE_M - np.minimum.accumulate(away_m), -falling_m)
+    behind = np.where(is_road, 0, until.take(stop - 1))
+    edges = np.stack([first, np.minimum(np.maximum(behind, first), stop), stop], axis=1)
+    lengths = np.diff(np.maximum(edges, top), axis=1)
+    kinds = np.full(lengths.shape, SHOWS_BEHIND, np.uint8)
+    kinds[:, 1] = np.where(is_road, SHOWS_ROAD, SHOWS_GROUND)
+    framed = np.zeros((width + 2, height - top + 2), np.uint8)
+    shown = framed[1:-1, 1:-1]
+    shown[:] = np.repeat(kinds.ravel(), lengths.ravel()).reshape(shown.shape)
     margin = MARGIN * (boxes_px[:, 2:] - boxes_px[:, :2])
     widened = boxes_px + np.column_stack([-margin[:, 0], 0.0 * margin[:, 0], margin])
-    for x0, y0, x1, y1 in np.maximum(np.rint(widened), 0).astype(int).tolist():
+    for x0, y0, x1, y1 in np.maximum(np.rint(widened).astype(int) - [0, top, 0, top], 0).tolist():
         shown[x0:x1, y0:y1] = HIDDEN
     return framed
 

@@ -218,23 +218,26 @@ class RoadOpenings:
 
 def _edge(plan: RoadPlan, side: int) -> _Edge:
     """Follow the road outwards from the car's axis in each row."""
-    road = plan.road if side == 1 else plan.road[:, ::-1]
     left_m = plan.left_m if side == 1 else -plan.left_m[::-1]
-    is_road, is_seen = road > ROAD, np.isfinite(road)
     middle, around = int(np.argmin(np.abs(left_m))), round(STARTS_M / CELL_M)
+    # Cells further inwards than the carriageway is searched for do not count.
+    road = (plan.road if side == 1 else plan.road[:, ::-1])[:, : middle + around + 1]
+    is_road = np.ascontiguousarray(road > ROAD)
     # The nearest road to the car's axis, of two the outer one.
     aside = np.array(sorted(range(-around, around + 1), key=abs))
-    near = is_road[:, middle + aside]
-    starts = middle + aside[near.argmax(axis=1)]
+    near = is_road.take(middle + aside, axis=1)
+    starts = middle + aside.take(near.argmax(axis=1))
     # The edge is the last cell before the next one that ends the road. A gap of one cell is noise.
     ends = ~is_road
     ends[:, 2:] &= ~is_road[:, 1:-1]
-    cells, rows = np.arange(road.shape[1]), np.arange(len(road))
-    last = np.maximum.accumulate(np.where(ends, cells, -1), axis=1)[rows, starts - 1]
+    ends &= np.arange(road.shape[1]) < starts[:, None]
+    inwards = ends[:, ::-1].argmax(axis=1)
+    rows = np.arange(len(road))
+    last = np.where(ends.any(axis=1), road.shape[1] - 1 - inwards, -1)
     has_road = near.any(axis=1)
     out_m = np.where(has_road, left_m[last + 1] + 0.5 * CELL_M, np.nan)
-    is_kerb = has_road & (last >= 0) & is_seen[rows, last]
-    span = is_seen[:, middle - around // 2 : middle + around // 2 + 1]
+    is_kerb = has_road & (last >= 0) & np.isfinite(road[rows, last])
+    span = np.isfinite(road[:, middle - around // 2 : middle + around // 2 + 1])
     is_closed = ~has_road & (span.mean(axis=1) > 0.8)
     return _Edge(out_m, is_kerb, is_closed)
 

@@ -288,11 +288,12 @@ def test_pixels_show_what_is_behind_the_edge_below_them(pitch_rad: float, share:
 
     boxes_px = np.array([[2.0, 3.5, 5.0, 9.0]])
 
-    found = _shown(is_road, boxes_px, away_m)
+    road = RoadMask(0, (12, 40), rle.encode_mask(is_road, (0, 0), (12, 40)), (12, 40))
+    found = _shown(road, boxes_px, away_m)
 
-    for top in (2, 12, 38):
+    for top in (1, 12, 39):
         # Rows above those in reach are left out.
-        part = _shown(is_road[top:], boxes_px - [0, top, 0, top], away_m[top:])
+        part = _shown(road, boxes_px, away_m, top)
         assert np.array_equal(part[:, 1:], found[:, top + 1 :])
     wanted = np.full((14, 42), HIDDEN)
     for row, column in np.ndindex(40, 12):
