@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class SizePrior:
     """Lognormal prior of an object's height.
 
@@ -27,12 +28,12 @@ class SizePrior:
     mean_m: float
     spread: float
 
-    @property
+    @cached_property
     def log_var(self) -> float:
         """Variance of the logarithm."""
         return float(np.log1p(self.spread**2))
 
-    @property
+    @cached_property
     def log_mean(self) -> float:
         """Mean of the logarithm."""
         return float(np.log(self.mean_m)) - 0.5 * self.log_var
@@ -63,6 +64,7 @@ HOUSINGS: Final[Mapping[str, Housing]] = {
     "4 lenses of 0.30 m, backplate": Housing(1.68, 0.61, 0.05),
     "2 lenses of 0.30 m": Housing(0.71, 0.35, 0.02),
 }
+_COLUMNS: Final = np.array(list(HOUSINGS.values())).T.copy()
 # Spread of a box's aspect (height over width) about its housing's, in logarithms.
 ASPECT_SPREAD: Final = 0.15
 OBLIQUE: Final = 0.10
@@ -89,11 +91,9 @@ def light_size(aspect: float | None = None) -> SizePrior:
     Args:
         aspect: Positive; None where unknown, as for lights that are not upright.
     """
-    heights = np.array([one.height_m for one in HOUSINGS.values()])
-    weights = np.array([one.proportion for one in HOUSINGS.values()])
+    heights, widths, weights = _COLUMNS
     if aspect is not None:
-        shapes = np.array([one.height_m / one.width_m for one in HOUSINGS.values()])
-        off = np.log(aspect / shapes) / ASPECT_SPREAD
+        off = np.log(aspect / (heights / widths)) / ASPECT_SPREAD
         density = np.exp(-0.5 * off**2) / (ASPECT_SPREAD * np.sqrt(2.0 * np.pi))
         weights = weights * ((1.0 - OBLIQUE) * density + OBLIQUE / ANY_ASPECT)
     weights = weights / weights.sum()
