@@ -14,6 +14,7 @@ def count(boxes: Sequence[Detections], vehicle: Vehicle, cue: CueSpec) -> Count:
     """Count the detections with a cue's labels and a score above its threshold."""
     setting, score = vehicle.threshold_of(cue)
     labels = vehicle.labels_of(cue)
+    boxes = [found for found in boxes if not set(labels).isdisjoint(found.labels)]
     number = count_labels(boxes, labels, 0.0 if setting is None else score)
     return count_by_label(boxes, labels, number, setting, score)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -85,6 +85,7 @@ VEHICLES: Final[Mapping[str, SizePrior]] = {
 }
 
 
+@lru_cache(maxsize=256)
 def light_size(aspect: float | None = None) -> SizePrior:
     """Size prior of a traffic light whose box is ``aspect`` times as high as wide.
 

@@ -160,16 +160,15 @@ def _fit(
     counts = np.array([len(seen) for seen in cars])
     most = int(counts.max())
     # Shorter tracks are padded with their newest observation, without weight.
-    table = np.array(
-        [
-            [(one.t_s, *one.pose, one.distance_m, one.error, *one.edges_rad) for one in seen]
-            + [(seen[-1].t_s, *seen[-1].pose, 1.0, 1.0, 0.0, 0.0)] * (most - len(seen))
-            for seen in cars
-        ]
-    )
+    values: list[float] = []
+    for seen in cars:
+        for t_s, pose, edges_rad, distance_m, error, *_ in seen:
+            values += (t_s, *pose, distance_m, error, *edges_rad)
+        values += (seen[-1].t_s, *seen[-1].pose, 1.0, 1.0, 0.0, 0.0) * (most - len(seen))
+    table = np.array(values).reshape(len(cars), most, 8)
     is_real = (np.arange(most) < counts[:, None])[:, None, :]
-    newest = np.array([(seen[-1].t_s, *seen[-1].pose) for seen in cars])
-    late_s, x, y, heading = np.moveaxis(table[:, :, :4] - newest[:, None, :], 2, 0)[:, :, None, :]
+    newest = table[np.arange(len(cars)), counts - 1, :4]
+    late_s, x, y, heading = (table[:, :, :4] - newest[:, None, :]).transpose(2, 0, 1)[:, :, None, :]
     distance_m, error = table[:, None, :, 4], table[:, None, :, 5]
     edge = np.swapaxes(table[:, :, 6:], 1, 2)
     far_m, sight = distance_m / np.cos(edge), heading - edge
@@ -182,18 +181,19 @@ def _fit(
     weights = np.array(
         [[along * c**2 + across * s**2, turned], [turned, along * s**2 + across * c**2]]
     )
-    powers = late_s ** np.arange(3)[:, None, None, None]
-    normal = np.einsum("abkin,mkin->mkiab", weights, np.broadcast_to(powers, (3, *far_m.shape)))
+    powers = np.broadcast_to(late_s ** np.arange(3)[:, None, None, None], (3, *far_m.shape))
+    normal = np.einsum("abkin,mkin->mkiab", weights, powers)
     weighted = np.einsum("abkin,bkin->akin", weights, places)
-    pulled = [
-        np.einsum("akin,kin->kia", weighted, np.broadcast_to(p, far_m.shape)) for p in powers[:2]
-    ]
-    information = np.block([[normal[0], normal[1]], [normal[1], normal[2]]])
-    information[..., 2:, 2:] += np.diag([USUAL_MPS**-2, aside_mps**-2])
+    information = np.empty((*counts.shape, 2, 4, 4))
+    pulled = [np.einsum("akin,kin->kia", weighted, one) for one in powers[:2]]
+    for m in (0, 1):
+        information[..., 2 * m : 2 * m + 2, :2] = normal[m]
+        information[..., 2 * m : 2 * m + 2, 2:] = normal[m + 1]
+    information[..., (2, 3), (2, 3)] += (USUAL_MPS**-2, aside_mps**-2)
     covariance = np.linalg.inv(information)
     state = np.einsum("kiab,kib->kia", covariance, np.concatenate(pulled, axis=2))
     predicted = state[..., :2, None] + state[..., 2:, None] * late_s[:, :, None, :]
-    off = places - np.moveaxis(predicted, 2, 0)
+    off = places - predicted.transpose(2, 0, 1, 3)
     squares = np.einsum("akin,abkin,bkin->ki", off, weights, off)
     sd = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
     return state[..., 2:], sd[..., 2:], squares / np.maximum(2 * counts - 4, 1)[:, None]
