@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ class GroundPlane:
     to_car: NDArray[np.float64]
 
     @classmethod
+    @lru_cache(maxsize=16)
     def of(cls, camera: Camera, size_px: tuple[int, int]) -> GroundPlane:
         """Build the view of a camera with known focal length.
 

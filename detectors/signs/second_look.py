@@ -130,9 +130,7 @@ def look_at_light(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Loo
     (x, y), (near, far, half) = 0.5 * (box_px[:2] + box_px[2:]), side_px * np.array(BESIDE)
     for left, right in ((x - far, x - near), (x + near, x + far)):
         beside = _cut(pixels, np.array([left, y - half, right, y + half]))
-        hue, saturation, value = np.moveaxis(
-            np.asarray(cv2.cvtColor(beside, cv2.COLOR_BGR2HSV)), 2, 0
-        )
+        hue, saturation, value = cv2.split(cv2.cvtColor(beside, cv2.COLOR_BGR2HSV))
         is_yellow = (hue > HUES[0]) & (hue <= HUES[2]) & (saturation >= YELLOW_SATURATION)
         if (is_yellow & (value >= 2 * MIN_VALUE)).mean() < MIN_YELLOW:
             return ""
@@ -194,8 +192,11 @@ def _cut(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> NDArray[np.u
     """Cut a box out of a picture; its edge continues beyond it."""
     x0, y0, x1, y1 = np.round(box_px).astype(int).tolist()
     height, width = pixels.shape[:2]
-    rows = np.clip(np.arange(y0, max(y1, y0 + 1)), 0, height - 1)
-    columns = np.clip(np.arange(x0, max(x1, x0 + 1)), 0, width - 1)
+    x1, y1 = max(x1, x0 + 1), max(y1, y0 + 1)
+    if min(x0, y0) >= 0 and x1 <= width and y1 <= height:
+        return pixels[y0:y1, x0:x1]
+    rows = np.clip(np.arange(y0, y1), 0, height - 1)
+    columns = np.clip(np.arange(x0, x1), 0, width - 1)
     return np.asarray(pixels[np.ix_(rows, columns)])
 
 
