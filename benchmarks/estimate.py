@@ -12,9 +12,14 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import wraps
 from pathlib import Path
 from statistics import median
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -23,9 +28,13 @@ from crosscue.datasets.simulated.log_files import BUS, GYRO, MAGNETOMETER, senso
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, DetectorChoice, Found, Frame, View
 from crosscue.detectors.catalog.known_models import OBJECTS, ROAD
+from crosscue.detectors.cues.road_area import RoadArea
+from crosscue.detectors.cues.road_openings import RoadOpenings
+from crosscue.detectors.cues.tracked import tracks
 from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.networks.box_model import BoxModel
 from crosscue.detectors.networks.picture_input import prepared
+from crosscue.detectors.ranging import object_tracks
 from crosscue.detectors.registry import make
 from crosscue.eval.drives.demo import fetch_drive
 from crosscue.eval.drives.replay import choices_for
@@ -141,6 +150,34 @@ def estimated(run: RunFolder, seconds: float) -> None:
     )
 
 
+@contextmanager
+def counted(seconds: Counter[str]) -> Iterator[None]:
+    """Add the CPU time of the computations that every frame needs, by their name."""
+    parts: tuple[tuple[Any, str, str], ...] = (
+        (RoadArea, "see", "road area"),
+        (RoadArea, "plan", "road area"),
+        (RoadOpenings, "__call__", "road area"),
+        (object_tracks, "range_from_motion", "ranges from motion"),
+        (tracks, "motions_of", "motion of cars"),
+    )
+
+    def timed(function: Callable[..., Any], part: str) -> Callable[..., Any]:
+        @wraps(function)
+        def call(*given: Any, **named: Any) -> Any:
+            began = time.process_time()
+            try:
+                return function(*given, **named)
+            finally:
+                seconds[part] += time.process_time() - began
+
+        return call
+
+    with ExitStack() as stack:
+        for owner, name, part in parts:
+            stack.enter_context(patch.object(owner, name, timed(getattr(owner, name), part)))
+        yield
+
+
 def real(source: str | None) -> None:
     """Time PandaSet 002, and its replay with yolox-nano against the bare network."""
     known = fetch_drive(source, with_road=True)
@@ -152,6 +189,11 @@ def real(source: str | None) -> None:
         outcome = replay_drive(drive, run, everything)
         print(f"PandaSet 002, {outcome.drive_seconds:.1f} s, with road, lights and cars")
         estimated(run, outcome.drive_seconds)
+        parts: Counter[str] = Counter()
+        with counted(parts):
+            estimate_run(open_run(run.path))
+        print(", ".join(f"{part} {used:.2f} s" for part, used in parts.items()))
+        print(f"these alone: {outcome.drive_seconds / parts.total():.1f} times real time (CPU)")
         (choice,) = choices_for(vehicle, OBJECTS)
         detector = make(choice)
         assert isinstance(detector, BoxModel)

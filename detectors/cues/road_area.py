@@ -124,14 +124,14 @@ class RoadArea:
         held = self._scratch[:, : len(dx_m) * len(dy_m)].reshape(-1, len(dx_m), len(dy_m))
         ahead_m, left_m, scale, x, y, weight = held
 
-        def sums(ahead: float, left: float, up: float, out: NDArray[np.float32]) -> None:
+        def sums(ahead: float, left: float, up: float, *, out: NDArray[np.float32]) -> None:
             """Weighted sum of each cell's place from the camera."""
             along = (ahead * cos - left * sin) * dx_m - ahead * camera.x_m - left * camera.y_m
             across = (ahead * sin + left * cos) * dy_m - up * camera.z_m
             np.add(along.astype(np.float32)[:, None], across.astype(np.float32), out=out)
 
-        sums(1.0, 0.0, 0.0, ahead_m)
-        sums(0.0, 1.0, 0.0, left_m)
+        sums(1.0, 0.0, 0.0, out=ahead_m)
+        sums(0.0, 1.0, 0.0, out=left_m)
         in_reach = (ahead_m > NEAREST_M) & (ahead_m < self._far_m - camera.x_m)
         in_reach &= np.abs(np.add(left_m, camera.y_m, out=x), out=x) < ASIDE_M
         # Ground in the camera's axes, forward, left and up, and in pixels of the mask.
@@ -139,14 +139,14 @@ class RoadArea:
         plane = GroundPlane.of(camera, road.size_px)
         mask_width, mask_height = road.mask_size_px
         across, down = mask_width / width, mask_height / height
-        sums(*forward, scale)
+        sums(*forward, out=scale)
         np.divide(-plane.focal_px, np.maximum(scale, 1e-3, out=scale), out=scale)
         # A border stands for everything out of the picture.
         for axis, at, size, center_px, per_px in (
             (left, x, mask_width, plane.center_px[0], across),
             (up, y, mask_height, plane.center_px[1], down),
         ):
-            sums(*axis, at)
+            sums(*axis, out=at)
             at *= np.multiply(scale, per_px, out=weight)
             at += center_px * per_px + 1.0
             np.clip(at, 0.0, size + 1.0, out=at)
@@ -190,8 +190,7 @@ class RoadArea:
         seen, road = self._seen.take(cells), self._road.take(cells)
         is_seen = seen >= min_weight
         road /= np.maximum(seen, 1e-9, out=seen)
-        np.copyto(road, np.nan, where=~is_seen)
-        return RoadPlan(ahead_m, left_m, road)
+        return RoadPlan(ahead_m, left_m, np.where(is_seen, road, np.nan))
 
     @property
     def _far_m(self) -> float:

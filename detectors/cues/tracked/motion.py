@@ -162,8 +162,8 @@ def _fit(
     # Shorter tracks are padded with their newest observation, without weight.
     values: list[float] = []
     for seen in cars:
-        for t_s, pose, edges_rad, distance_m, error, *_ in seen:
-            values += (t_s, *pose, distance_m, error, *edges_rad)
+        for one in seen:
+            values += (one.t_s, *one.pose, one.distance_m, one.error, *one.edges_rad)
         values += (seen[-1].t_s, *seen[-1].pose, 1.0, 1.0, 0.0, 0.0) * (most - len(seen))
     table = np.array(values).reshape(len(cars), most, 8)
     is_real = (np.arange(most) < counts[:, None])[:, None, :]
