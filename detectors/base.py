@@ -157,10 +157,6 @@ class Detections:
         """The detections with this label, in the same order."""
         return self.taken(np.array([one == label for one in self.labels], np.bool_))
 
-    def above(self, score: float) -> Self:
-        """The detections with a score of at least ``score``, in the same order."""
-        return self.taken(self.scores >= score)
-
     def are_sure(self, setting: float | None) -> NDArray[np.bool_]:
         """Mark the detections that are a cue, by their score or by a track's decision, shape (N,).
 
@@ -233,14 +229,6 @@ class RoadMask:
     size_px: tuple[int, int]
     mask: bytes
     mask_size_px: tuple[int, int]
-
-    def runs(self) -> NDArray[np.int64]:
-        """Decode the lengths of the runs of other ground and road, down the columns.
-
-        Raises:
-            ValueError: As ``pixels``.
-        """
-        return rle.checked_runs(self.mask, self.mask_size_px)
 
     def pixels(self) -> NDArray[np.bool_]:
         """Decode the mask, shape (height, width); True where a pixel is road.

@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.ranging.ground_plane import GroundPlane, turned
 from crosscue.replay.columns import Floats
@@ -229,7 +230,7 @@ def _shown(road: RoadMask, boxes_px: Floats, away_m: Floats, top: int = 0) -> ND
     width, height = road.mask_size_px
     # Runs of pixels end at the end of their column, too. Places are doubled; odd ones turn to road
     # or back.
-    turns = 2 * road.runs().cumsum()[:-1] + 1
+    turns = 2 * rle.checked_runs(road.mask, road.mask_size_px).cumsum()[:-1] + 1
     keys = np.concatenate([turns, 2 * height * np.arange(width)])
     keys.sort()
     starts, is_road = keys >> 1, (keys & 1).cumsum() & 1 > 0

@@ -214,7 +214,7 @@ def test_average_precision_is_100_for_ground_truth_and_0_for_no_detections(tmp_p
 
     whole, none = (
         average_precisions(labelled, found)
-        for found in (perfect, [one.above(2.0) for one in perfect])
+        for found in (perfect, [one.taken(one.scores >= 2.0) for one in perfect])
     )
 
     assert whole["box"] == whole["mask"] == whole["box car"] == 100.0

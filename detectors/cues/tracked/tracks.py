@@ -108,10 +108,6 @@ class CarTracks:
         self._t_s = 0.0
         self._begun = 0
 
-    def restart(self) -> None:
-        """Forget all cars."""
-        self._tracks.clear()
-
     def __call__(self, found: Sequence[Detections], ego: CarStep) -> list[CarMotion]:
         """Update the tracks with the next frame.
 

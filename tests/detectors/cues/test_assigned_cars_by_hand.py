@@ -331,16 +331,6 @@ def test_each_box_continues_the_track_it_fits_best() -> None:
     assert sorted(one.number for one in both) == [1, 2]
 
 
-def test_tracks_are_forgotten_at_a_restart() -> None:
-    tracks = CarTracks(CAMERA, RULES)
-    tracks([found(CAR)], STILL)
-    tracks.restart()
-
-    assert tracks([found(CAR)], STILL) == []
-    (made,) = tracks([found(CAR)], STILL)
-    assert made.number == 2
-
-
 @pytest.mark.parametrize("moves", [2, 6])
 def test_motion_uses_the_newest_frames_and_fewer_if_it_is_unsteady(moves: int) -> None:
     """A car stands, then moves by 60 px a frame: longer fits halve the frames, to at least 3.

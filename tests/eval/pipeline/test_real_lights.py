@@ -73,7 +73,8 @@ def looked_at(network: Detector, path: Path) -> Detections:
     frame = Frame(0, "front", pixels, (pixels.shape[1], pixels.shape[0]))
     (found,) = network([frame])
     assert isinstance(found, Detections)
-    return with_looks(found.of("stop sign").above(0.5), frame, SIGN)
+    signs = found.of("stop sign")
+    return with_looks(signs.taken(signs.scores >= 0.5), frame, SIGN)
 
 
 @pytest.mark.slow
