@@ -40,14 +40,18 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
 BODY_UNSEEN = {"images": "pictures are not opened", "openpilot": "its video has no index"}
 
 
+def _largest_file(log: Path) -> Path:
+    files = [log] if log.is_file() else [path for path in log.rglob("*") if path.is_file()]
+    return max(files, key=lambda path: path.stat().st_size)
+
+
 @pytest.mark.parametrize("name", sorted(EVERY_FORMAT))
 def test_quick_info_reports_truncated_log(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = EVERY_FORMAT[name](tmp_path)
     assert cli.run(["info", "--quick", str(log)]) == 0
-    files = [log] if log.is_file() else [path for path in log.rglob("*") if path.is_file()]
-    largest = max(files, key=lambda path: path.stat().st_size)
+    largest = _largest_file(log)
     largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
     capsys.readouterr()
 
@@ -68,8 +72,7 @@ def test_quick_info_reports_truncated_log(
 @pytest.mark.parametrize("name", sorted(EVERY_FORMAT))
 def test_quick_info_reports_no_loss_that_reading_does_not(name: str, tmp_path: Path) -> None:
     log = EVERY_FORMAT[name](tmp_path)
-    files = [log] if log.is_file() else [path for path in log.rglob("*") if path.is_file()]
-    largest = max(files, key=lambda path: path.stat().st_size)
+    largest = _largest_file(log)
     raw = largest.read_bytes()
     for size in range(len(raw), len(raw) // 8, -max(1, len(raw) // 19)):
         largest.write_bytes(raw[:size])
@@ -89,8 +92,7 @@ def test_truncated_log_is_read_in_part_or_refused(
     name: str, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = EVERY_FORMAT[name](tmp_path)
-    files = [log] if log.is_file() else [path for path in log.rglob("*") if path.is_file()]
-    largest = max(files, key=lambda path: path.stat().st_size)
+    largest = _largest_file(log)
     largest.write_bytes(largest.read_bytes()[: largest.stat().st_size // 2])
 
     status = cli.run([command, str(log), *(["-o", str(tmp_path / "o.mcap")] * (command != "info"))])

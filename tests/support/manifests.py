@@ -49,13 +49,7 @@ def estimated(**changes: Any) -> EstimateManifest:
 
 
 def detected(camera: str, detectors: dict[str, str], **changes: Any) -> DetectManifest:
-    """Manifest of a finished detect stage.
-
-    Args:
-        camera: Topic of the camera.
-        detectors: Roles by name.
-        changes: Changes of other fields.
-    """
+    """Manifest of a finished detect stage."""
     content = {
         **_drive(),
         "camera": camera,

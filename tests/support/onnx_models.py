@@ -117,15 +117,7 @@ def bright_box_model(*, by_brightness: bool = False) -> bytes:
 def write_card(
     folder: Path, model: bytes, output: str, size: tuple[int, int] = (64, 48), more: str = ""
 ) -> Path:
-    """Write ``net.onnx`` and its card ``net.toml``, whose path is returned.
-
-    Args:
-        folder: An existing folder.
-        model: The network.
-        output: Lines of the section output.
-        size: Width and height of the input in pixels.
-        more: Further lines of the section input.
-    """
+    """Write a network and its card; ``output`` and ``more`` are lines of output and input."""
     (folder / "net.onnx").write_bytes(model)
     path = folder / "net.toml"
     path.write_text(

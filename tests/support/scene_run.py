@@ -105,12 +105,7 @@ def poses(frames: int = FRAMES) -> pa.Table:
 
 
 def scene_run(folder: Path, *, without: frozenset[str] = frozenset()) -> RunFolder:
-    """Write a finished run ``folder/run`` of ``folder/drive.mcap``.
-
-    Args:
-        folder: Folder to create.
-        without: Tables to omit.
-    """
+    """Write a finished run ``folder/run`` of ``folder/drive.mcap``."""
     folder.mkdir(parents=True, exist_ok=True)
     write_pictures(folder / "drive.mcap")
     cues = {**CUES, "cross_traffic_right": {frame: int(frame > 20) for frame in range(1, FRAMES)}}
