@@ -2,8 +2,10 @@
 
 Pitch and yaw are the direction of travel in the pictures of a straight road. The height is the
 speed by the car's own sensors over the speed by the ground in the pictures, which is in proportion
-to the height that was assumed. A step is found by comparing what was measured before a moment with
-what was measured after it; both have intervals from the variation of successive measurements.
+to the height that was assumed. A step is fitted to what was measured before and after a moment,
+together with what the car's signals explain, such as a nod. Intervals follow from the residuals and
+their correlation, which is that of this drive (long-run variance; Newey and West, Econometrica 55,
+1987).
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -30,8 +32,12 @@ ROAD_SD: Final = {"pitch": math.radians(0.05), "yaw": math.radians(0.05), "heigh
 # values, not steps. On two real drives the angles are off by up to 0.2 degrees.
 SAME_SD: Final = {"pitch": math.radians(0.12), "yaw": math.radians(0.12), "height": 0.02}
 LEAST_STEP: Final = {"pitch": math.radians(0.25), "yaw": math.radians(0.25), "height": 0.1}
-# Successive measurements that share an error.
-CORRELATED: Final = 4
+# Successive measurements that may share an error, and s.d. of the residuals beyond which a
+# measurement counts less.
+CORRELATED: Final = 8
+FAR: Final = 2.0
+FITS: Final = 6
+LEAST_SCALE: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,41 +126,95 @@ def _window(value: str, t_ns: Int64s, measured: Floats) -> MountingWindow:
     return MountingWindow(value, int(t_ns[0]), int(t_ns[-1]), mean, sd, len(measured))
 
 
-def steps_of(value: str, t_ns: Int64s, measured: Floats) -> list[MountingStep]:
-    """Return the steps of a value, the most significant of neighbouring moments each.
+def steps_of(
+    value: str, t_ns: Int64s, measured: Floats, explained: Floats | None = None
+) -> list[MountingStep]:
+    """Return the steps of a value, the likeliest of neighbouring moments each.
 
     Args:
         value: Name of the value.
         t_ns: Times, ascending.
         measured: Measurements; NaN where unknown.
+        explained: What the car's signals explain of them, up to a factor of about 1; NaN where
+            unknown.
     """
-    t_ns, measured = _known(t_ns, measured)
-    found: list[MountingStep] = []
+    signals = np.zeros((len(t_ns), 0)) if explained is None else explained[:, None]
+    is_known = np.isfinite(measured) & np.isfinite(signals).all(axis=1)
+    t_ns, measured, signals = t_ns[is_known], measured[is_known], signals[is_known]
+    found: list[tuple[float, MountingStep]] = []
     for at in range(MIN_MEASURED, len(t_ns) - MIN_MEASURED + 1):
-        before = measured[:at][t_ns[at] - t_ns[:at] <= BESIDE_NS]
-        after = measured[at:][t_ns[at:] - t_ns[at] <= BESIDE_NS]
-        if min(len(before), len(after)) < MIN_MEASURED:
+        near = np.abs(t_ns - t_ns[at]) <= BESIDE_NS
+        is_after = np.arange(len(t_ns))[near] >= at
+        if min(is_after.sum(), (~is_after).sum()) < MIN_MEASURED:
             continue
-        (old, old_sd), (new, new_sd) = _mean(value, before), _mean(value, after)
-        least = LEAST_STEP[value] * (abs(old) if value == "height" else 1.0)
-        step = MountingStep(value, int(t_ns[at]), new - old, math.hypot(old_sd, new_sd))
-        if abs(step.by) > max(SIGMAS * step.sd, least):
-            found.append(step)
-    return _strongest(found)
-
-
-def _strongest(steps: Sequence[MountingStep]) -> list[MountingStep]:
+        same = np.ones((len(is_after), 1))
+        fit = _fitted(np.column_stack([same, is_after]), measured[near], signals[near])
+        size = abs(fit.found[0]) if value == "height" else 1.0
+        by, sd = float(fit.found[1]), math.hypot(fit.sd[1], 2.0**0.5 * ROAD_SD[value] * size)
+        if abs(by) > max(SIGMAS * sd, LEAST_STEP[value] * size):
+            without = _fitted(same, measured[near], signals[near])
+            likelihood = len(same) * math.log(without.loss(fit.scale) / fit.loss(fit.scale))
+            found.append((likelihood, MountingStep(value, int(t_ns[at]), by, sd)))
     kept: list[MountingStep] = []
-    for step in sorted(steps, key=lambda one: -abs(one.by) / one.sd):
+    for _, step in sorted(found, key=lambda one: -one[0]):
         if all(abs(step.t_ns - other.t_ns) > BESIDE_NS for other in kept):
             kept.append(step)
     return sorted(kept, key=lambda one: one.t_ns)
 
 
+def without_explained(
+    t_ns: Int64s, measured: Floats, explained: Floats, steps: Sequence[MountingStep]
+) -> Floats:
+    """Return measurements less what signals explain of them; NaN where either is unknown."""
+    is_known = np.isfinite(measured) & np.isfinite(explained)
+    if is_known.sum() < MIN_MEASURED:
+        return measured
+    free = np.column_stack([np.ones(len(t_ns)), *(t_ns >= one.t_ns for one in steps)])
+    fit = _fitted(free[is_known], measured[is_known], explained[is_known, None])
+    return np.asarray(measured - fit.found[-1] * explained)
+
+
+class _Fit(NamedTuple):
+    """Factors of columns, their s.d., the residuals, and the residuals' scale."""
+
+    found: Floats
+    sd: Floats
+    rest: Floats
+    scale: float
+
+    def loss(self, scale: float) -> float:
+        """Return the sum of squares, each limited in proportion to a scale."""
+        return float(np.minimum(self.rest**2, (3.0 * FAR * scale) ** 2).sum()) + scale**2
+
+
+def _fitted(free: Floats, measured: Floats, signals: Floats) -> _Fit:
+    """Fit columns, reweighted after Huber; factors of ``signals`` have an s.d. of 1 before."""
+    design = np.column_stack([free, signals])
+    prior = np.diag([0.0] * free.shape[1] + [1.0] * signals.shape[1])
+    weight, scale = np.ones(len(measured)), max(float(np.std(measured)), LEAST_SCALE)
+    for _ in range(FITS):
+        information = (design * weight[:, None]).T @ design
+        found = np.linalg.solve(
+            information + scale**2 * prior, (design * weight[:, None]).T @ measured
+        )
+        rest = measured - design @ found
+        scale = max(1.4826 * float(np.median(np.abs(rest))), LEAST_SCALE)
+        weight = np.minimum(FAR * scale / np.maximum(np.abs(rest), 1e-12), 1.0)
+    near = np.clip(rest, -FAR * scale, FAR * scale)
+    variance = float(near @ near)
+    lags = min(CORRELATED, len(near) // 4)
+    shared = sum(
+        (1.0 - lag / (lags + 1)) * (near[lag:] @ near[:-lag]) for lag in range(1, lags + 1)
+    )
+    variance = max(variance + 2.0 * float(shared), variance, scale**2)
+    variance /= max(len(near) - design.shape[1], 1)
+    sd = np.sqrt(variance * np.diag(np.linalg.inv(information + variance * prior)))
+    return _Fit(found, sd, rest, scale)
+
+
 def _mean(value: str, measured: Floats) -> tuple[float, float]:
-    """Return the median, and the s.d. of it with what the road explains."""
-    middle = float(np.median(measured))
-    spread = 1.4826 * float(np.median(np.abs(measured - middle)))
-    sd = 1.2533 * spread * math.sqrt(CORRELATED / len(measured))
+    """Return the robust mean, and its s.d. with what the road explains."""
+    fit = _fitted(np.ones((len(measured), 1)), measured, np.empty((len(measured), 0)))
+    middle = float(fit.found[0])
     road = ROAD_SD[value] * (abs(middle) if value == "height" else 1.0)
-    return middle, math.hypot(sd, road)
+    return middle, math.hypot(float(fit.sd[0]), road)

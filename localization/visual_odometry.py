@@ -123,12 +123,17 @@ class Travel(NamedTuple):
         below_rad: Angle of its axis below the direction of travel.
         turned_rad: Rotation between the pictures, to the left.
         points: Number of corners followed.
+        per_turn: Error of ``left_rad`` for an error of ``turned_rad``: far from the camera, a turn
+            looks like a movement to the side.
+        seconds: Time between the pictures.
     """
 
     left_rad: float
     below_rad: float
     turned_rad: float
     points: int
+    per_turn: float = 0.0
+    seconds: float = 0.0
 
 
 def travel_between(
@@ -153,13 +158,16 @@ def travel_between(
         return None
     before_rays, after_rays = (_rays(one, focal_px, center_px) for one in (first, second))
     ahead = np.array([1.0, 0.0, 0.0])
-    rotation, _ = _fitted(before_rays, after_rays, np.eye(3), ahead, focal_px, is_free=False)
-    rotation, along = _fitted(
+    rotation, _, _ = _fitted(before_rays, after_rays, np.eye(3), ahead, focal_px, is_free=False)
+    rotation, along, weights = _fitted(
         before_rays, after_rays, rotation, ahead, focal_px, is_free=True, direction_sd=ASIDE_SD
     )
     x, y, z = _rotated(0.5 * np.asarray(cv2.Rodrigues(rotation)[0], np.float64)) @ along
     turned_rad = -math.atan2(rotation[1, 0], rotation[0, 0])
-    return Travel(-math.atan2(y, x), math.atan2(z, math.hypot(x, y)), turned_rad, len(first))
+    shared = np.linalg.inv(weights)[2]
+    per_turn = float(shared[3] / shared[2]) - 0.5
+    left_rad, below_rad = -math.atan2(y, x), math.atan2(z, math.hypot(x, y))
+    return Travel(left_rad, below_rad, turned_rad, len(first), per_turn)
 
 
 @dataclass(slots=True)
@@ -334,12 +342,12 @@ def _rotation(
     the one expected: many corners on one plane, the road, would allow for a second solution.
     """
     ahead = attitude.T @ np.array([1.0, 0.0, 0.0])
-    rotation, _ = _fitted(first, second, np.eye(3), ahead, focal_px, is_free=False)
+    rotation, _, _ = _fitted(first, second, np.eye(3), ahead, focal_px, is_free=False)
     turned_rays = first @ rotation.T
     parallax = turned_rays[:, 1:] / turned_rays[:, :1] - second[:, 1:] / second[:, :1]
     if np.median(np.linalg.norm(parallax, axis=1)) * focal_px < PARALLAX_PX:
         return rotation, None
-    return _fitted(first, second, rotation, ahead, focal_px, is_free=True)
+    return _fitted(first, second, rotation, ahead, focal_px, is_free=True)[:2]
 
 
 def _fitted(
@@ -351,8 +359,8 @@ def _fitted(
     *,
     is_free: bool,
     direction_sd: float = DIRECTION_SD,
-) -> tuple[Floats, Floats]:
-    """Fit the rotation, and the direction of travel if it is free."""
+) -> tuple[Floats, Floats, Floats]:
+    """Fit the rotation, and the direction of travel if it is free; also the normal matrix."""
     second = second / np.linalg.norm(second, axis=1, keepdims=True)
     # The direction of travel in the second body's axes.
     along = rotation @ ahead
@@ -387,7 +395,7 @@ def _fitted(
             along = rotation @ ahead
         if np.linalg.norm(change) < 1e-7:
             break
-    return rotation, rotation.T @ along
+    return rotation, rotation.T @ along, left
 
 
 def _rays(points: Floats, focal_px: float, center_px: tuple[float, float]) -> Floats:

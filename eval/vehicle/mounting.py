@@ -20,7 +20,9 @@ from crosscue.localization.camera_watch import (
     steps_of,
     whole,
     windows_of,
+    without_explained,
 )
+from crosscue.localization.visual_odometry import Travel
 from crosscue.replay.base import EVERYTHING, Log, Selection
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.drafting.camera import Intrinsics, MountingParameter
@@ -35,10 +37,13 @@ FOCAL_SD: Final = 0.03
 HEIGHT_SD: Final = 0.05
 # Min speed at which distances by wheels and by pictures are compared.
 MOVING_MPS: Final = 2.0
-# Max acceleration over the last second in which the pitch is that of the mounting: cars nod by
-# about 0.3 degrees per m/s2.
-STEADY_MPS2: Final = 0.3
+# Nod of a car that brakes, per m/s2; how much one nods follows from the drive. Pictures count where
+# the acceleration of the last second has changed by less than this: nods come late.
+NOD_RAD: Final = math.radians(0.3)
+STEADY_MPS2: Final = 0.6
 NODS_NS: Final = 1_000_000_000
+# Longest time between two pictures that show the direction of travel of a moving car.
+MOVES_S: Final = 1.0
 # Smallest delay that is set, so that stamps of a run differ from those of the log only for a cause.
 DELAY_S: Final = 0.01
 # Passes over the pictures, each with the focal length and height that the last one found.
@@ -178,7 +183,7 @@ def watch_camera(
         if not has_focal and (focal := _focal(seen, delays)) is not None:
             off = abs(focal.value * seen.scale / _focal_px(seen) - 1.0)
             known = known.model_copy(update={"focal_px": focal.value})
-        watch = watch_mounting(seen, motion.speed) if has_focal or focal is not None else None
+        watch = watch_mounting(seen, motion) if has_focal or focal is not None else None
         if watch is not None and (height := watch.whole.get("height")) is not None:
             off = max(off, abs(height.mean / known.z_m - 1.0))
             known = known.model_copy(update={"z_m": height.mean})
@@ -221,37 +226,73 @@ def delays_of(seen: PicturePass, motion: CarMotion) -> tuple[CameraDelay, ...]:
     return tuple(found)
 
 
-def watch_mounting(seen: PicturePass, speed: Series | None) -> MountingWatch:
+def watch_mounting(seen: PicturePass, motion: CarMotion) -> MountingWatch:
     """Return pitch, yaw and height over a drive, and their steps.
 
     Args:
         seen: The pictures.
-        speed: Speed of the vehicle, m/s; without it the height is unknown.
+        motion: Signals of the vehicle's motion; without a speed the height is unknown.
     """
-    pitch = np.array([one.below_rad for one in seen.travel], np.float64)
-    is_steady = _is_steady(seen.travel_ns, speed)
-    if is_steady.sum() >= MIN_PAIRS:
-        pitch[~is_steady] = np.nan
-    measured: dict[str, tuple[Int64s, Floats]] = {
-        "pitch": (seen.travel_ns, pitch),
-        "yaw": (seen.travel_ns, np.array([one.left_rad for one in seen.travel], np.float64)),
-    }
+    speed, yaw_rate = motion
+    travel = np.array(seen.travel, np.float64).reshape(-1, len(Travel._fields))
+    measured, explained = {"pitch": travel[:, 1], "yaw": travel[:, 0]}, {}
+    times = dict.fromkeys(measured, seen.travel_ns)
     if speed is not None and len(speed) > 1:
-        measured["height"] = _heights(seen, speed)
-    entire = {name: whole(name, *columns) for name, columns in measured.items()}
+        times["height"], measured["height"] = _heights(seen, speed)
+        nod, is_steady = _nod(seen.travel_ns, speed)
+        if is_steady.sum() >= MIN_PAIRS:
+            explained["pitch"] = nod
+            measured["pitch"] = np.where(is_steady, travel[:, 1] + nod, np.nan)
+    if yaw_rate is not None and len(yaw_rate) > 1:
+        by_turn, slip = _by_turn(seen, yaw_rate, speed)
+        if np.isfinite(by_turn).sum() >= MIN_PAIRS:
+            explained["yaw"] = by_turn
+            measured["yaw"] = travel[:, 0] + slip
+    steps = []
+    for name, t_ns in times.items():
+        found = steps_of(name, t_ns, measured[name], explained.get(name))
+        steps += found
+        if name in explained:
+            measured[name] = without_explained(t_ns, measured[name], explained[name], found)
+    entire = {name: whole(name, t_ns, measured[name]) for name, t_ns in times.items()}
     return MountingWatch(
-        tuple(one for name, columns in measured.items() for one in windows_of(name, *columns)),
-        tuple(one for name, columns in measured.items() for one in steps_of(name, *columns)),
+        tuple(one for name in times for one in windows_of(name, times[name], measured[name])),
+        tuple(steps),
         {name: window for name, window in entire.items() if window is not None},
     )
 
 
-def _is_steady(t_ns: Int64s, speed: Series | None) -> NDArray[np.bool_]:
-    """Return where the car has not been braking or accelerating, for which it nods."""
-    if speed is None or len(speed) < 2:
-        return np.ones(len(t_ns), np.bool_)
-    now, before = (np.interp(t_ns - at, speed.t_ns, speed.values) for at in (0, NODS_NS))
-    return np.abs(now - before) * 1e9 / NODS_NS < STEADY_MPS2
+def _nod(t_ns: Int64s, speed: Series) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the nod of a car by its acceleration, and where that has not been changing."""
+    now, before, earlier = (
+        np.interp(t_ns - round(at * NODS_NS), speed.t_ns, speed.values) for at in (0.0, 0.5, 1.0)
+    )
+    changes = 2.0 * np.abs(now - 2.0 * before + earlier) * 1e9 / NODS_NS
+    return NOD_RAD * (now - earlier) * 1e9 / NODS_NS, changes < STEADY_MPS2
+
+
+def _by_turn(seen: PicturePass, yaw_rate: Series, speed: Series | None) -> tuple[Floats, Floats]:
+    """Return what the yaw rate explains of the direction of travel, and the camera's sideslip.
+
+    Few pictures tell a turn from a movement to the side, so that most of an error of the direction
+    is that of the turn they show, which the yaw rate knows better. A camera ahead of the rear axle
+    moves sideways in bends.
+    """
+    turned, per_turn, seconds = (
+        np.array([getattr(one, name) for one in seen.travel], np.float64)
+        for name in ("turned_rad", "per_turn", "seconds")
+    )
+    start_ns = seen.travel_ns - np.round(seconds * 1e9).astype(np.int64)
+    inside = (start_ns >= yaw_rate.t_ns[0]) & (seen.travel_ns <= yaw_rate.t_ns[-1])
+    usable = inside & (seconds > 0.0) & (seconds < MOVES_S)
+    seconds = np.where(usable, seconds, np.nan)
+    rate = (yaw_rate.integral(seen.travel_ns) - yaw_rate.integral(start_ns)) / seconds
+    bias = np.median((turned / seconds - rate)[usable]) if usable.any() else np.nan
+    slip = np.zeros(len(seconds))
+    if speed is not None and len(speed) > 1:
+        mps = np.interp(seen.travel_ns, speed.t_ns, speed.values)
+        slip = (rate + bias) * seen.camera.x_m / np.maximum(mps, MOVING_MPS)
+    return per_turn * (turned - (rate + bias) * seconds), slip
 
 
 def _heights(seen: PicturePass, speed: Series) -> tuple[Int64s, Floats]:

@@ -155,7 +155,7 @@ class Follower:
         self.travel: list[Travel] = []
         self.bends = 0
         self._last_ns: int | None = None
-        self._reference: tuple[Bytes, float] | None = None
+        self._reference: tuple[int, Bytes, float] | None = None
 
     def follow(self, t_ns: int, grey: Bytes) -> VisualStep | None:
         """Return the motion since the last picture that was followed."""
@@ -165,16 +165,16 @@ class Follower:
         step = self.odometry(t_ns, grey, np.empty((0, 4)))
         growth = self.odometry.expansion
         if step is None or not np.isfinite(growth) or self._reference is None:
-            self._reference = grey, 0.0
+            self._reference = t_ns, grey, 0.0
             return step
-        reference, grown = self._reference
-        self._reference = reference, grown + growth
+        start_ns, reference, grown = self._reference
+        self._reference = start_ns, reference, grown + growth
         if grown + growth >= GROWTH and reference.shape == grey.shape:
-            self._reference = grey, 0.0
-            self._add_travel(t_ns, reference, grey)
+            self._reference = t_ns, grey, 0.0
+            self._add_travel(start_ns, t_ns, reference, grey)
         return step
 
-    def _add_travel(self, t_ns: int, before: Bytes, after: Bytes) -> None:
+    def _add_travel(self, start_ns: int, t_ns: int, before: Bytes, after: Bytes) -> None:
         focal_px, center_px = self.camera.focal_px, self.camera.center_px
         assert focal_px is not None
         assert center_px is not None
@@ -183,7 +183,7 @@ class Follower:
             self.bends += 1
         elif travel is not None:
             self.travel_ns.append(t_ns)
-            self.travel.append(travel)
+            self.travel.append(travel._replace(seconds=(t_ns - start_ns) * 1e-9))
 
 
 def _grey(

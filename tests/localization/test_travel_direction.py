@@ -60,3 +60,20 @@ def test_pictures_without_points_or_motion_yield_none() -> None:
 
     assert travel_between(black, black, FOCAL_PX, CENTER_PX) is None
     assert travel_between(still, still, FOCAL_PX, CENTER_PX) is None
+
+
+def test_error_of_the_turn_is_taken_for_a_movement_to_the_side() -> None:
+    """Corners that are followed wrongly turn both the rotation and the direction of travel."""
+    found = []
+    for seed in range(12):
+        noise = np.random.default_rng(seed).normal(0.0, 6.0, (2, *SIZE_PX[::-1]))
+        pair = (street(np.array([0.0, 0.0, z]), Rotation.identity()) for z in (0.0, 0.7))
+        noisy = (np.clip(one + dots, 0, 255) for one, dots in zip(pair, noise, strict=True))
+        before, after = (one.astype(np.uint8) for one in noisy)
+        one = travel_between(before, after, FOCAL_PX, CENTER_PX)
+        assert one is not None
+        found.append((one.left_rad, one.turned_rad, one.per_turn))
+    left, turned, per_turn = np.array(found).T
+
+    assert per_turn.min() > 3.0
+    assert np.std(left - per_turn * turned) < 0.7 * np.std(left)

@@ -64,20 +64,17 @@ class Series:
         is_inside = (grid.t_ns >= self.t_ns[0]) & (grid.t_ns <= self.t_ns[-1])
         return np.where(is_near & is_inside, values, np.nan)
 
+    def integral(self, t_ns: Int64s) -> Floats:
+        """Return the integral up to each time; every reading counts, so that noise averages out."""
+        steps = 0.5 * (self.values[1:] + self.values[:-1]) * np.diff(self.t_ns) * 1e-9
+        return np.interp(t_ns, self.t_ns, np.concatenate([[0.0], np.cumsum(steps)]))
+
     def turned(self, grid: Grid) -> Floats:
         """Integrate an angular rate over each window, rad; NaN where readings are missing."""
         rate = self.at(grid)
         if not np.isfinite(rate).any():
             return np.full(grid.windows, np.nan)
-        # Readings between the grid's times are included, so that a gyro's noise averages out.
-        area = np.concatenate(
-            [
-                [0.0],
-                np.cumsum(0.5 * (self.values[1:] + self.values[:-1]) * np.diff(self.t_ns) * 1e-9),
-            ]
-        )
-        edges_ns = grid.edges_ns
-        turned = np.diff(np.interp(edges_ns, self.t_ns, area))
+        turned = np.diff(self.integral(grid.edges_ns))
         return np.where(grid.windows_where(np.isfinite(rate)), turned, np.nan)
 
 

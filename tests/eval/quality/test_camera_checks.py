@@ -11,7 +11,7 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings, integrated, sense
 from crosscue.eval.quality.drive import QualityDrive
 from crosscue.eval.quality.verdict import judge
-from crosscue.eval.vehicle.mounting import MountingWatch, watch_mounting
+from crosscue.eval.vehicle.mounting import CarMotion, MountingWatch, watch_mounting
 from crosscue.eval.vehicle.picture_pass import PicturePass
 from crosscue.localization.camera_watch import steps_of, windows_of
 from crosscue.localization.visual_odometry import Travel
@@ -130,7 +130,7 @@ def test_no_step_is_reported_where_there_is_none() -> None:
         assert steps_of("pitch", np.round(t_s * 1e9).astype(np.int64), angle) == []
 
 
-def braking(step_rad: float = 0.0) -> MountingWatch:
+def braking(step_rad: float = 0.0, at_s: float = 28.0) -> MountingWatch:
     """A car brakes, stands, and accelerates; it nods by 0.35 degrees per m/s2, as in simulation."""
     t_s = np.arange(0.0, 40.0, 0.1)
     acceleration = np.select(
@@ -140,11 +140,11 @@ def braking(step_rad: float = 0.0) -> MountingWatch:
     _, angle = measured(3, 0.0)
     angle = np.interp(t_s, np.arange(0.0, 40.0, 1.0 / 8.0), angle)
     angle -= math.radians(0.35) * acceleration
-    angle += step_rad * (t_s >= 28.0)
+    angle += step_rad * (t_s >= at_s)
     t_ns = np.round(t_s * 1e9).astype(np.int64)
     travel = tuple(Travel(0.0, float(one), 0.0, 200) for one in angle)
     seen = PicturePass(t_ns, t_s, t_s, t_ns, (960, 540), CAMERA, 1.0, (), t_s[:0], t_ns, travel, 0)
-    return watch_mounting(seen, Series("speed", t_ns, speed))
+    return watch_mounting(seen, CarMotion(Series("speed", t_ns, speed), None))
 
 
 def test_camera_that_nods_while_the_car_brakes_has_not_moved() -> None:
@@ -156,6 +156,52 @@ def test_camera_that_nods_while_the_car_brakes_has_not_moved() -> None:
             assert abs(window.mean - 0.02) < 1.96 * window.sd
     (step,) = braking(math.radians(0.5)).steps
     assert step.t_ns * 1e-9 == pytest.approx(28.0, abs=2.0)
+
+
+@pytest.mark.parametrize("at_s", [7.0, 9.0, 11.0])
+def test_step_beside_a_nod_is_found(at_s: float) -> None:
+    """The car brakes from 8 to 13 s and accelerates from 15 s on."""
+    for by_deg in (-0.5, 0.5):
+        (step,) = braking(math.radians(by_deg), at_s).steps
+
+        assert step.t_ns * 1e-9 == pytest.approx(at_s, abs=1.5)
+        assert math.degrees(step.by) == pytest.approx(by_deg, abs=0.25)
+
+
+def swaying(seed: int, step_rad: float = 0.0, *, has_rate: bool = True) -> MountingWatch:
+    """A car that sways; pictures mistake a part of a turn for a movement to the side.
+
+    The error of the turn wanders, and the gyro has a bias. The camera is 1.7 m ahead of the axle.
+    """
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(0.0, 30.0, 0.1)
+    t_ns = np.round(t_s * 1e9).astype(np.int64)
+    rate = 0.02 * np.sin(2.0 * np.pi * t_s / 12.0)
+    turn = np.diff(np.concatenate([[0.0], np.cumsum(rate) * 0.1]))
+    wrong = np.radians(0.02) * np.convolve(rng.normal(size=len(t_s) + 29), np.ones(30) / 30.0**0.5)
+    wrong = wrong[29 : 29 + len(t_s)]
+    left = 20.0 * wrong - 1.7 * rate / 10.0 + np.radians(0.1) * rng.normal(size=len(t_s))
+    left += step_rad * (t_s >= 15.0)
+    travel = tuple(
+        Travel(float(x), 0.0, float(y), 200, 20.0, 0.1)
+        for x, y in zip(left, turn + wrong, strict=True)
+    )
+    camera = CAMERA.model_copy(update={"x_m": 1.7})
+    seen = PicturePass(t_ns, t_s, t_s, t_ns, (960, 540), camera, 1.0, (), t_s[:0], t_ns, travel, 0)
+    gyro = Series("gyro", t_ns, rate + 0.003)
+    motion = CarMotion(Series("speed", t_ns, np.full(len(t_s), 10.0)), gyro if has_rate else None)
+    return watch_mounting(seen, motion)
+
+
+@pytest.mark.parametrize("step_deg", [0.5, -0.5])
+def test_step_of_the_yaw_is_found_though_pictures_mistake_turns(step_deg: float) -> None:
+    for seed in range(4):
+        (step,) = swaying(seed, math.radians(step_deg)).steps
+
+        assert (step.value, step.t_ns * 1e-9) == ("yaw", pytest.approx(15.0, abs=2.0))
+        assert swaying(seed).steps == ()
+    found = [swaying(seed, math.radians(step_deg), has_rate=False).steps for seed in range(4)]
+    assert sum(len(one) == 1 for one in found) < 3
 
 
 def test_wheels_of_a_straight_drive_do_not_contradict_the_gyro() -> None:
@@ -186,3 +232,12 @@ def test_windows_of_ten_seconds_have_intervals_that_hold_the_truth() -> None:
         inside += [abs(one.mean - 0.02) < 1.96 * one.sd for one in windows]
 
     assert np.mean(inside) > 0.93
+
+
+def test_values_that_never_vary_have_no_step() -> None:
+    t_ns = np.arange(60, dtype=np.int64) * 100_000_000
+    same = np.zeros(60)
+
+    assert steps_of("pitch", t_ns, same, same) == []
+    (step,) = steps_of("pitch", t_ns, np.where(t_ns < t_ns[30], 0.0, 0.01), same)
+    assert step.t_ns == t_ns[30]
