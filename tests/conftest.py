@@ -1,7 +1,10 @@
 """Fixtures and settings of all tests."""
 
+import atexit
 import gc
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +13,11 @@ from hypothesis import HealthCheck, settings
 
 from support.range_server import Served, serving
 
-# Tests do not read or fill the user's cache; tests of the cache name a folder.
+# Tests and their commands do not read or fill the user's cache; tests of a cache name a folder.
+CACHE = tempfile.mkdtemp(prefix="crosscue-tests-")
+atexit.register(shutil.rmtree, CACHE, ignore_errors=True)
+os.environ.setdefault("MPLCONFIGDIR", str(Path.home() / ".cache" / "matplotlib"))
+os.environ["XDG_CACHE_HOME"] = CACHE
 os.environ["CROSSCUE_DBC_CACHE"] = "off"
 # Tests run in parallel, one process per core. Further threads would only wait for each other, and
 # OpenMP waits by spinning. Tests of threads set a number.
