@@ -94,7 +94,7 @@ class LandmarkList(Result):
 
     def lines(self) -> Iterator[str]:
         """Yield a line for the database, and one for each landmark."""
-        head = f"{self.path}: {self.total} landmarks of matcher {self.kind}; "
+        head = f"{self.path}: {counted(self.total, 'landmark')} of matcher {self.kind}; "
         yield f"{head}listed: {len(self.places)}"
         yield from map(_place_line, self.places)
 
@@ -147,7 +147,8 @@ class LandmarkMatches(Result):
     def lines(self) -> Iterator[str]:
         """Yield a line for the picture, and one for each landmark."""
         yield (
-            f"{self.points} points; {self.compared} landmarks compared; min score of a match "
+            f"{counted(self.points, 'point')}; {counted(self.compared, 'landmark')} compared; "
+            f"min score of a match "
             f"{self.min_score:g}"
         )
         for one in self.best:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.safe_text import counted
 
 Bools = NDArray[np.bool_]
 
@@ -124,7 +125,7 @@ class CameraDelay:
             drift = f", drift {self.drift_ppm:+.0f} +- {1.96 * self.drift_sd_ppm:.0f} ppm"
         late = f"{self.delay_s * 1e3:+.0f} +- {1.96 * self.sd_s * 1e3:.0f} ms"
         coarse = "" if self.is_observable else f"; not observable to {OBSERVABLE_S * 1e3:.0f} ms"
-        return f"{late} by {self.signal}, {self.pairs} pairs of pictures{drift}{coarse}"
+        return f"{late} by {self.signal}, {counted(self.pairs, 'pair')} of pictures{drift}{coarse}"
 
 
 def delay_by_yaw_rate(

@@ -121,8 +121,10 @@ def _known(t_ns: Int64s, measured: Floats) -> tuple[Int64s, Floats]:
 
 
 def _window(value: str, t_ns: Int64s, measured: Floats) -> MountingWindow:
-    mean, sd = _mean(value, measured)
-    sd = math.hypot(sd, SAME_SD[value] * (abs(mean) if value == "height" else 1.0))
+    fit = _fitted(np.ones((len(t_ns), 1)), measured, np.empty((len(t_ns), 0)))
+    mean = float(fit.found[0])
+    size = abs(mean) if value == "height" else 1.0
+    sd = math.hypot(fit.sd[0], ROAD_SD[value] * size, SAME_SD[value] * size)
     return MountingWindow(value, int(t_ns[0]), int(t_ns[-1]), mean, sd, len(measured))
 
 
@@ -167,8 +169,6 @@ def without_explained(
 ) -> Floats:
     """Return measurements less what signals explain of them; NaN where either is unknown."""
     is_known = np.isfinite(measured) & np.isfinite(explained)
-    if is_known.sum() < MIN_MEASURED:
-        return measured
     free = np.column_stack([np.ones(len(t_ns)), *(t_ns >= one.t_ns for one in steps)])
     fit = _fitted(free[is_known], measured[is_known], explained[is_known, None])
     return np.asarray(measured - fit.found[-1] * explained)
@@ -208,13 +208,5 @@ def _fitted(free: Floats, measured: Floats, signals: Floats) -> _Fit:
     )
     variance = max(variance + 2.0 * float(shared), variance, scale**2)
     variance /= max(len(near) - design.shape[1], 1)
-    sd = np.sqrt(variance * np.diag(np.linalg.inv(information + variance * prior)))
-    return _Fit(found, sd, rest, scale)
-
-
-def _mean(value: str, measured: Floats) -> tuple[float, float]:
-    """Return the robust mean, and its s.d. with what the road explains."""
-    fit = _fitted(np.ones((len(measured), 1)), measured, np.empty((len(measured), 0)))
-    middle = float(fit.found[0])
-    road = ROAD_SD[value] * (abs(middle) if value == "height" else 1.0)
-    return middle, math.hypot(float(fit.sd[0]), road)
+    spread = variance * np.linalg.inv(information + variance * prior)
+    return _Fit(np.asarray(found, np.float64), np.sqrt(np.diag(spread)), rest, scale)

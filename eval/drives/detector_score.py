@@ -181,7 +181,7 @@ class DetectorScore(Result):
 
 def _line(one: PartScore) -> str:
     if not one.labels and one.part == "all":
-        why = f"not labelled: {one.wrong:,} detections not judged"
+        why = f"not labelled: {counted(one.wrong, 'detection')} not judged"
         return f"{visible(one.label)[:14]:14} {one.part:11} {0:6}  {why}"
     threshold = _number(one.threshold)
     return (

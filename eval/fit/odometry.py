@@ -26,6 +26,7 @@ from crosscue.replay.base import Log, Selection, name_of
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import EmptyResultError, FitError, VehicleError
 from crosscue.replay.files.tree_text import toml_document
+from crosscue.replay.safe_text import counted
 from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.vehicle.pose import OdometryFitted
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
@@ -224,8 +225,9 @@ def _source(one: SourceFit) -> list[str]:
     fit, before, after = one.fit, one.before, one.after
     width = max(len(name) for name in [*(v.parameter for v in fit.fitted), "gyro_bias_radps"])
     lines = [
-        f"turns from {fit.source}: {fit.fixes} positions of s.d. {fit.fix_sd_m:.2f} m, whose error "
-        f"wanders by {fit.wander_m_per_sqrt_s:.2f} m in a second; {fit.outliers} outliers"
+        f"turns from {fit.source}: {counted(fit.fixes, 'position')} of s.d. {fit.fix_sd_m:.2f} m, "
+        f"whose error wanders by {fit.wander_m_per_sqrt_s:.2f} m in a second; "
+        f"{counted(fit.outliers, 'outlier')}"
     ]
     lines += [
         f"  {value.parameter:{width}}  {value.value:.6g} +- {value.sd:.2g}  (was {value.given:.6g})"

@@ -126,7 +126,7 @@ def check_truth(
     matched = 0 if pictures is None else int(np.isin(moments, pictures.t_ns).sum())
     if len(moments) and pictures is not None and not matched:
         raise SchemaError(
-            f"{path}: cues: {log_path} has no picture at any of {len(moments)} moments; the times "
+            f"{path}: cues: {log_path} has no picture at their times, {len(moments)} in all; they "
             "are of another log or clock"
         )
     ranges = 0 if drive.ranges is None else len(drive.ranges.t_ns)

@@ -122,7 +122,7 @@ def _lines(found: pa.Table, width: int) -> Iterator[str]:
     numbers = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
     texts = [i for i, one in enumerate(found.schema) if not any(is_a(one.type) for is_a in numbers)]
     yield from table(found.column_names, rows, width, texts)
-    yield f"{len(rows)} row{'' if len(rows) == 1 else 's'}"
+    yield counted(len(rows), "row")
 
 
 def _records(found: pa.Table) -> list[dict[str, Any]]:

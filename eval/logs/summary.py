@@ -226,7 +226,7 @@ def _can_ids(summary: LogSummary, width: int) -> Iterator[str]:
 def _ids_in_words(bus: TopicSummary) -> str:
     named = ", ".join(
         f"0x{i.arbitration_id:X}{'x' * i.is_extended}"
-        + (f" {i.rate_hz:.3g} Hz" if i.rate_hz else f" {i.count} times")
+        + (f" {i.rate_hz:.3g} Hz" if i.rate_hz else f" {counted(i.count, 'time')}")
         for i in bus.can_ids
     )
     prefix = "most frequent: " if bus.can_id_count > len(bus.can_ids) else ""

@@ -11,7 +11,7 @@ from crosscue.eval.runs.candidates import candidate_lines, not_looked_lines
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import ApproachRow, SceneSummary
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.safe_text import terminal_width, visible, wrapped
+from crosscue.replay.safe_text import counted, terminal_width, visible, wrapped
 from crosscue.replay.time.segments import ONE_SEGMENT, TimeSegment
 from crosscue.results import HIDDEN, Result, json_key
 
@@ -148,7 +148,7 @@ def _lines_of(outcome: Outcome) -> list[str]:
     lines = [] if outcome.scene is None else _found(outcome.scene)
     if outcome.rows:
         lines += [
-            f"pose     {outcome.rows:,} rows over {outcome.travelled_m:.0f} m in "
+            f"pose     {counted(outcome.rows, 'row')} over {outcome.travelled_m:.0f} m in "
             f"{outcome.drive_seconds:.0f} s;",
             f"         2-sigma ellipse {outcome.major_axis_m:.1f} m long at the end",
         ]
@@ -217,6 +217,6 @@ def _approach(one: ApproachRow) -> str:
 def _landmarks(counts: dict[str, int]) -> str:
     looked = counts["frames"] - counts["thinned"] - counts["late"]
     return (
-        f"{counts['accepted']} landmarks used, {counts['gated']} rejected by the gate; "
-        f"{counts['matched']} of {looked} frames examined matched one"
+        f"{counted(counts['accepted'], 'landmark')} used, {counts['gated']} rejected by the gate; "
+        f"{counts['matched']} of {counted(looked, 'frame')} examined matched one"
     )

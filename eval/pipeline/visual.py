@@ -24,6 +24,7 @@ from crosscue.localization.odometry import BY_NOTHING, BY_YAW_RATE, Increments
 from crosscue.localization.visual_odometry import HEIGHT_SD, VisualOdometry
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import VehicleError
+from crosscue.replay.safe_text import counted
 from crosscue.replay.signals.kinds import Signal
 from crosscue.replay.signals.plan import plan
 from crosscue.replay.vehicle.vehicle import Vehicle
@@ -122,7 +123,7 @@ class VisualSource:
         measured = len(self.increments) - self.assumed
         return (
             f"odometry from the pictures (visual): {measured} of "
-            f"{self.pairs} pairs of pictures measured, {self.standing} of them standing; "
+            f"{counted(self.pairs, 'pair')} of pictures measured, {self.standing} standing; "
             f"{self.assumed} at the last speed; distances are as uncertain as camera.z_m"
         )
 

@@ -16,6 +16,7 @@ from crosscue.localization.camera_delay import PictureMotion, delay_by_yaw_rate,
 from crosscue.replay.clocks.findings import duration_text
 from crosscue.replay.clocks.reports import StampReport
 from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.safe_text import counted
 from crosscue.replay.signals.kinds import Samples, Signal
 from crosscue.replay.vehicle.drafting.series import EARTH_RADIUS_M, Series
 
@@ -247,16 +248,16 @@ def _clocks(drive: QualityDrive) -> Found:
 
 def _faults(stamps: StampReport, name: str) -> Iterator[tuple[Kind, str]]:
     if stamps.resets:
-        yield "wrong", f"{name} was set back {stamps.resets} times"
+        yield "wrong", f"{name} was set back {counted(stamps.resets, 'time')}"
     if stamps.late_rows > LOST * stamps.rows and not stamps.resets:
-        text = f"{stamps.late_rows} rows out of order by {name}"
+        text = f"{counted(stamps.late_rows, 'row')} out of order by {name}"
         yield "late", f"{text}, by up to {duration_text(stamps.worst_late_ns)}"
     if stamps.is_constant and stamps.rows > 2:
         yield "wrong", f"{name} never changes"
     if name == "log time":
         return
     if stamps.jumps > stamps.resets:
-        yield "late", f"{name} jumps against log time, {stamps.jumps} times"
+        yield "late", f"{name} jumps against log time, {counted(stamps.jumps, 'time')}"
     line = stamps.line
     if line is None or stamps.is_constant or stamps.rows < MIN_BAD:
         return
@@ -385,7 +386,7 @@ def _jumps(drive: QualityDrive) -> Found:
         near = (seconds > 0.0) & (seconds < STEP_S)
         jumps = int((near & (change > step) & (change > rate * seconds)).sum())
         if jumps:
-            text = f"{words_of(signal)}: {jumps} jumps of more than {step:g} that no car can make"
+            text = f"{words_of(signal)}: {counted(jumps, 'jump')} above {step:g}, as no car makes"
             yield "wrong", NEEDS[signal][0], text, "check its unit, and for invalid readings"
     position = drive.samples.get(Signal.POSITION)
     if position is not None and len(position.t_ns) > 1:
@@ -403,7 +404,7 @@ def _position_jumps(position: Samples) -> Found:
     seconds = np.maximum(np.diff(position.t_ns) * 1e-9, 0.05)
     jumps = int(((way_m > 30.0) & (way_m > GNSS_MPS * seconds)).sum())
     if jumps:
-        text = f"position: {jumps} jumps, the largest {way_m.max():.0f} m"
+        text = f"position: {counted(jumps, 'jump')}, the largest {way_m.max():.0f} m"
         yield "wrong", ("pose", "landmarks"), text, "check the receiver; gnss.gate_nis rejects some"
 
 
@@ -481,7 +482,7 @@ def _damage(drive: QualityDrive) -> Found:
         dropped = sum(topic.dropped.values())
         if topic.name in drive.used_topics and (dropped or topic.dropped_unknown):
             purposes = _purposes(drive.used_topics[topic.name])
-            text = f"{topic.name}: {dropped} of {topic.found + dropped} rows are lost"
+            text = f"{topic.name}: {dropped} of {counted(topic.found + dropped, 'row')} lost"
             yield "damaged", purposes, text, "see crosscue info; copy the log again"
 
 
@@ -489,7 +490,8 @@ def _duplicates(drive: QualityDrive) -> Found:
     for topic in drive.topics:
         if topic.name in drive.used_topics and topic.duplicates > LOST * max(topic.found, 1):
             purposes = _purposes(drive.used_topics[topic.name])
-            text = f"{topic.name}: {topic.duplicates} rows are exact copies of the row before"
+            copies = counted(topic.duplicates, "exact copy", "exact copies")
+            text = f"{topic.name}: {copies} of the row before"
             yield "damaged", purposes, text, "log each message once"
 
 

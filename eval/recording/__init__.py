@@ -26,6 +26,7 @@ from crosscue.replay.columns import Floats
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import spelled
 from crosscue.replay.files.whole_file import write_whole
+from crosscue.replay.safe_text import counted
 
 from .part import WHOLE, RecordingSpan
 
@@ -135,7 +136,7 @@ def _log_all(
         pictures = partial(_read_part, stored, part)
         left_out = camera.send_pictures(recording, pictures, time)
         if left_out:
-            more.append(f"{stored.topic.name}: {left_out} pictures that cannot be decoded")
+            more.append(f"{stored.topic.name}: {counted(left_out, 'picture')} cannot be decoded")
     recording.log("notes", notes(run, more), static=True)
 
 

@@ -210,9 +210,9 @@ def judged_sentences(scored: RunScored) -> tuple[str, ...]:
     results = () if judged is None else judged.results
     told = [_verdict(one, scored.judged.cues, len(results) > 1) for one in results[:MAX_TOLD]]
     if len(results) > MAX_TOLD:
-        told.append(f"{len(results) - MAX_TOLD} more approaches are in the table.")
+        told.append(f"More in the table: {len(results) - MAX_TOLD}.")
     if judged is not None and judged.extra_detected:
-        told.append(f"{judged.extra_detected} times an intersection was believed where none is.")
+        told.append(f"Intersections believed where none is: {judged.extra_detected}.")
     if scored.pose is not None:
         told.append(_pose_sentence(scored.pose))
     return tuple(told)
@@ -292,7 +292,7 @@ def _told(run: RunFolder, tables: RunTables, threshold: float) -> tuple[str, ...
         more = f" {_listed(sides)} believed." if sides else " No road of it believed."
         told.append(f"{name} believed{f' {ahead}' if ahead else ''}.{more}")
     if len(numbers) > MAX_TOLD:
-        told.append(f"{len(numbers) - MAX_TOLD} more approaches are in belief.parquet.")
+        told.append(f"More in belief.parquet: {len(numbers) - MAX_TOLD}.")
     return (*told, *_pose_told(run))
 
 

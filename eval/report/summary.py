@@ -175,7 +175,7 @@ def _approaches(one: ApproachScore) -> list[str]:
             _line(
                 "false",
                 f"absent features believed in {one.false_features.right} of "
-                f"{one.false_features.of} approaches: {reported}",
+                f"{counted(one.false_features.of, 'approach', 'approaches')}: {reported}",
             )
         )
     for what, reasons in one.failures.items():

@@ -243,9 +243,8 @@ def _measure(
     whole = read_training_coco(Path(settings.data), Path(settings.images), classes)
     labelled = replace(whole, pictures=whole.pictures[_slice(measuring.subset)])
     if not labelled.pictures:
-        count = len(whole.pictures)
         raise UsageError(
-            f"subset: {measuring.subset}: selects none of {count} pictures; select others"
+            f"subset: {measuring.subset}: selects none of {len(whole.pictures)}; select others"
         )
     measured: dict[int, NetworkResults] = {}
     for count in measuring.proposals:
@@ -261,7 +260,7 @@ def _set_text(one: LabelledSet) -> str:
     """Return the numbers of pictures, of objects without a mask, and of what was left out."""
     text, bare = counted(len(one.pictures), "picture"), one.objects - one.masks
     if bare:
-        text += f", {bare} of {one.objects} objects without a mask"
+        text += f", {bare} of {counted(one.objects, 'object')} without a mask"
     left_out = ", ".join(f"{count} {why}" for why, count in sorted(one.left_out.items()))
     return f"{text}; {left_out}" if left_out else text
 

@@ -25,6 +25,7 @@ from crosscue.localization.camera_watch import (
 from crosscue.localization.visual_odometry import Travel
 from crosscue.replay.base import EVERYTHING, Log, Selection
 from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.safe_text import counted
 from crosscue.replay.vehicle.drafting.camera import Intrinsics, MountingParameter
 from crosscue.replay.vehicle.drafting.series import Series
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle
@@ -199,8 +200,8 @@ def _with_angles(found: Estimate, seen: PicturePass, watch: MountingWatch) -> Es
         pitch, yaw = (_angle(watch.whole[name]) for name in ("pitch", "yaw"))
     else:
         notes.append(
-            f"pitch and yaw {NOT_CAN}{len(seen.travel)} pairs of pictures of a straight road, "
-            f"{seen.bends} in bends; needs {MIN_PAIRS} or more"
+            f"pitch and yaw {NOT_CAN}{counted(len(seen.travel), 'pair')} of pictures of a "
+            f"straight road, {seen.bends} in bends; needs {MIN_PAIRS} or more"
         )
     height = watch.whole.get("height")
     if height is None or height.sd > HEIGHT_SD * height.mean:
@@ -244,7 +245,7 @@ def watch_mounting(seen: PicturePass, motion: CarMotion) -> MountingWatch:
             explained["pitch"] = nod
             measured["pitch"] = np.where(is_steady, travel[:, 1] + nod, np.nan)
     if yaw_rate is not None and len(yaw_rate) > 1:
-        by_turn, slip = _by_turn(seen, yaw_rate, speed)
+        by_turn, slip = _by_turn(seen, travel, yaw_rate, speed)
         if np.isfinite(by_turn).sum() >= MIN_PAIRS:
             explained["yaw"] = by_turn
             measured["yaw"] = travel[:, 0] + slip
@@ -254,11 +255,10 @@ def watch_mounting(seen: PicturePass, motion: CarMotion) -> MountingWatch:
         steps += found
         if name in explained:
             measured[name] = without_explained(t_ns, measured[name], explained[name], found)
-    entire = {name: whole(name, t_ns, measured[name]) for name, t_ns in times.items()}
     return MountingWatch(
         tuple(one for name in times for one in windows_of(name, times[name], measured[name])),
         tuple(steps),
-        {name: window for name, window in entire.items() if window is not None},
+        {name: one for name in times if (one := whole(name, times[name], measured[name]))},
     )
 
 
@@ -271,17 +271,16 @@ def _nod(t_ns: Int64s, speed: Series) -> tuple[Floats, NDArray[np.bool_]]:
     return NOD_RAD * (now - earlier) * 1e9 / NODS_NS, changes < STEADY_MPS2
 
 
-def _by_turn(seen: PicturePass, yaw_rate: Series, speed: Series | None) -> tuple[Floats, Floats]:
+def _by_turn(
+    seen: PicturePass, travel: Floats, yaw_rate: Series, speed: Series | None
+) -> tuple[Floats, Floats]:
     """Return what the yaw rate explains of the direction of travel, and the camera's sideslip.
 
     Few pictures tell a turn from a movement to the side, so that most of an error of the direction
     is that of the turn they show, which the yaw rate knows better. A camera ahead of the rear axle
     moves sideways in bends.
     """
-    turned, per_turn, seconds = (
-        np.array([getattr(one, name) for one in seen.travel], np.float64)
-        for name in ("turned_rad", "per_turn", "seconds")
-    )
+    _, _, turned, _, per_turn, seconds = travel.T
     start_ns = seen.travel_ns - np.round(seconds * 1e9).astype(np.int64)
     inside = (start_ns >= yaw_rate.t_ns[0]) & (seen.travel_ns <= yaw_rate.t_ns[-1])
     usable = inside & (seconds > 0.0) & (seconds < MOVES_S)
@@ -344,12 +343,12 @@ def _why_no_delay(delays: tuple[CameraDelay, ...]) -> str:
 def _angle(window: MountingWindow) -> MountingParameter:
     return MountingParameter(
         window.mean,
-        f"ESTIMATED: {window}, the vanishing point of {window.measured} pairs of pictures",
+        f"ESTIMATED: {window}, vanishing point of {counted(window.measured, 'pair')} of pictures",
     )
 
 
 def _height(window: MountingWindow) -> MountingParameter:
     return MountingParameter(
         window.mean,
-        f"ESTIMATED: {window}, from the speed and {window.measured} pairs of pictures of the road",
+        f"ESTIMATED: {window}, by speed and road in {counted(window.measured, 'pair')} of pictures",
     )

@@ -5,6 +5,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Final
 
 from crosscue.replay.clocks.clock import Clock
+from crosscue.replay.safe_text import counted
 
 from .order import ClockStep
 from .reports import MAX_OFFSET_NS, ClockReport, StampReport
@@ -99,13 +100,14 @@ def _of_topic(report: ClockReport, start_ns: int) -> Iterator[str]:
     name = report.topic
     yield from (f"{name}: {s}" for s in _of_order(report.log, Clock.LOG, start_ns))
     if report.log.absurd:
-        yield f"{name}: {_rows(report.log.absurd)} with a log time before 1970 or after 2115"
+        rows = counted(report.log.absurd, "row")
+        yield f"{name}: {rows} with a log time before 1970 or after 2115"
     gaps = report.of_used
     if gaps.gaps and gaps.longest_step_ns and gaps.longest_step_at_ns and gaps.gap_over_ns:
         offset_ns = gaps.line.offset_ns if gaps.line else 0
         at_s = (gaps.longest_step_at_ns - offset_ns - start_ns) / SECOND_NS
         yield (
-            f"{name}: {_times(gaps.gaps, 'gap')} over {duration_text(gaps.gap_over_ns)}"
+            f"{name}: {counted(gaps.gaps, 'gap')} over {duration_text(gaps.gap_over_ns)}"
             f"{' (5 periods)' if gaps.is_steady else ''}, "
             f"the longest {duration_text(gaps.longest_step_ns)} at {at_s:.2f} s"
         )
@@ -119,24 +121,25 @@ def _of_order(stamps: StampReport, clock: Clock, start_ns: int) -> Iterator[str]
         yield f"{clock.value} was set back {_steps(stamps.resets, stamps.reset_steps, start_ns)}"
     if stamps.late_rows:
         yield (
-            f"{_rows(stamps.late_rows)} in {_times(stamps.late_stretches, 'stretch', 'es')} out of "
+            f"{counted(stamps.late_rows, 'row')} in "
+            f"{counted(stamps.late_stretches, 'stretch', 'stretches')} out of "
             f"order on {clock.value}, by up to {duration_text(stamps.worst_late_ns)}"
         )
     # A recorder often stores a burst at one instant, but a sensor should not repeat a stamp.
     worth = DUPLICATES_WORTH_TELLING * stamps.rows if clock is Clock.LOG else 0
     if stamps.duplicates > worth and stamps.is_steady and not stamps.is_constant:
-        yield f"{_rows(stamps.duplicates)} with the {clock.value} of the row before"
+        yield f"{counted(stamps.duplicates, 'row')} with the {clock.value} of the row before"
     if stamps.is_constant:
-        yield f"{clock.value} is the same on all {stamps.rows} rows"
+        yield f"{clock.value} is the same on all {counted(stamps.rows, 'row')}"
 
 
 def _of_other(
     stamps: StampReport, clock: Clock, report: ClockReport, start_ns: int
 ) -> Iterator[str]:
     if stamps.unset:
-        yield f"{clock.value} is 0 on {stamps.unset} of {report.count} rows"
+        yield f"{clock.value} is 0 on {stamps.unset:,} of {counted(report.count, 'row')}"
     if stamps.absurd:
-        yield f"{clock.value} is absurd on {stamps.absurd} of {report.count} rows"
+        yield f"{clock.value} is absurd on {stamps.absurd:,} of {counted(report.count, 'row')}"
     yield from _of_order(stamps, clock, start_ns)
     if stamps.jumps > stamps.resets:
         steps = _steps(stamps.jumps, stamps.jump_steps, start_ns)
@@ -179,11 +182,3 @@ def _steps(count: int, steps: tuple[ClockStep, ...], start_ns: int) -> str:
     at_s = (first.at_log_ns - start_ns) / SECOND_NS
     times = "once" if count == 1 else f"{count} times, first"
     return f"{times} by {duration_text(first.by_ns)} at {at_s:.2f} s"
-
-
-def _rows(count: int) -> str:
-    return "1 row" if count == 1 else f"{count} rows"
-
-
-def _times(count: int, noun: str, plural: str = "s") -> str:
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}{plural}"

@@ -24,6 +24,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.columns import Block, Int64s
+from crosscue.replay.safe_text import counted
 
 from .clock import LATEST_NS, Clock
 from .offset import ClockLine, OffsetWatch
@@ -182,15 +183,15 @@ def _disagreement(count: int, stamps: StampReport) -> str | None:
     if not stamps.rows or line is None:
         return "is never set"
     if stamps.rows < MIN_SHARE * count:
-        return f"is missing on {count - stamps.rows} of {count} rows"
+        return f"is missing on {count - stamps.rows:,} of {counted(count, 'row')}"
     if stamps.is_constant:
         return "never changes"
     if stamps.resets:
-        return f"was set back {stamps.resets} times"
+        return f"was set back {counted(stamps.resets, 'time')}"
     if stamps.jumps:
-        return f"jumps {stamps.jumps} times against the log clock"
+        return f"jumps {counted(stamps.jumps, 'time')} against the log clock"
     if stamps.late_rows > MAX_LATE_SHARE * stamps.rows:
-        return f"is out of order on {stamps.late_rows} rows"
+        return f"is out of order on {counted(stamps.late_rows, 'row')}"
     if abs(line.offset_ns) > MAX_OFFSET_NS:
         return f"is {line.offset_ns * 1e-9:+.3f} s off the log clock"
     if line.drift_ppm is not None and abs(line.drift_ppm) > MAX_DRIFT_PPM:

@@ -26,6 +26,7 @@ from crosscue.replay.columns import Block, CanFrames, Images, Messages, Topic
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Detail, Ledger, TopicAccount
 from crosscue.replay.progress import Progress, emit
+from crosscue.replay.safe_text import counted
 from crosscue.replay.seal.log import sealed_sentence
 from crosscue.replay.vehicle.roles import Role, role_of
 
@@ -371,7 +372,8 @@ def _of_nameless(account: TopicAccount) -> Iterator[str]:
     if not account.is_whole:
         why = ", ".join(dict.fromkeys([*account.dropped, *account.dropped_unknown]))
         at_least = "at least " if account.dropped_unknown else ""
-        yield f"{at_least}{account.dropped.total()} rows of unknown topics dropped: {why}"
+        lost = counted(account.dropped.total(), "row")
+        yield f"{at_least}{lost} of unknown topics dropped: {why}"
 
 
 def _of_account(topics: Iterable[TopicSummary], *, is_quick: bool) -> Iterator[str]:
@@ -380,17 +382,14 @@ def _of_account(topics: Iterable[TopicSummary], *, is_quick: bool) -> Iterator[s
         if count or topic.dropped_unknown:
             at_least = "at least " if topic.dropped_unknown else ""
             why = ", ".join(dict.fromkeys([*topic.dropped, *topic.dropped_unknown]))
-            yield f"{topic.name}: {at_least}{count} of {topic.found + count} rows dropped: {why}"
+            rows = counted(topic.found + count, "row")
+            yield f"{topic.name}: {at_least}{count:,} of {rows} dropped: {why}"
         if topic.duplicates:
-            rows = (
-                "1 row is an exact copy"
-                if topic.duplicates == 1
-                else (f"{topic.duplicates} rows are exact copies")
-            )
-            yield f"{topic.name}: {rows} of the row before: same stamp, same content"
+            copies = counted(topic.duplicates, "exact copy", "exact copies")
+            yield f"{topic.name}: {copies} of the row before: same stamp, same content"
         if topic.used == 0 and topic.found:
             why = ", ".join(topic.skipped)
-            yield f"{topic.name}: none of its {topic.found} rows can be used: {why}"
+            yield f"{topic.name}: none of its {counted(topic.found, 'row')} can be used: {why}"
     if not is_quick and not any(topic.found for topic in topics):
         yield "it contains no rows"
 

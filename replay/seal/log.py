@@ -122,7 +122,8 @@ def _report(check: Check, ledger: Ledger) -> None:
     spans = list(check.damaged())
     for span in spans:
         ledger.drop("", DIFFERS, None, f"{span.name}: bytes {span.start} to {span.stop}")
-    state = f"sealed at {seal.sealed_at} ({HASH}): {check.checked} of {seal.blocks} blocks of 1 MiB"
+    blocks = counted(seal.blocks, "block")
+    state = f"sealed at {seal.sealed_at} ({HASH}): {check.checked} of {blocks} of 1 MiB"
     bad = "some differ" if spans else "none differs"
     ledger.integrity = f"{ledger.integrity}; {state} were checked, {bad}"
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from crosscue.replay.base import EVERYTHING, Log, Selection
 from crosscue.replay.columns import Block, Int64s
 from crosscue.replay.ledger import Ledger, ReversedTimes
+from crosscue.replay.safe_text import counted
 
 STRAY_STAMP: Final = "stray time stamp"
 BEGINNING: Final = int(np.iinfo(np.int64).min)
@@ -256,15 +257,15 @@ def gaps_text(segments: Sequence[TimeSegment]) -> list[str]:
     silent = [one.gap_ns for one in later if one.gap_ns is not None]
     parts = []
     if silent:
-        noun = "gap" if len(silent) == 1 else "gaps"
         parts.append(
-            f"{len(silent)} {noun} without odometry, {sum(silent) * 1e-9:.1f} s in all"
+            f"{counted(len(silent), 'gap')} without odometry, {sum(silent) * 1e-9:.1f} s in all"
             + (f", the longest {max(silent) * 1e-9:.1f} s" if len(silent) > 1 else "")
         )
     back = [-one.by_ns * 1e-9 for one in later if one.cause is Cause.SET_BACK]
     if back:
-        times = "once" if len(back) == 1 else f"{len(back)} times"
+        times = "once" if len(back) == 1 else counted(len(back), "time")
         parts.append(f"the log's clock was set back {times}, by up to {max(back):.1f} s")
     return [
-        f"{len(segments)} time segments: {'; '.join(parts)}; distance counts measured motion only"
+        f"{counted(len(segments), 'time segment')}: {'; '.join(parts)}; "
+        "distance counts measured motion only"
     ]

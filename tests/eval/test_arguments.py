@@ -20,12 +20,12 @@ def test_error_names_the_argument_of_a_function_and_the_option_of_its_command() 
 # Command lines with a wrong value, and what the error says; no file that they name exists.
 LINES: Final[dict[str, str]] = {
     "fit ranges --cue stop_sign": "--truth: expected drives",
-    "fit ranges --cue stop_sign --truth a b --runs run": "--runs: 1 runs for 2 drives",
+    "fit ranges --cue stop_sign --truth a b --runs run": "--runs: got 1 for 2",
     "fit signs gone --label stop --test-every 0": "--test-every 0: expected 1 or more",
     "fit landmarks --pairs gone --false-match-rate 1": "--false-match-rate 1: expected 0 or more",
     "fit detector gone --labels labels --hold-out 1": "--hold-out 1.0: expected above 0",
     "fit detector gone --labels labels --test other": (
-        "--test-labels: 0 for 1 runs; expected one for each"
+        "--test-labels: got 0 for 1; expected one for each run"
     ),
     "fit temporal a b --truth truth.json": "--truth: 2 runs, 1 truth files",
     "failures run --top 0": "--top 0: expected 1 or more",

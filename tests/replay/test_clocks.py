@@ -132,11 +132,11 @@ def test_clock_set_back_is_counted_only_as_reset(
     [
         (np.zeros(2000, dtype=np.int64), 2000, "is never set"),
         (np.full(2000, START_NS), 0, "never changes"),
-        (np.where(np.arange(2000) % 2, steady(), 0), 1000, "missing on 1000 of 2000"),
+        (np.where(np.arange(2000) % 2, steady(), 0), 1000, "missing on 1,000 of 2,000"),
         (steady() - START_NS, 1, "off the log clock"),
         (steady()[::-1], 0, "was set back"),
         (steady() + np.arange(2000) * 20_000, 0, r"drifts \+2000 ppm"),
-        (np.concatenate([steady()[:900], steady()[900:] + SECOND_NS]), 0, "jumps 1 times"),
+        (np.concatenate([steady()[:900], steady()[900:] + SECOND_NS]), 0, "jumps 1 time against"),
     ],
     ids=["zero", "constant", "half", "boot", "backwards", "drift", "jump"],
 )
@@ -227,10 +227,10 @@ def test_faulty_header_stamp_is_reported() -> None:
     set_back = replace(STREAM, jumps={600: -4 * SECOND_NS}).header_ns()
 
     assert findings_of(with_header(np.zeros(1200, dtype=np.int64))) == (
-        "/camera: header stamp is 0 on 1200 of 1200 rows",
+        "/camera: header stamp is 0 on 1,200 of 1,200 rows",
     )
     assert findings_of(with_header(np.full(1200, START_NS))) == (
-        "/camera: header stamp is the same on all 1200 rows",
+        "/camera: header stamp is the same on all 1,200 rows",
     )
     assert findings_of(with_header(drifting)) == (
         "/camera: header stamp runs 200 ppm fast against the log clock (12 ms a minute)",

@@ -231,7 +231,7 @@ def test_file_of_sealed_folder_is_checked_against_folder_seal(
     place = write_folder(tmp_path / "bag", rows_of(50))
     assert run(["seal", str(place)]) == 0
     database = next(place.glob("*.db3"))
-    assert "1 of 1 blocks of 1 MiB were checked, none differs" in read(database)[1].integrity
+    assert "1 of 1 block of 1 MiB were checked, none differs" in read(database)[1].integrity
     run(["info", "--quick", str(database)])
     assert f"by {place.name}.seal of the folder" in " ".join(capsys.readouterr().out.split())
 

@@ -182,8 +182,8 @@ class Catalog:
             return ""
         first, other = sorted(found["examples"][0].as_py())[:2]
         return (
-            f"{found.num_rows} drives have runs of different settings, as {first} and {other}: "
-            "settings_sha256 tells them apart"
+            f"{counted(found.num_rows, 'drive')} with runs of different settings, as {first} "
+            f"and {other}: settings_sha256 tells them apart"
         )
 
     @cached_property

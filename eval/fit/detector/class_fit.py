@@ -181,8 +181,8 @@ def fit_class(
     calibration = _calibration(chosen_on, kind)
     if calibration is None and kind != "none":
         notes.append(
-            f"scores not calibrated: {right} right and {n - right} wrong detections, {MIN_EACH} of "
-            "each needed"
+            f"scores not calibrated: {right} right and {counted(n - right, 'wrong detection')}, "
+            f"{MIN_EACH} of each needed"
         )
     found = bounded_threshold(chosen_on.scores, chosen_on.is_right, precision, confidence)
     if found is None:
@@ -210,7 +210,7 @@ def _applied(calibration: Platt | None, scores: NDArray[np.float64]) -> NDArray[
 def _why_none(judged: ClassDetections, precision: float, confidence: float) -> str:
     fewest = fewest_detections(precision, confidence)
     if len(judged.scores) < fewest:
-        return f"no threshold: {len(judged.scores)} detections, at least {fewest} needed"
+        return f"no threshold: {counted(len(judged.scores), 'detection')}, at least {fewest} needed"
     best = best_bound(judged.scores, judged.is_right, precision, confidence)
     return f"no threshold reaches {precision:g}: the best lower bound is {best:.3f}"
 

@@ -219,8 +219,8 @@ class DetectorFitSettings:
             raise UsageError(f"calibration: {self.calibration}, expected one of {names}")
         if len(self.test_labels) != len(self.test):
             raise UsageError(
-                f"test_labels: {len(self.test_labels)} for {len(self.test)} runs; expected one for "
-                "each, in the same order"
+                f"test_labels: got {len(self.test_labels)} for {len(self.test)}; "
+                "expected one for each run, in the same order"
             )
 
 
@@ -267,7 +267,7 @@ def fit_detector(
     theirs = [labels] if isinstance(labels, Path | str) else list(labels)
     if len(theirs) != len(given):
         raise UsageError(
-            f"labels: {len(theirs)} for {len(given)} runs; expected one for each, in the same order"
+            f"labels: got {len(theirs)} for {len(given)}; expected one for each run, in this order"
         )
     output, card = settings.output, settings.card
     if card is not None:
@@ -315,7 +315,7 @@ def fit_detector(
     written = None
     if output is not None and source is not None and any(one.scores for one in fits):
         written = Path(output)
-        numbers = f"{len(fitted)} images fitted to, {len(held)} held out"
+        numbers = f"{counted(len(fitted), 'image')} fitted to, {len(held)} held out"
         pictures = f"{numbers}, of {_log_names(whole)}{_date_of(fitted.runs)}"
         aim = f"precision {settings.precision:g} with {CONFIDENCE:.0%} confidence"
         text = with_fit(source.read_text(encoding="utf-8"), fits, pictures, aim)

@@ -90,7 +90,7 @@ class FittedRanges(Fitted):
         yield from _bins(best.bins)
         if tested is not None:
             sd = tested.curve.residual_sd_m
-            yield from ("", f"on other drives, {tested.pairs} pairs, r.m.s. {sd:.2f} m:")
+            yield from ("", f"on other drives, {counted(tested.pairs, 'pair')}, r.m.s. {sd:.2f} m:")
             yield from _bins(tested.bins)
 
     def charts(self) -> Iterator[Chart]:
@@ -173,7 +173,7 @@ class RangeFitSettings:
             raise UsageError("truth: expected drives, or else a TABLE of pairs")
         if self.runs and self.truth and len(self.runs) != len(self.truth):
             runs, drives = len(self.runs), len(self.truth)
-            raise UsageError(f"runs: {runs} runs for {drives} drives; expected one run per drive")
+            raise UsageError(f"runs: got {runs} for {drives}; expected one run per drive")
 
 
 @keywords(RangeFitSettings)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from crosscue.replay.ledger import Ledger
+from crosscue.replay.safe_text import counted
 
 
 @dataclass(slots=True)
@@ -67,36 +68,32 @@ class Checks:
         right: list[str] = []
         read = self.chunks - self.chunks_unread
         if read and not self.chunks_unread:
-            right.append(f"{self.chunks_right} of {self.chunks} chunks")
+            right.append(f"{self.chunks_right} of {counted(self.chunks, 'chunk')}")
         elif self.chunks_right != read:
-            right.append(_many(self.chunks_right, "chunk"))
+            right.append(counted(self.chunks_right, "chunk"))
         if self.sections_right:
             right.append("the data section")
         if self.summaries_right:
             right.append("the summary")
         if self.attachments > self.attachments_unread:
-            right.append(f"{self.attachments_right} of {self.attachments} attachments")
+            right.append(f"{self.attachments_right} of {counted(self.attachments, 'attachment')}")
         has_any = self.chunks_right + self.sections_right + self.summaries_right
         parts = [f"CRC-32 verified: {', '.join(right)}"] if has_any and right else []
         if self.chunks_bare or self.rows_bare:
-            what = [_many(self.chunks_bare, "chunk")] if self.chunks_bare else []
-            bare = _many(self.rows_bare, "message")
+            what = [counted(self.chunks_bare, "chunk")] if self.chunks_bare else []
+            bare = counted(self.rows_bare, "message")
             what += [f"{bare} outside complete chunks"] if self.rows_bare else []
             parts.append(f"no checksum covers {' and '.join(what)}")
         if self.chunks_unread:
             verb = "was" if read == 1 else "were"
             verified = " and verified" if read and read == self.chunks_right else ""
             parts.append(
-                f"of {_many(self.chunks, 'chunk')} {read} {verb} read{verified}; the rest was not"
+                f"of {counted(self.chunks, 'chunk')} {read} {verb} read{verified}; the rest was not"
             )
         if self.attachments_unread:
-            parts.append(f"{_many(self.attachments_unread, 'attachment')} not read")
+            parts.append(f"{counted(self.attachments_unread, 'attachment')} not read")
         if self.sections_unread:
             parts.append("the data section's checksum was not compared, which takes every byte")
         if self.sections_wrong:
             parts.append("the data section's checksum is wrong")
         return "; ".join(parts) or "the file has no checksums"
-
-
-def _many(count: int, noun: str) -> str:
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -67,7 +67,8 @@ class Series:
     def integral(self, t_ns: Int64s) -> Floats:
         """Return the integral up to each time; every reading counts, so that noise averages out."""
         steps = 0.5 * (self.values[1:] + self.values[:-1]) * np.diff(self.t_ns) * 1e-9
-        return np.interp(t_ns, self.t_ns, np.concatenate([[0.0], np.cumsum(steps)]))
+        area = np.concatenate([[0.0], np.cumsum(steps)])
+        return np.asarray(np.interp(t_ns, self.t_ns, area), np.float64)
 
     def turned(self, grid: Grid) -> Floats:
         """Integrate an angular rate over each window, rad; NaN where readings are missing."""

@@ -149,7 +149,7 @@ def test_landmarks_list_and_match_report_stored_landmarks(town: Town) -> None:
     assert found["compared"] == listed["landmarks"]
     assert (found["best"][0]["name"], found["best"][0]["is_match"]) == (first["name"], True)
     assert not found["best"][3]["is_match"]
-    assert "1 landmarks compared" in output_of("landmarks", "match", town.database, picture, near)
+    assert "1 landmark compared" in output_of("landmarks", "match", town.database, picture, near)
 
 
 def photos(folder: Path, table: str) -> tuple[Path, Path]:

@@ -68,7 +68,7 @@ def test_pictures_alone_give_odometry_that_is_named_in_the_account(tmp_path: Pat
     run = replayed(tmp_path)
     manifest, scene = scene_of(run)
     (notice,) = [one for one in manifest.notices if "visual" in one]
-    assert "8 of 8 pairs of pictures measured, 2 of them standing" in notice
+    assert "8 of 8 pairs of pictures measured, 2 standing" in notice
     used = manifest.account.estimating["pairs of pictures"]
     assert (used.entered, used.used) == (8, 8)
     rows = [row for row in run["measurements"].to_pylist() if row["kind"] == "odometry"]

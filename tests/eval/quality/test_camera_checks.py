@@ -198,7 +198,8 @@ def test_step_of_the_yaw_is_found_though_pictures_mistake_turns(step_deg: float)
     for seed in range(4):
         (step,) = swaying(seed, math.radians(step_deg)).steps
 
-        assert (step.value, step.t_ns * 1e-9) == ("yaw", pytest.approx(15.0, abs=2.0))
+        assert step.value == "yaw"
+        assert step.t_ns * 1e-9 == pytest.approx(15.0, abs=2.0)
         assert swaying(seed).steps == ()
     found = [swaying(seed, math.radians(step_deg), has_rate=False).steps for seed in range(4)]
     assert sum(len(one) == 1 for one in found) < 3

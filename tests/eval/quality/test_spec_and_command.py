@@ -164,7 +164,7 @@ def test_info_names_exact_copies() -> None:
 
     (sentence,) = [one for one in summary_of(streams).findings if "exact cop" in one]
 
-    assert sentence.startswith(f"wheels: {len(wheels.t_s)} rows are exact copies")
+    assert sentence.startswith(f"wheels: {len(wheels.t_s)} exact copies")
 
 
 def test_lost_rows_of_a_used_topic_are_found(kitti: Path) -> None:
