@@ -118,7 +118,11 @@ def test_dockerfile_copies_what_exists_and_starts_a_command(
     assert SpecifierSet(project["requires-python"]).contains(version)
     assert of["COPY"] == [". /crosscue"]
     ignored = (ROOT / ".dockerignore").read_text().splitlines()
-    assert not {*ignored} & {"requirements.lock", "pyproject.toml", "README.md", "crosscue"}
+    packages = {one.resolve().name for one in (ROOT / "crosscue").iterdir() if one.is_dir()}
+    assert {"replay", "detectors", "eval"} <= packages
+    needed = {"requirements.lock", "pyproject.toml", "README.md", "LICENSE", "crosscue", *packages}
+    assert not {*ignored} & needed
+    assert {".git", ".venv", "docs", "tests", "benchmarks"} <= {*ignored}
     for path in re.findall(r"/crosscue/([\w./-]+)", of["RUN"][0]):
         assert (ROOT / path).is_file(), path
     assert of["VOLUME"] == of["WORKDIR"]
