@@ -230,7 +230,7 @@ def check(
         OutputError: The JUnit file cannot be written.
     """
     if unknown := [one for one in purposes if one not in PURPOSES]:
-        raise UsageError(f"purposes: {unknown[0]}: expected {', '.join(PURPOSES)}")
+        raise UsageError(f"purposes: {', '.join(unknown)}: expected {', '.join(PURPOSES)}")
     if init and spec is None:
         raise UsageError("init: needs a file to write; name it with spec")
     if not (math.isfinite(seconds) and seconds > 0.0):

@@ -160,7 +160,8 @@ def _read(file: Path, wanted: set[str]) -> _Lines:
     reader = csv.reader(lines_of(file, MAX_FILE_BYTES))
     header = next(reader, [])
     if missing := sorted(wanted - {*header}):
-        raise LogFormatError(f"{file}: no column {missing[0]!r}; expected the published columns")
+        names = ", ".join(map(repr, missing))
+        raise LogFormatError(f"{file}: no column {names}; expected the published columns")
     times: list[int] = []
     fields: list[dict[str, str]] = []
     losses: list[Loss] = []

@@ -173,11 +173,11 @@ class ModelCard(Settings):
             raise ValueError("output.classes is empty; list the network's classes in their order")
         unknown = [name for name in self.labels if name not in classes]
         if unknown:
-            raise ValueError(f"labels: {unknown[0]!r} is not one of output.classes")
+            raise ValueError(f"labels: not in output.classes: {', '.join(map(repr, unknown[:8]))}")
         meanings = set(map(self.meaning, range(len(classes))))
         others = [name for name in self.scores if name not in meanings]
         if others:
-            raise ValueError(f"scores: {others[0]!r} is not a label of its classes")
+            raise ValueError(f"scores: not labels of classes: {', '.join(map(repr, others[:8]))}")
         return self
 
     @model_validator(mode="after")

@@ -35,7 +35,7 @@ class RecordingSpan:
         """
         strange = sorted(self.only.difference(VIEWS))
         if strange:
-            raise UsageError(f"--only {strange[0]}: expected some of {','.join(VIEWS)}")
+            raise UsageError(f"--only {','.join(strange)}: expected some of {','.join(VIEWS)}")
 
     @property
     def is_whole(self) -> bool:

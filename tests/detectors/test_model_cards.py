@@ -153,7 +153,7 @@ def test_mask_has_the_size_of_the_camera_picture(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("output", "sections", "message"),
     [
-        (BRIGHT, {"labels": 'bicycle = "car"'}, "'bicycle' is not one of output.classes"),
+        (BRIGHT, {"labels": 'bike = "car"\nbus = "car"'}, "not in output.classes: 'bike', 'bus'"),
         ('kind = "yolo12"\nclasses = ["car"]', {}, "yolox"),
     ],
 )

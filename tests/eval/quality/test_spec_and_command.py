@@ -132,8 +132,8 @@ def test_exit_status_is_that_of_the_verdict(kitti: Path) -> None:
 
 
 def test_purpose_that_does_not_exist_is_refused(kitti: Path) -> None:
-    with pytest.raises(UsageError, match="purposes: fun: expected pose"):
-        crosscue.check(kitti, purposes=["fun"])  # type: ignore[list-item]
+    with pytest.raises(UsageError, match="purposes: fun, joy: expected pose"):
+        crosscue.check(kitti, purposes=["fun", "joy"])  # type: ignore[list-item]
     with pytest.raises(UsageError, match="init: needs a file"):
         crosscue.check(kitti, init=True)
 

@@ -249,7 +249,7 @@ def test_approach_is_recorded_from_its_first_step_to_its_last(tmp_path: Path) ->
         ("--at noon", "expected seconds"),
         ("--at nan", "expected seconds"),
         ("--at 1 --approach 7", "not allowed"),
-        ("--only sky", "expected some of cameras"),
+        ("--only sky,sun", "--only sky,sun: expected some of cameras"),
     ],
 )
 def test_invalid_part_options_are_refused_in_one_line(
