@@ -9,7 +9,7 @@ import pytest
 
 from crosscue.localization.visual_odometry import VisualOdometry, VisualStep
 from crosscue.replay.vehicle.camera import Camera
-from support.plane_pictures import CAMERA, WALL, arc, picture
+from support.plane_pictures import CAMERA, SIZE_PX, WALL, arc, picture
 
 NO_BOXES: Final = np.empty((0, 4))
 
@@ -36,6 +36,21 @@ def test_distance_and_turn_of_an_arc_are_found_in_every_pair(
         assert step.distance_m == pytest.approx(step_m, rel=0.04)
         assert abs(step.distance_m - step_m) < 2.0 * step.distance_sd_m
         assert math.degrees(step.turn_rad) == pytest.approx(turn_deg, abs=0.1)
+
+
+def test_pictures_in_a_mirror_turn_to_the_other_side() -> None:
+    """The picture is mirrored about its middle, half a pixel from the camera's centre."""
+    poses, (width_px, _) = arc(1.0, math.radians(1.5), 4), SIZE_PX
+    x_px, y_px = CAMERA.center_px or (math.nan, math.nan)
+    mirrored = VisualOdometry(CAMERA.model_copy(update={"center_px": (width_px - 1 - x_px, y_px)}))
+    found = [
+        mirrored(i * 100_000_000, np.ascontiguousarray(picture(*pose)[:, ::-1]), NO_BOXES)
+        for i, pose in enumerate(poses)
+    ]
+    for step, other in zip(driven(poses), found[1:], strict=True):
+        assert other is not None
+        assert math.degrees(other.turn_rad + step.turn_rad) == pytest.approx(0.0, abs=0.01)
+        assert other.distance_m == pytest.approx(step.distance_m, rel=0.01)
 
 
 def test_a_wrong_pitch_is_corrected_by_the_ground_and_the_direction_of_travel() -> None:
