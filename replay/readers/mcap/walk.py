@@ -314,7 +314,8 @@ class Walk:
         """Return whether a record of an unknown kind is genuine, and not a damaged message."""
         if self._resync.is_hidden(at, length):
             return False
-        return self._before is None or self._resync.continues(at + PREFIX.size + length, 1)
+        after = at + PREFIX.size + length
+        return self._before is None or self._resync.follows_unknown(after)
 
     def _whole(self, length: int, near: memoryview | None = None) -> memoryview:
         """Return the content of the record here, of which ``near`` may have been read."""

@@ -83,15 +83,16 @@ def test_chunks_are_read_together_though_the_first_one_repeats_definitions(tmp_p
     assert sizes == [("/a", 3), ("/b", 3)]
 
 
+@pytest.mark.parametrize("pairs", [1, 10])
 @pytest.mark.parametrize("is_chunked", [True, False])
-def test_unknown_record_kinds_are_ignored_with_notice(tmp_path: Path, is_chunked: bool) -> None:
-    odd = [record(0x99, b"a private record of its application"), record(0x42, bytes(50))]
-    # Between records without a chunk, two of them in a row are taken for damage.
-    odd = odd if is_chunked else odd[:1]
+def test_unknown_record_kinds_are_ignored_with_notice(
+    tmp_path: Path, is_chunked: bool, pairs: int
+) -> None:
+    odd = [record(0x99, b"a private record of its application"), record(0x42, bytes(50))] * pairs
     records = [*odd, *DEFINITIONS, *odd, message(1, 1, b"x"), *odd, message(1, 2, b"y")]
     parts = [ChunkOf(records)] if is_chunked else records
 
-    file = McapFile([*odd, *parts, *odd, message(2, 3, b"z"), odd[0]], summary=is_chunked)
+    file = McapFile([*odd, *parts, *odd, message(2, 3, b"z"), *odd], summary=is_chunked)
     reading = read_coded(tmp_path, file)
 
     assert reading.messages == {"/a": [(1, 1, b"x"), (2, 2, b"y")], "/b": [(3, 3, b"z")]}

@@ -32,6 +32,8 @@ from crosscue.replay.readers.mcap.records import (
 
 # Number of consecutive plausible records that are accepted wherever they end.
 LINKS: Final = 3
+# Number of consecutive records of unknown kinds that are accepted whatever follows them.
+UNKNOWN_LINKS: Final = 8
 # Maximum difference of a log time from earlier messages, if no statistics bound it.
 DAY_NS: Final = 86_400 * 10**9
 LATEST: Final = (1 << 63) - 1
@@ -166,6 +168,20 @@ class McapResync:
             if after is None:
                 return False
             at = after
+        return True
+
+    def follows_unknown(self, at: int) -> bool:
+        """Return whether a plausible record starts at ``at``, or after others of unknown kinds."""
+        for _ in range(UNKNOWN_LINKS):
+            if self.continues(at, 1):
+                return True
+            raw = self._file.peek(at, PREFIX.size)
+            if len(raw) < PREFIX.size:
+                return False
+            opcode, length = PREFIX.unpack(raw)
+            if opcode <= Op.DATA_END or self.is_hidden(at, length):
+                return False
+            at += PREFIX.size + length
         return True
 
     def find(self, at: int, end: int) -> int | None:
