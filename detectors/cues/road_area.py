@@ -163,7 +163,7 @@ class RoadArea:
         cells = x.astype(np.int32)
         cells *= shown.shape[1]
         cells += np.maximum(np.subtract(y, top, out=y), 0.0, out=y).astype(np.int32)
-        found = shown.take(cells)
+        found = shown.take(cells, mode="clip")
         np.multiply(ahead_m, ahead_m, out=weight)
         weight += np.multiply(left_m, left_m, out=x)
         np.divide(SHARP_M**2, np.maximum(weight, SHARP_M**2, out=weight), out=weight)
@@ -188,7 +188,7 @@ class RoadArea:
         cells = _index(np.subtract.outer(self._xy_m[0] + ahead_m * cos, left_m * sin, out=at_m))
         cells *= CELLS
         cells += _index(np.add.outer(self._xy_m[1] + ahead_m * sin, left_m * cos, out=at_m))
-        seen, road = self._seen.take(cells), self._road.take(cells)
+        seen, road = (grid.take(cells, mode="clip") for grid in (self._seen, self._road))
         is_seen = seen >= min_weight
         road /= np.maximum(seen, 1e-9, out=seen)
         return RoadPlan(ahead_m, left_m, np.where(is_seen, road, np.nan))

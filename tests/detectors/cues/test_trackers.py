@@ -107,6 +107,26 @@ def test_run_length_encoding_matches_coco() -> None:
     assert rle.encode_mask(corner, (0, 40), (1, 41)) == b"X11"
 
 
+@given(st.lists(st.integers(0, 2**30), min_size=1, max_size=40))
+def test_runs_are_joined_from_their_groups_of_five_bits(lengths: list[int]) -> None:
+    text = rle._to_text(np.array(lengths, np.int64))
+    values, value, bits = list[int](), 0, 0
+    for code in (byte - 48 for byte in text):
+        value, bits = value | (code & 31) << bits, bits + 5
+        if not code & 32:
+            signed = value - (1 << bits if code & 16 else 0)
+            values.append(signed + (values[-2] if len(values) > 2 else 0))
+            value, bits = 0, 0
+
+    assert rle.runs(text).tolist() == values == lengths
+
+
+def test_a_run_of_more_than_seven_groups_is_refused() -> None:
+    assert rle.runs(b"o" * 6 + b"0").tolist() == [2**30 - 1]
+    with pytest.raises(ValueError, match="a run is too long"):
+        rle.runs(b"o" * 7 + b"0")
+
+
 def test_mask_outside_its_picture_is_refused() -> None:
     with pytest.raises(ValueError, match="not inside 4 x 4"):
         rle.encode_mask(np.ones((2, 2), np.bool_), (3, 0), (4, 4))
