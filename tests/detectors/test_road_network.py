@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save
 
 from crosscue.datasets.scenes.single_frames import load_folder
 from crosscue.detectors.networks.road.checkpoint import RoadFacts, load_road, save_road
@@ -70,28 +71,17 @@ def test_resumed_training_matches_uninterrupted_training(tmp_path: Path) -> None
 
 
 def test_invalid_checkpoints_and_settings_are_refused(tmp_path: Path) -> None:
-    whole = tmp_path / "r.safetensors"
-    save_road(whole, RoadNetwork(), RoadFacts(width_px=80, height_px=48))
-    cut = tmp_path / "cut.safetensors"
-    cut.write_bytes(whole.read_bytes()[:-100])
-    from safetensors.torch import save_file
-
-    other = tmp_path / "other.safetensors"
-    save_file({"a": torch.zeros(1)}, other)
-
-    with pytest.raises(VehicleError, match=r"cut.safetensors: not a safetensors file"):
-        load_road(cut)
-    flipped = tmp_path / "flipped.safetensors"
-    flipped.write_bytes(whole.read_bytes()[:-1] + bytes([whole.read_bytes()[-1] ^ 1]))
-
-    with pytest.raises(VehicleError, match=r"flipped.safetensors: damaged"):
-        load_road(flipped)
-    with pytest.raises(
-        VehicleError, match=r"other.safetensors: expected a file written by crosscue train road"
+    save_road(tmp_path / "r.safetensors", RoadNetwork(), RoadFacts(width_px=80, height_px=48))
+    whole = (tmp_path / "r.safetensors").read_bytes()
+    for name, content, message in (
+        ("cut.safetensors", whole[:-100], "not a safetensors file"),
+        ("flipped.safetensors", whole[:-1] + bytes([whole[-1] ^ 1]), "damaged"),
+        ("other.safetensors", save({"a": torch.zeros(1)}), "expected a file written by crosscue t"),
+        ("r.pth", whole, "expected .safetensors"),
     ):
-        load_road(other)
-    with pytest.raises(VehicleError, match=r"r.pth: expected .safetensors"):
-        load_road(tmp_path / "r.pth")
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(VehicleError, match=f"{name}: {message}"):
+            load_road(tmp_path / name)
     with pytest.raises(VehicleError, match=r"none.safetensors: No such file"):
         build(checkpoint=str(tmp_path / "none.safetensors"))
     with pytest.raises(VehicleError, match=r"probability"):

@@ -16,7 +16,7 @@ from crosscue.detectors.signs.matching import nearest, window_counts
 from crosscue.detectors.signs.templates import AMERICAN, Kind, draw_sign_template
 from crosscue.detectors.training.operating_point import Verdicts, rates_at, threshold_at_precision
 from crosscue.eval.cli import run
-from crosscue.replay.columns import Block, Bytes, Images, Messages, Topic
+from crosscue.replay.columns import Block, Bytes, Floats, Images, Messages, Topic
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
 from support.refusals import refusal
@@ -114,86 +114,80 @@ def test_fit_signs_measures_on_frames_not_used_for_the_choice(
     rows = ["picture,label,x0,y0,x1,y1"]
     for seed in range(8):
         grey, box = scene("one way left", seed)
-        ok, encoded = cv2.imencode(".png", grey)
-        assert ok
-        (tmp_path / f"{seed}.png").write_bytes(encoded.tobytes())
+        (tmp_path / f"{seed}.png").write_bytes(png(grey).tobytes())
         rows.append(f"{seed}.png,one way left," + ",".join(map(str, box.tolist())))
     labels = tmp_path / "labels.csv"
     labels.write_text("\n".join(rows) + "\n")
 
-    assert run(["fit", "signs", str(labels), "--label", "one way left"]) == 0
+    fit = ["fit", "signs", str(labels), "--label", "one way left"]
+    assert run(fit) == 0
 
     reported = capsys.readouterr().out
     assert "min_score = " in reported
     assert "precision 1.00 (4 of 4; 95 % interval 0.51 to 1.00, by drive too few" in reported
-    printed = reported.split()[2]
-    assert (
-        run(["fit", "signs", str(labels), "--label", "one way left", "--threshold", printed]) == 0
-    )
+    assert run([*fit, "--threshold", reported.split()[2]]) == 0
     assert capsys.readouterr().out == reported
 
 
-def size_of(grey: Bytes) -> dict[str, int]:
-    return {"width": grey.shape[1], "height": grey.shape[0]}
+KINDS: tuple[Kind, Kind] = ("one way left", "one way right")
+# Number of a picture, number of the kind of its sign, and the sign's box.
+Labelled = tuple[int, int, Floats]
+
+
+def png(grey: Bytes) -> Bytes:
+    ok, encoded = cv2.imencode(".png", grey)
+    assert ok
+    return np.asarray(encoded, np.uint8).ravel()
+
+
+def picture_row(number: int, name: str, grey: Bytes) -> dict[str, int | str]:
+    return {"id": number, "file_name": name, "width": grey.shape[1], "height": grey.shape[0]}
+
+
+def write_coco(path: Path, images: list[dict[str, int | str]], signs: list[Labelled]) -> Path:
+    """Write a COCO file of pictures and their signs."""
+    annotations = []
+    for number, (image, kind, box) in enumerate(signs):
+        x0, y0, x1, y1 = box.tolist()
+        sides = {"image_id": image, "category_id": kind, "bbox": [x0, y0, x1 - x0, y1 - y0]}
+        annotations.append({"id": number} | sides)
+    names = [{"id": i, "name": name} for i, name in enumerate(KINDS)]
+    tree = {"images": images, "annotations": annotations, "categories": names}
+    path.write_text(json.dumps(tree))
+    return path
 
 
 def coco(folder: Path, seeds: range) -> Path:
     """Write a COCO file and pictures with alternating left and right one-way signs."""
-    kinds: tuple[Kind, Kind] = ("one way left", "one way right")
     (folder / "images").mkdir(parents=True)
-    images, annotations = [], []
+    images, signs = [], []
     for seed in seeds:
-        grey, (x0, y0, x1, y1) = scene(kinds[seed % 2], seed)
-        ok, encoded = cv2.imencode(".png", grey)
-        assert ok
-        (folder / "images" / f"{seed}.png").write_bytes(encoded.tobytes())
-        images.append({"id": seed, "file_name": f"{seed}.png"} | size_of(grey))
-        annotations.append(
-            {
-                "id": seed,
-                "image_id": seed,
-                "category_id": seed % 2,
-                "bbox": [x0, y0, x1 - x0, y1 - y0],
-            }
-        )
-    names = [{"id": i, "name": name} for i, name in enumerate(kinds)]
-    tree = {"images": images, "annotations": annotations, "categories": names}
-    (folder / "coco.json").write_text(json.dumps(tree))
-    return folder / "coco.json"
+        grey, box = scene(KINDS[seed % 2], seed)
+        (folder / "images" / f"{seed}.png").write_bytes(png(grey).tobytes())
+        images.append(picture_row(seed, f"{seed}.png", grey))
+        signs.append((seed, seed % 2, box))
+    return write_coco(folder / "coco.json", images, signs)
 
 
 def drive(folder: Path, seeds: range) -> Path:
     """Write a drive with a sign in every second picture, and its ground truth."""
     folder.mkdir()
     times = [1_700_000_000_000_000_000 + 10**8 * i for i in range(len(seeds))]
-    pictures, images, annotations = [], [], []
+    pictures, images = [], []
+    signs: list[Labelled] = []
     for number, (t_ns, seed) in enumerate(zip(times, seeds, strict=True)):
-        grey, (x0, y0, x1, y1) = scene("one way left", seed)
+        grey, box = scene("one way left", seed)
         has_sign = number % 2 == 0
-        pictures.append(cv2.imencode(".png", grey if has_sign else clutter(seed))[1].ravel())
-        images.append({"id": number, "t_ns": t_ns, "file_name": f"{t_ns}.jpg"} | size_of(grey))
-        if has_sign:
-            annotations.append(
-                {
-                    "id": number,
-                    "image_id": number,
-                    "category_id": 101,
-                    "bbox": [x0, y0, x1 - x0, y1 - y0],
-                }
-            )
+        pictures.append(png(grey if has_sign else clutter(seed)))
+        images.append(picture_row(number, f"{t_ns}.jpg", grey) | {"t_ns": t_ns})
+        signs += [(number, 0, box)] if has_sign else []
     edges = np.cumsum([0, *map(len, pictures)])
-    rows = Images(
-        Messages(np.concatenate(pictures), edges[:-1], edges[1:]), ("png",) * len(pictures)
-    )
+    rows = Messages(np.concatenate(pictures), edges[:-1], edges[1:])
     with LogWriter(folder / "drive.mcap", Ledger("drive.mcap")) as writer:
         writer.add_topic(Topic("/camera", "crosscue/Images", "columns"))
-        writer.write(Block("/camera", np.array(times), rows))
-    tree = {
-        "images": images,
-        "annotations": annotations,
-        "categories": [{"id": 101, "name": "one way left"}],
-    }
-    (folder / "objects.json").write_text(json.dumps(tree))
+        shown = Images(rows, ("png",) * len(pictures))
+        writer.write(Block("/camera", np.array(times), shown))
+    write_coco(folder / "objects.json", images, signs)
     return folder
 
 

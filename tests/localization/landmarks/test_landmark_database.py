@@ -213,6 +213,18 @@ def test_killed_writer_leaves_previous_landmarks(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["lm.sqlite"]
 
 
+def test_page_limit_is_reported_as_a_full_disk(tmp_path: Path) -> None:
+    path = database_of(tmp_path / "lm.sqlite", GRID[:3])
+    full = pytest.raises(OutputError, match=r"lm\.sqlite: the disk is full")
+
+    with full, LandmarkWriter(path, "orb") as writer:
+        writer._sql.execute("PRAGMA max_page_count = 1")
+        for i in range(200):
+            writer.add(place_at(1.0, 1.0, f"new {i}"), some_features(9, 200))
+    with LandmarkDatabase(path) as database:
+        assert len(database) == 3
+
+
 def test_query_distance_includes_the_landmark_covariance(tmp_path: Path) -> None:
     positions: Floats = np.array([[30.0, 0.0]])
     sharp = database_of(tmp_path / "sharp.sqlite", positions, sd_m=1.0)
