@@ -90,7 +90,6 @@ PARTS: Final = {
         tuple(
             f"tests/detectors/cues/test_{name}.py"
             for name in (
-                "candidates",
                 "far_side_by_hand",
                 "frames_by_hand",
                 "looked_for",
@@ -100,7 +99,6 @@ PARTS: Final = {
                 "road_area",
                 "road_by_hand",
                 "road_openings_by_hand",
-                "same_object",
                 "trackers",
             )
         ),

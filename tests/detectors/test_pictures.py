@@ -1,7 +1,9 @@
-"""Tests of the decoding of pictures of all encodings, at the smallest sufficient scale."""
+"""Pictures of all encodings, decoded at the smallest sufficient scale, and pictures drawn in."""
 
 import struct
 import zlib
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 
 from crosscue.detectors.base import View
 from crosscue.detectors.images import MAX_PIXELS, Encoded, decode, reduction
+from crosscue.detectors.overlay import Drawer
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import LogError, LogTooLargeError
 
@@ -116,3 +119,24 @@ def test_damaged_picture_is_refused_or_decoded(where: int, flip: int, suffix: st
         return
     assert pixels.dtype == np.uint8
     assert pixels.shape == (height, width)
+
+
+SIZE = (640, 360)
+PLAIN = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
+
+
+@given(frames=st.integers(0, 40), max_count=st.integers(0, 9))
+def test_pictures_are_evenly_spaced_over_the_drive(frames: int, max_count: int) -> None:
+    _, coded = cv2.imencode(".jpg", PLAIN[:16, :16])
+    with TemporaryDirectory() as name:
+        drawer = Drawer(Path(name) / "pictures", max_count)
+        for t_ns in range(frames):
+            picture = Encoded("jpeg", memoryview(coded.tobytes()))
+            drawer(t_ns, picture, ())
+        drawn = sorted(int(path.stem) for path in Path(name).glob("pictures/*"))
+
+    assert len(drawn) <= max_count
+    assert len(drawn) >= min(frames, (max_count + 1) // 2)
+    assert (
+        drawn == list(range(0, frames, drawn[1] if len(drawn) > 1 else max(frames, 1)))[:max_count]
+    )

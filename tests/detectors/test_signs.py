@@ -1,5 +1,6 @@
-"""Tests of sign detection and of the choice of its threshold from labels."""
+"""Tests of sign drawings, of sign detection, and of the choice of its threshold from labels."""
 
+import hashlib
 import json
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.signs.detector import build, orb_points
 from crosscue.detectors.signs.matching import nearest, window_counts
-from crosscue.detectors.signs.templates import AMERICAN, Kind, draw_sign_template
+from crosscue.detectors.signs.templates import AMERICAN, Kind, draw_sign_template, drawings
 from crosscue.detectors.training.operating_point import Verdicts, rates_at, threshold_at_precision
 from crosscue.eval.cli import run
 from crosscue.replay.columns import Block, Bytes, Floats, Images, Messages, Topic
@@ -236,3 +237,9 @@ def test_threshold_is_the_lowest_that_meets_the_precision() -> None:
     assert rates_at(judged, 0.8).precision == 1.0
     assert rates_at(judged, 0.8).recall == 0.5
     assert threshold_at_precision(Verdicts(np.array([0.9]), np.array([False]), 1), 0.95) is None
+
+
+def test_detector_drawings_do_not_depend_on_the_opencv_version() -> None:
+    grey = b"".join(one.grey.tobytes() for one in drawings())
+
+    assert hashlib.sha256(grey).hexdigest()[:12] == "43c98c5fd7d6"

@@ -125,16 +125,3 @@ def test_duplicate_frames_do_not_change_results(fusion: Fusion, drive: list[Fram
     doubled = [one for one in single for _ in range(2)]
 
     assert run(doubled, fusion)[0][::2] == run(single, fusion)[0]
-
-
-def test_range_with_overflowing_variance_is_refused() -> None:
-    """The squares of these variances would overflow in the filter."""
-    fusion = Fusion()
-    approaches = Approaches(graph_of(fusion), fusion, RangeFilter())
-
-    for i in range(1, 6):
-        approaches(
-            FrameEvidence(i * 10**8, 0.0, 0.0, (SignRange(Reference.START, 1.0, 1e300),), {})
-        )
-
-    assert approaches.counts["ranges refused: beyond reason"] == 5

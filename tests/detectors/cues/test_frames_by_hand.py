@@ -1,4 +1,4 @@
-"""Cues of whole frames and their account of candidates, with numbers worked out by hand."""
+"""Cues of whole frames and their account of candidates: numbers by hand, and laws of any frame."""
 
 import math
 from collections.abc import Sequence
@@ -6,9 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, RoadMask
+from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.cues import frame
 from crosscue.detectors.cues.candidates import (
     BELOW_SCORE,
@@ -45,7 +48,7 @@ from crosscue.detectors.cues.observed import (
     detector_role,
 )
 from crosscue.detectors.cues.rules import counts_of, rule_of
-from crosscue.detectors.cues.same_object import KEPT, label_meanings, same_objects
+from crosscue.detectors.cues.same_object import KEPT, MIN_IOU, label_meanings, same_objects
 from crosscue.detectors.cues.tracked.judge import count_cars
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.vehicle.cue_spec import CueSpec, Input
@@ -112,6 +115,8 @@ def test_scores_and_thresholds_are_those_of_the_labels() -> None:
     assert label_scores(both, labels) == [0.6, 0.5, 0.2, 0.7]
     assert unsure_of(both, labels, 0.5) == {BELOW_SCORE: 2}
     assert unsure_of(both, labels, None) == {BELOW_SCORE: 3}
+    decided = replace(FEW, decisions=("too far", "", "", ""))
+    assert unsure_of([decided], labels, 0.4) == {"too far": 1, BELOW_SCORE: 1}
     assert count_labels(both, labels, 0.5) == 2
     assert count_labels(both, labels, None) == 1
     assert thresholds_met(both, labels, 0.4) == [0.4]
@@ -141,6 +146,7 @@ def test_candidates_are_seen_used_and_skipped() -> None:
     one.take(Count(1, [0.2, 0.4, 0.3], {"low": 1, "far": 1, "none": 0}))
     assert (one.seen, one.used, one.max_score) == (3, 1, 0.4)
     one.take(Count(2, [0.1, 0.3], {"low": 0}))
+    assert one.max_score == 0.4
     one.take(Count(0, [0.9], {"low": 1}))
 
     assert (one.seen, one.used, one.max_score) == (6, 3, 0.9)
@@ -603,3 +609,78 @@ def test_cars_are_explained_if_a_detector_can_report_them(
     cues(FrameDetections(0, (), (found(("car", 0.9)),), labels=reported), EGO)
     if is_explained:
         assert tally["parked_left"].seen == 1
+
+
+# A label, a score, the left edge and the width.
+Shown = list[tuple[str, float, float, float]]
+
+
+def shown(*labels: str, width: st.SearchStrategy[float]) -> st.SearchStrategy[Shown]:
+    score, left = st.floats(0.0, 1.0), st.floats(0.0, 60.0)
+    return st.lists(st.tuples(st.sampled_from(labels), score, left, width), max_size=5)
+
+
+def objects_of(things: Shown, t_ns: int = 0) -> Detections:
+    boxes = [(left, 5.0, left + width, 45.0) for _, _, left, width in things]
+    return found(*[(label, score) for label, score, *_ in things], boxes=boxes, t_ns=t_ns)
+
+
+CUE_LABELS = ("traffic light", "stop sign", "car", "zebra", "one way left", "dog", "cat")
+FRAMES = st.lists(shown(*CUE_LABELS, width=st.floats(5.0, 300.0)), min_size=1, max_size=4)
+# Groups of cues that need the place of an intersection.
+UNPLACED = ("cars_past", "leg_traffic", "map")
+
+
+@given(FRAMES, FRAMES, st.sampled_from([VEHICLE, TRACKED]))
+def test_used_and_skipped_candidates_add_up_for_every_cue(
+    objects: list[Shown], signs: list[Shown], vehicle: Vehicle
+) -> None:
+    cues, tally = _cues(vehicle)
+    counted: dict[str, int] = {}
+    for t, (some, others) in enumerate(zip(objects, signs, strict=False)):
+        t_ns = 100 * t * MS
+        seen = FrameDetections(t_ns, (objects_of(some, t_ns),), (objects_of(others, t_ns),))
+        for cue, number in cues(seen, EGO).counts.items():
+            counted[cue] = counted.get(cue, 0) + number
+
+    for name, one in tally.items():
+        skipped(tally, name)
+        assert all(number > 0 for number in one.skipped.values())
+        assert one.used == counted.get(name, 0)
+    evaluated = {
+        name
+        for name, cue in CUES.items()
+        if cue.observed_by not in ("road", "mobileye") and cue.group not in UNPLACED
+    }
+    assert set(tally) == evaluated | {"crossing", "dogs"}
+
+
+OBJECTS = shown("car", "van", "stop sign", "no entry", "do not enter", "cat", width=st.just(20.0))
+
+
+@given(st.lists(OBJECTS, min_size=1, max_size=3))
+def test_dropped_detection_overlaps_a_kept_one_of_another_detector(results: list[Shown]) -> None:
+    boxes = [objects_of(things) for things in results]
+    same = same_objects(boxes, label_meanings(VEHICLE), (False,) * len(boxes))
+
+    for k, (one, whose) in enumerate(zip(boxes, same, strict=True)):
+        for i, other in enumerate(whose.tolist()):
+            if other == KEPT:
+                continue
+            assert other != k
+            assert any(
+                same[other][j] == KEPT
+                and box_ious(one.boxes_px[i], boxes[other].boxes_px[j]) > MIN_IOU
+                and boxes[other].scores[j] >= one.scores[i]
+                for j in range(len(boxes[other]))
+            )
+
+
+@given(OBJECTS)
+def test_identical_second_detector_is_dropped_completely(things: Shown) -> None:
+    one = objects_of(things)
+
+    first, second = same_objects((one, one), label_meanings(VEHICLE), (False, False))
+
+    assert (first == KEPT).all()
+    assert (second == 0).all()
