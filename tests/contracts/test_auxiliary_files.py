@@ -12,11 +12,11 @@ from typing import Final
 import pytest
 
 from crosscue.eval import cli
-from crosscue.localization.landmarks.database import LandmarkWriter
 from support.coco import stop_signs
 from support.command_lines import VALID
 from support.failures import table_of_failures
 from support.gap_drive import BEGIN, BUS, Clock, replayed, write_drive
+from support.landmark_files import empty_database
 from support.mcap_files import McapFile
 from support.onnx_models import bright_box_model
 from support.opened_files import opened_files
@@ -135,8 +135,6 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     log = write_drive(drive, Clock(), seconds=4)
     run = replayed(drive, log, "../run")
     (folder / "empty.mcap").write_bytes(McapFile([]).coded())
-    with LandmarkWriter(folder / "known.db", "orb"):
-        pass
     for place in ("images", "masks"):
         (photos / place).mkdir(parents=True)
         for number in range(2):
@@ -156,7 +154,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "run": run.path,
         "car": drive / "car.toml",
         "truth": drive / "truth.json",
-        "db": folder / "known.db",
+        "db": empty_database(folder / "known.db"),
         "pictures": photos / "images",
         "picture": photos / "images" / "0.png",
         "masks": photos,

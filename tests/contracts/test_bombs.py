@@ -13,12 +13,12 @@ from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive as simulated
 from crosscue.detectors.images import MAX_PIXELS
 from crosscue.eval import cli
-from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.replay.limits import MIB
 from support.coco import annotate, stop_signs
 from support.every_format import EVERY_FORMAT
 from support.failures import table_of_failures
 from support.gap_drive import BEGIN, SIZE, Clock, replayed, write_drive
+from support.landmark_files import empty_database
 from support.mcap_files import MAGIC, record, text
 from support.onnx_models import bright_box_model, open_model
 from support.pictures import OVERSIZED as CODED
@@ -83,8 +83,6 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     log = write_drive(drive, Clock(), seconds=4)
     with_bomb(log)
     run = replayed(drive, log, "../run")
-    with LandmarkWriter(folder / "known.db", "orb"):
-        pass
     compass = simulated(folder / "compass", DriveSettings(seed=3, blocks=1, block_m=60.0))
     with_bomb(compass.log)
     (drive / "vehicle.toml").write_bytes((drive / "car.toml").read_bytes())
@@ -99,7 +97,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "car": drive / "car.toml",
         "truth": drive / "truth.json",
         "coco": objects,
-        "db": folder / "known.db",
+        "db": empty_database(folder / "known.db"),
         "compass": compass.log,
         "its_car": compass.vehicle,
         "gnss_car": gnss_car,
@@ -213,15 +211,13 @@ def test_oversized_camera_picture_is_reported_with_size_and_limit(
     valid = [("png", picture(number)) for number in range(3)]
     log = HOLDERS[holder](drive, [(coded, CODED[coded]()), *valid])
     annotate(drive, 0 if holder == "folder" else START_NS)
-    with LandmarkWriter(tmp_path / "known.db", "orb"):
-        pass
     names = {
         "log": log,
         "out": tmp_path / "out",
         "drive": drive,
         "truth": drive / "truth.json",
         "coco": drive / "objects.json",
-        "db": tmp_path / "known.db",
+        "db": empty_database(tmp_path / "known.db"),
     }
 
     flags, status = READS_CAMERA[command]
@@ -267,10 +263,8 @@ def test_oversized_picture_file_is_refused_with_status_4(
     (folder / "net.onnx").write_bytes(bright_box_model())
     if command == "check":
         assert cli.run(["model", "init", str(folder / "net.onnx"), "-q"]) == 0
-    with LandmarkWriter(tmp_path / "known.db", "orb"):
-        pass
     names = {
-        "db": tmp_path / "known.db",
+        "db": empty_database(tmp_path / "known.db"),
         "picture": folder / f"a.{coded}",
         "folder": folder,
         "out": tmp_path / "out",

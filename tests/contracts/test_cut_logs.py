@@ -7,7 +7,6 @@ import pytest
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval import cli
-from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.replay.base import report_missing
 from crosscue.replay.errors import LogError
 from crosscue.replay.ledger import Ledger
@@ -16,6 +15,7 @@ from support.accounted import read
 from support.coco import annotate
 from support.commands import output_of
 from support.every_format import EVERY_FORMAT
+from support.landmark_files import empty_database
 from support.mcap_files import ChunkOf, McapFile, channel, message, schema
 from support.refusals import refusal
 
@@ -202,15 +202,13 @@ def _drive(folder: Path, is_cut: bool, camera: str) -> dict[str, Path]:
     (folder / "a.mcap").write_bytes(coded[: len(coded) * 2 // 3] if is_cut else coded)
     (folder / "vehicle.toml").write_text(f"version = 1\n{camera}")
     annotate(folder, START_NS)
-    with LandmarkWriter(folder.parent / "known.db", "orb"):
-        pass
     return {
         "drive": folder,
         "log": folder / "a.mcap",
         "car": folder / "vehicle.toml",
         "truth": folder / "truth.json",
         "coco": folder / "objects.json",
-        "db": folder.parent / "known.db",
+        "db": empty_database(folder.parent / "known.db"),
         "out": folder.parent / "out",
     }
 

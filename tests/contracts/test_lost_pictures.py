@@ -16,7 +16,6 @@ import pytest
 
 from crosscue.eval import cli
 from crosscue.eval.vehicle.mounting import estimate_mounting
-from crosscue.localization.landmarks.database import LandmarkWriter
 from crosscue.replay.columns import Images, Int64s
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.losses import losses_heard
@@ -36,6 +35,7 @@ from support.gap_drive import (
     replayed,
     write_drive,
 )
+from support.landmark_files import empty_database
 from support.pictures import OVERSIZED, SIDE_PX
 
 PRODUCT: Final = ("datasets", "detectors", "eval", "fusion", "localization", "replay")
@@ -146,9 +146,7 @@ def names(
     tree = json.loads((labelled / "truth.json").read_text())
     (labelled / "truth.json").write_text(json.dumps({**tree, "objects": "objects.json"}))
     times = [BEGIN + number * ROW for number in (*AT, 20)]
-    database = folder / "known.db"
-    with LandmarkWriter(database, "orb"):
-        pass
+    database = empty_database(folder / "known.db")
     added = ["landmarks", "add", database, log, "--poses", drive / "truth.json", "--every", "1"]
     assert cli.run([*map(str, added), "--vehicle", str(drive / "car.toml")]) == 3
     return {

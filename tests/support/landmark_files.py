@@ -34,6 +34,10 @@ def database_of(path: Path, xy_m: Floats, sd_m: float = 2.0, kind: str = "orb") 
     return path
 
 
+def empty_database(path: Path) -> Path:
+    return database_of(path, np.zeros((0, 2)))
+
+
 def wall(seed: int, width_px: int = 640, height_px: int = 480) -> Bytes:
     """A simulated textured wall: grey, with random patches of all sizes."""
     rng = np.random.default_rng(seed)

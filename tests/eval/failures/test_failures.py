@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import crosscue
@@ -66,9 +68,6 @@ def test_overconfident_range_is_a_failure(tmp_path: Path) -> None:
     assert not [f for f in crosscue.failures(folder, truth=truth).failures if f.kind == "range"]
 
     path = folder / "range.parquet"
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     table = pq.read_table(path)
     var = table["var_m2"].to_numpy().copy()
     # An error of half a metre with an s.d. of 0.1 m is five standard deviations.

@@ -6,13 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import pyarrow.parquet as pq
 import pytest
 
 import crosscue
 from crosscue.datasets.truth.coco import read_coco
 from crosscue.detectors.training.annotations import read_training_coco as read_to_train
 from crosscue.eval.failures.imported_truth import ImportedLabels
-from crosscue.eval.failures.record import Failure
+from crosscue.eval.failures.record import Failure, read_failures
 from crosscue.eval.fit.truth_check import check_truth
 from crosscue.eval.runs.folder import write_manifest
 from crosscue.eval.runs.manifest import EstimateManifest
@@ -54,8 +55,6 @@ def write_corrected(exported: Path, to: Path, change: Callable[[dict[str, object
 def test_export_writes_each_recorded_picture_with_its_detections(
     worst: Path, exported: Path
 ) -> None:
-    import pyarrow.parquet as pq
-
     frames = set(pq.read_table(worst)["t_ns"].to_pylist())
     labels = read_coco(exported)
 
@@ -122,8 +121,6 @@ def test_existing_output_is_not_replaced(worst: Path, exported: Path, tmp_path: 
 
 
 def test_deleted_run_is_left_out_of_the_export_with_its_reason(worst: Path, tmp_path: Path) -> None:
-    from crosscue.eval.failures.record import read_failures
-
     kept: tuple[Failure, ...] = read_failures(worst)
     gone = replace(kept[0], run=str(tmp_path / "gone"))
 

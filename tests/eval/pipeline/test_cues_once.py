@@ -59,19 +59,7 @@ class Road:
         return [RoadMask(one.t_ns, one.size_px, mask, (32, 16)) for one in frames]
 
 
-def first() -> GreyNumber:
-    return GreyNumber()
-
-
-def second() -> Second:
-    return Second()
-
-
-def road() -> Road:
-    return Road()
-
-
-NAMES = ",".join(f"{__name__}:{name}" for name in ("first", "second", "road"))
+NAMES = ",".join(f"{__name__}:{name}" for name in ("GreyNumber", "Second", "Road"))
 PICTURE = '[regions]\nkind = "picture"\n'
 CHANGES = {
     "threshold of a cue": "[cues]\nstop_sign_score = 0.3\n",

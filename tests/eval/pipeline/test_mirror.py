@@ -105,18 +105,6 @@ class Road:
         ]
 
 
-def busy() -> Busy:
-    return Busy()
-
-
-def signs() -> Signs:
-    return Signs()
-
-
-def road() -> Road:
-    return Road()
-
-
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """A simulated drive with a Mobileye, in which every kind of object is found."""
@@ -124,7 +112,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     with pytest.MonkeyPatch.context() as patch:
         shorten(patch, pictures=80)
         files = write_scene(folder / "drive", SCENE)
-    names = ",".join(f"{__name__}:{one}" for one in ("busy", "signs", "road"))
+    names = ",".join(f"{__name__}:{one}" for one in ("Busy", "Signs", "Road"))
     argv = ["replay", str(files.log), "--vehicle", str(files.vehicle), "--no-cache"]
     assert run([*argv, "--detectors", names, "-o", str(folder / "run")]) == 0
     return open_run(folder / "run")

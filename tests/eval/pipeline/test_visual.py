@@ -13,9 +13,15 @@ from crosscue.detectors.base import Frame, RoadMask, View
 from crosscue.detectors.catalog.fetch import fetch_weights
 from crosscue.eval.pipeline.run import Run
 from crosscue.eval.pipeline.scene.road_picture import plans_of
+from crosscue.eval.pipeline.visual import uses_pictures, with_visual_scale
 from crosscue.eval.report.frame_pictures import draw_pictures
+from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import EstimateManifest, SceneSummary
+from crosscue.replay.columns import Topic
+from crosscue.replay.signals.kinds import Signal
+from crosscue.replay.signals.plan import plan
+from crosscue.replay.vehicle.vehicle import parse
 from support.data import shared
 from support.detecting import Nothing
 from support.pictures import picture_log
@@ -114,11 +120,6 @@ def test_pictures_are_not_followed_where_the_file_says_wheels(tmp_path: Path) ->
 
 
 def test_odometry_of_a_log_with_speeds_is_used_unless_the_file_says_visual() -> None:
-    from crosscue.replay.columns import Topic
-    from crosscue.replay.signals.kinds import Signal
-    from crosscue.replay.signals.plan import plan
-    from crosscue.replay.vehicle.vehicle import parse
-
     topics = [(0, Topic("odometry", "nav_msgs/msg/Odometry", "columns"))]
     usual, visual = (
         plan(topics, parse(f"version = 1\n[odometry]\nkind = '{kind}'\n", "here"))
@@ -130,19 +131,12 @@ def test_odometry_of_a_log_with_speeds_is_used_unless_the_file_says_visual() -> 
 
 
 def test_distances_from_pictures_have_the_scale_error_of_the_cameras_height() -> None:
-    from crosscue.eval.pipeline.visual import with_visual_scale
-    from crosscue.replay.vehicle.vehicle import parse
-
     assert with_visual_scale(parse(SETUP, "here")).odometry.scale_sd == 0.05
     worse = parse(f"{SETUP}[odometry]\nscale_sd = 0.2\n", "here")
     assert with_visual_scale(worse).odometry.scale_sd == 0.2
 
 
 def test_pictures_are_also_compared_for_the_pitch_where_road_is_accumulated() -> None:
-    from crosscue.eval.pipeline.visual import uses_pictures
-    from crosscue.eval.runs.drive import Drive
-    from crosscue.replay.vehicle.vehicle import parse
-
     for more, finds_road, expected in (
         ("", True, True),
         ('[odometry]\nkind = "wheels"\n', True, False),

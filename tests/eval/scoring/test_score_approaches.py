@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -205,8 +206,6 @@ def test_approaches_are_associated_one_to_one_by_overlap() -> None:
 
 
 def test_extra_and_split_approaches_are_counted() -> None:
-    import pyarrow as pa
-
     far = approach(start_ns=at(20), enter_ns=at(40))
     pieces = [
         belief_table({"intersection": {2: 0.95}}, 1, range(10)),
@@ -259,8 +258,6 @@ def test_belief_comparison_is_decided_only_over_enough_drives() -> None:
 
 
 def test_range_errors_and_nees_are_scored_by_reference() -> None:
-    import pyarrow as pa
-
     both = pa.concat_tables(
         [range_table(0, 40, 0.5, 0.25), range_table(20, 45, -2.0, 1.0, reference="end")]
     )

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import binomtest
 
 from crosscue.eval.scoring.intervals import fraction, wilson
+from crosscue.eval.scoring.run_tables import run_tables
 from crosscue.eval.scoring.scene.cues import match_cues, score_cues
 from support.scoring import (
     ENTER,
@@ -23,8 +25,6 @@ from support.scoring import (
 @given(st.integers(0, 400), st.integers(1, 400), st.sampled_from([0.8, 0.95, 0.99]))
 @settings(max_examples=50)
 def test_wilson_interval_equals_scipy(right: int, more: int, confidence: float) -> None:
-    from scipy.stats import binomtest
-
     theirs = binomtest(right, right + more).proportion_ci(confidence, "wilson")
     ours = wilson(right, right + more, confidence)
 
@@ -99,8 +99,6 @@ def test_hidden_objects_do_not_count_in_visible_recall() -> None:
 @settings(max_examples=30)
 @given(st.dictionaries(st.integers(0, 55), st.integers(0, 3), min_size=1))
 def test_order_of_rows_does_not_matter(frames: dict[int, int]) -> None:
-    from crosscue.eval.scoring.run_tables import run_tables
-
     table = cue_table({"stop_sign": frames, "road_left": frames})
     order = np.random.default_rng(len(frames)).permutation(table.num_rows)
     shuffled = run_tables("made up", cues_table=table.take(order))
