@@ -157,8 +157,12 @@ def _steps(drive: Drive, follower: Follower) -> list[MountingStep]:
 
 def _drives(asked: Sequence[str]) -> Iterator[Drive]:
     for name in REAL:
-        if not asked or name in asked:
+        if asked and name not in asked:
+            continue
+        if any((DATA / "sequences" / DRIVES[name].folder).glob(DRIVES[name].pictures)):
             yield real(name)
+        else:
+            print(f"{name:24} no pictures in {DATA}")
     for seed, layouts in (DEVELOPED, FRESH):
         for layout in layouts:
             if not asked or f"{seed}-{layout}" in asked:
