@@ -107,57 +107,42 @@ def _fill_lz4(body: Bytes, size: int, room: Bytes, _: int) -> tuple[int, str]:
     """Decompress block by block, because the library copies a frame's stored blocks twice."""
     import lz4.block
     import lz4.frame
+    from xxhash import xxh32_intdigest
 
     done, view, out = 0, body.data, room.data
     try:
         frame = lz4.frame.get_frame_info(view)
-        declared, most = frame["content_size"], frame["block_size"]
+        declared, most, after = frame["content_size"], frame["block_size"], 0
         if declared not in (*UNKNOWN_SIZES, size):
             return 0, f"its lz4 frame declares {declared} bytes, the chunk {size}"
-        if frame["content_checksum"] or frame["block_checksum"] or view[4] & _LZ4_DICTIONARY:
-            return _stream_lz4(view, size, out)
-        window = _LZ4_WINDOW if frame["block_linked"] else 0
-        at = 15 if view[4] & _LZ4_SIZE else 7
-        while done <= size and at + 4 <= len(view):
-            length = int.from_bytes(view[at : at + 4], "little")
-            if not length:
-                return done, ""
-            is_stored, length = length & _LZ4_STORED, length & ~_LZ4_STORED
-            part: bytes | memoryview = view[at + 4 : at + 4 + length]
-            at += 4 + length
-            if length > most:
-                return done, f"lz4: a block of {length} bytes"
-            if not is_stored and at <= len(view):
-                past = out[max(0, done - window) : done]
+        # The header may have a size of eight bytes and the number of a dictionary.
+        at = 7 + (view[4] & _LZ4_SIZE) + 4 * (view[4] & _LZ4_DICTIONARY)
+        while done <= size and (length := _number(view, at)):
+            is_stored, at, length = length & _LZ4_STORED, at + 4, length & ~_LZ4_STORED
+            part: bytes | memoryview = view[at : at + length]
+            after = at + length
+            if length > most or (after > len(view) and not is_stored):
+                return done, f"lz4: a block of {length} bytes at byte {at} of {len(view)}"
+            if frame["block_checksum"] and after <= len(view):
+                if xxh32_intdigest(part) != _number(view, after):
+                    return done, "lz4: a block does not match its checksum"
+                after += 4
+            if not is_stored:
+                past = out[max(0, done - _LZ4_WINDOW) : done] if frame["block_linked"] else b""
                 part = lz4.block.decompress(part, uncompressed_size=most, dict=past)
-            elif not is_stored:
-                break
-            step = min(len(part), size + 1 - done)
+            step, at = min(len(part), size + 1 - done), after
             out[done : done + step] = part[:step]
             done += step
     except (RuntimeError, ValueError, EOFError, lz4.block.LZ4BlockError) as error:
         return done, f"lz4: {error}"
-    return done, f"its lz4 frame does not end after {done} bytes"
+    if at + 4 > len(view):
+        return done, f"its lz4 frame does not end after {done} bytes"
+    is_wrong = frame["content_checksum"] and xxh32_intdigest(out[:done]) != _number(view, at + 4)
+    return done, "lz4: its content does not match its checksum" if is_wrong else ""
 
 
-def _stream_lz4(view: memoryview, size: int, out: memoryview) -> tuple[int, str]:
-    """Decompress a frame of any kind by the library, which verifies the frame's checksums."""
-    import lz4.frame
-
-    done, used, is_done = 0, 0, False
-    context = lz4.frame.create_decompression_context()
-    while not is_done and done <= size:
-        try:
-            step, taken, is_done = lz4.frame.decompress_chunk(
-                context, view[used:], max_length=min(size + 1 - done, STEP)
-            )
-        except (RuntimeError, ValueError, EOFError) as error:
-            return done, f"lz4: {error}"
-        if not step and not taken:
-            break
-        out[done : done + len(step)] = step
-        done, used = done + len(step), used + taken
-    return done, "" if is_done else f"its lz4 frame does not end after {done} bytes"
+def _number(view: memoryview, at: int) -> int:
+    return int.from_bytes(view[at : at + 4], "little")
 
 
 _FILL: Final[dict[str, Callable[[Bytes, int, Bytes, int], tuple[int, str]]]] = {
