@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from crosscue.fusion.approaches import Approaches, Step, no_past_cues
@@ -493,6 +494,23 @@ def test_approach_open_at_end_of_drive_is_counted() -> None:
     loop.finish()
 
     assert loop.counts["approaches closed: the drive ended"] == 1
+
+
+def test_range_errors_over_drives_match_reported_variance() -> None:
+    rng = np.random.default_rng(5)
+    nees = []
+    for _ in range(300):
+        loop, truth_m = approaches(), 70.0
+        for i in range(60):
+            truth_m -= 1.0
+            seen = (sign(truth_m + rng.normal(0.0, 1.7)),) if rng.random() < 0.6 else ()
+            way_m = 1.0 + rng.normal(0.0, 0.05)
+            step = loop(FrameEvidence(i * FRAME_NS, way_m, 0.05**2, seen, {}))
+        (row,) = step.ranges
+        nees.append((row.range_m - truth_m) ** 2 / row.var_m2)
+
+    # The gate at 16 rejects one good measurement in 16,000.
+    assert np.mean(nees) == pytest.approx(1.0, abs=4 * math.sqrt(2 / 300))
 
 
 def test_wait_of_unknown_length_at_a_light_in_view_is_one_approach() -> None:
