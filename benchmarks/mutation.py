@@ -140,6 +140,7 @@ PARTS: Final = {
         tuple(
             f"tests/fusion/test_{name}"
             for name in (
+                "approaches.py::test_range_errors_over_drives_match_reported_variance",
                 "calibrated.py::test_calibrated_model_beats_source_on_held_out_simulated_approaches",
                 "intersection_range.py::"
                 "test_filter_errors_match_variance_with_distance_correlated_noise",
