@@ -328,7 +328,7 @@ class _Pages:
 
     def _follow(self, page: int, target: Bytes) -> None:
         """Fill ``target`` from a chain of pages, which are mostly consecutive in the file."""
-        done = 0
+        done, room, data = 0, self._room, target.data
         while done < len(target):
             left = -(-(len(target) - done) // self._room)
             count = min(left, self._run, self._count + 1 - page)
@@ -337,9 +337,7 @@ class _Pages:
             # Without a copy: each page's payload goes to its place, the next page's number aside.
             stop = min(done + count * self._room, len(target))
             parts = self._asides[: 2 * count]
-            parts[1::2] = [
-                target.data[at : min(at + self._room, stop)] for at in range(done, stop, self._room)
-            ]
+            parts[1::2] = [data[at : at + room] for at in range(done, stop, room)]
             size = stop - done + count * (self._size - self._room)
             self._fill(parts, (page - 1) * self._size - self._reserved, size)
             after = self._after[:count]
@@ -366,17 +364,15 @@ def _varint(buffer: Bytes, at: Int64s) -> tuple[Int64s, Int64s]:
     """Parse SQLite's variable-length integers, and return them and their ends."""
     byte = buffer[at]
     value, at = (byte & 0x7F).astype(np.int64), at + 1
-    more = np.flatnonzero(byte & 0x80)
+    more = byte >= 0x80
     for i in range(1, _VARINT_BYTES):
-        if not len(more):
+        if not more.any():
             break
-        byte = buffer[at[more]]
-        if i == _VARINT_BYTES - 1:
-            value[more] = value[more] << 8 | byte
-        else:
-            value[more] = value[more] << 7 | byte & 0x7F
-        at[more] += 1
-        more = more[byte >= 0x80]
+        byte = buffer[at]
+        bits, mask = (7, 0x7F) if i < _VARINT_BYTES - 1 else (8, 0xFF)
+        value = np.where(more, value << bits | byte & mask, value)
+        at += more
+        more &= byte >= 0x80
     return value, at
 
 
