@@ -102,6 +102,13 @@ def _missing_paths(text: str) -> list[str]:
     return [name for name in names if not (ROOT / name).exists()]
 
 
+def test_checks_of_integration_files_can_fail(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--colour" in _command_fault("crosscue demo --colour", capsys)
+    assert _command_fault("crosscue drive", capsys) == "no command: crosscue drive"
+    assert _missing_paths("pip install -c requirement.lock .") == ["requirement.lock"]
+    assert _missing_paths(".ci/runs") == [".ci/runs"]
+
+
 def test_dockerfile_copies_what_exists_and_starts_a_command(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

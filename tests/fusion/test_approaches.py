@@ -428,6 +428,14 @@ def test_crawling_car_keeps_one_approach_until_passed() -> None:
     assert max(p for one in slow for p in one.probabilities.values()) < 1.0
 
 
+def test_continuous_road_cue_is_split_into_approaches_of_max_length() -> None:
+    loop = approaches()
+
+    run_steps([frame(i, 1.0, road_left=1) for i in range(1000)], loop)
+
+    assert loop.counts["approaches closed: too long"] == 9
+
+
 def test_isolated_false_detections_never_establish_presence() -> None:
     loop = approaches()
     noise = [frame(i, 1.0, road_left=int(i % 50 == 0)) for i in range(500)]

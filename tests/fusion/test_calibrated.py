@@ -16,7 +16,7 @@ from crosscue.fusion.situation import Situation
 from crosscue.replay.errors import VehicleError
 from crosscue.replay.vehicle.fusion import Calibrated, Fade, Fusion, RangeFilter, Rates
 from crosscue.replay.vehicle.vehicle import parse
-from support.fusion import annotated, drive, situation
+from support.fusion import FADE_M, RATES, annotated, drive, situation
 
 GRAPH = graph_of(Fusion())
 LEFT = GRAPH.feature_names.index("left")
@@ -173,6 +173,24 @@ def test_message_memory_is_reset_for_each_approach() -> None:
 
     assert first == [pytest.approx(one) for one in second]
     assert loop.counts["approaches opened"] == 2
+
+
+def test_fit_recovers_true_rates_and_fade_length() -> None:
+    fit = fit_messages(annotated(1, 300), GRAPH)
+
+    learned = [one for one in fit.rates if one.rates is not None]
+    assert {one.cue for one in fit.calibrated.rates} == {*RATES}
+    for one in learned:
+        found = (one.rates.if_there, one.rates.if_not) if one.rates else ()
+        for rate, side, fraction in zip(
+            RATES[one.cue], (one.there, one.missing), found, strict=True
+        ):
+            four_sd = 4 * math.sqrt(rate * (1 - rate) / side.observations)
+            assert fraction == pytest.approx(rate, abs=four_sd)
+    # At 10 m/s, fades over distance and over time are equivalent here.
+    fades = [one.fade for one in fit.fades if one.is_learned]
+    scales_m = [fade.way_m or (fade.time_s or 0.0) * 10.0 for fade in fades]
+    assert scales_m == pytest.approx([FADE_M] * 3, rel=0.35)
 
 
 def test_calibrated_model_beats_source_on_held_out_simulated_approaches() -> None:

@@ -1,5 +1,6 @@
 """Bounded reading of text and files."""
 
+import ast
 import json
 import tempfile
 import time
@@ -14,6 +15,7 @@ import tomlkit
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import crosscue
 from crosscue.datasets.labels.table import read_tool_labels
 from crosscue.datasets.truth import truth
 from crosscue.detectors.catalog.card import read_card
@@ -26,6 +28,10 @@ from crosscue.replay.vehicle import vehicle
 from support.every_format import EVERY_FORMAT
 from support.measured import measured
 
+PARSERS: Final = {
+    *("json.loads", "json.load", "tomllib.loads", "tomllib.load"),
+    *("tomlkit.parse", "tomlkit.loads", "tomlkit.load"),
+}
 DEEP_JSON: Final = (
     "[" * 100_000,
     '{"a":' * 100_000,
@@ -179,6 +185,20 @@ def test_unterminated_quotes_are_refused_quickly(text: str) -> None:
     with pytest.raises(ValueError):  # noqa: PT011
         json_tree("[" * 70 + text)
     assert time.process_time() - began < 2.0
+
+
+@pytest.mark.slow
+def test_product_parses_json_toml_and_yaml_only_in_tree_text() -> None:
+    """All readers of such files count the nesting first."""
+    root = Path(crosscue.__file__).parent
+    paths = [path for room in root.iterdir() if room.is_dir() for path in room.rglob("*.py")]
+    assert len(paths) > 500
+    for path in (one for one in paths if one.name != "tree_text.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            assert not (isinstance(node, ast.Name) and node.id == "YAML"), path
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                assert f"{node.value.id}.{node.attr}" not in PARSERS, path
+                assert node.attr != "load_string" or path.name == "database.py", path
 
 
 ENDLESS = Path("/dev/zero")

@@ -7,6 +7,7 @@ import pytest
 
 import crosscue
 from crosscue.eval import cli
+from crosscue.eval.check import KINDS
 from crosscue.eval.fit.truth_check import TruthFit
 from support import scene_run
 from support.refusals import refusal
@@ -47,6 +48,15 @@ def test_files_are_recognised_by_content_whatever_their_names(drive: Path, tmp_p
         "truth",
         "model",
     ]
+
+
+def test_every_kind_is_named_where_none_fits(tmp_path: Path) -> None:
+    (tmp_path / "x.bin").write_bytes(b"\0\1")
+
+    (row,) = crosscue.check(tmp_path / "x.bin")
+
+    assert (row.kind, row.exit_status) == (None, 4)
+    assert all(kind.name in str(row.error) for kind in KINDS)
 
 
 def test_truth_is_compared_with_the_log_that_is_named_with_it(drive: Path) -> None:

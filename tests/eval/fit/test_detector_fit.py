@@ -170,6 +170,15 @@ def test_class_without_labelled_box_is_not_labelled(tmp_path: Path) -> None:
     assert "truck 0.000" not in found.report.read_text()
 
 
+def test_page_of_run_without_detections_says_that_there_are_none(tmp_path: Path) -> None:
+    run, labels = two_labels_on_one_object(tmp_path, 0.1), car_labels(tmp_path)
+
+    page = crosscue.score_detector(run, labels, has_figures=False).report.read_text()
+
+    assert "the detections stored in the run, of which there are none. Precision" in page
+    assert "a score of at least" not in page
+
+
 @pytest.mark.parametrize(
     ("rows", "meanings", "error", "message"),
     [
@@ -213,9 +222,10 @@ def test_invalid_labels_are_refused_in_one_line_without_output(
     assert not out.exists()
 
 
-def two_labels_on_one_object(folder: Path) -> crosscue.Run:
+def two_labels_on_one_object(folder: Path, factor: float = 1.0) -> crosscue.Run:
     """Run a network that reports a car (0.9) and a truck (0.8) on one object, and another car."""
     rows = np.array([[[8, 8, 24, 24, 0.9, 0], [9, 8, 24, 24, 0.8, 1], [40, 8, 60, 24, 0.7, 0]]])
+    rows[..., 4] *= factor
     model = constant_model((1, 3, 48, 64), {"rows": rows.astype(np.float32)})
     output = 'kind = "end-to-end"\nclasses = ["car", "truck"]\noverlap = 1.0'
     card = write_card(folder, model, output)

@@ -64,6 +64,17 @@ def test_all_tables_hold_only_driven_speed(tmp_path: Path, speed_mps: float) -> 
         np.testing.assert_allclose(speeds, speed_mps, atol=1e-6, err_msg=name)
 
 
+def test_mirrored_input_yields_mirrored_path(tmp_path: Path) -> None:
+    left, right = (
+        _replay(tmp_path / f"{rate}", driven_blocks(20, 10.0, rate)).run.table("pose")
+        for rate in (0.1, -0.1)
+    )
+
+    np.testing.assert_allclose(left["x_m"], right["x_m"], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(left["y_m"].to_numpy(), -right["y_m"].to_numpy(), atol=1e-9)
+    assert left["y_m"][-1].as_py() > 1.0
+
+
 def test_real_comma2k19_segment_replays_from_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

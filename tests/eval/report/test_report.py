@@ -233,6 +233,30 @@ def test_tile_without_a_distance_says_never(tmp_path: Path) -> None:
     assert "<b>never</b>" in _report_text(tmp_path, one, approaches=none)
 
 
+def _needed_px(table: str) -> float:
+    """Least width of a table in a browser: that of its longest lines, and of its padding."""
+    rows = [
+        [
+            max(len(part) for part in re.split(r"<small>| " if "text" in kind else "<small>", cell))
+            for kind, cell in re.findall(r"<t[dh]([^>]*)>(.*?)</t[dh]>", row)
+        ]
+        for row in table.replace("&emsp;", "  ").replace("</small>", "").split("<tr")[1:]
+    ]
+    widths: list[int] = [max(column) for column in zip(*rows, strict=True)]
+    return sum(7.7 * width + 17.6 for width in widths)
+
+
+def test_tables_beside_figures_fit_their_columns(tmp_path: Path) -> None:
+    """At 1400 px, the column of a pair is 585 px wide; what does not fit is cut off."""
+    scored = [_scored(tmp_path / name, name) for name in "ABCDE"]
+
+    for some in (scored[:1], scored):
+        pairs = _report_text(tmp_path / f"{len(some)}", *some).split('<div class="pair">')[1:]
+        tables = [one.partition("<table>")[2].partition("</table>")[0] for one in pairs]
+        assert len(tables) == 2
+        assert [table for table in tables if _needed_px(table) > 585] == []
+
+
 def test_pictures_of_a_report_leave_out_unlikely_detections(tmp_path: Path) -> None:
     run = _scored(tmp_path / "drive").run
     path = run.file("detections.parquet")

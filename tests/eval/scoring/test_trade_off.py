@@ -49,6 +49,16 @@ def test_each_rate_has_the_lowest_threshold_that_keeps_to_it() -> None:
     assert half.full.of == 10
 
 
+def test_belief_that_ranks_equally_has_the_same_curve() -> None:
+    """Only the ranking counts: raising a threshold is no merit of the belief."""
+    rng = np.random.default_rng(1)
+    plain = [Reached(full, (p,)) for full, p in rng.random((40, 2)).tolist()]
+    bold = [Reached((one.full or 0.0) ** 0.1, (one.false[0] ** 0.1,)) for one in plain]
+
+    for one, other in zip(*(trade_off(x, np.arange(40)) for x in (plain, bold)), strict=True):
+        assert (one.full, one.false_features) == (other.full, other.false_features)
+
+
 def test_short_or_missing_belief_is_never_full() -> None:
     assert reached({}, PRESENT, ABSENT, np.zeros(0, np.bool_)) == Reached(-1.0, (0.0,))
     assert reached({"left": np.ones(9)}, PRESENT, ABSENT, np.zeros(9, np.bool_)).full == -1.0
