@@ -109,15 +109,19 @@ def test_distance_is_along_the_ego_vehicle_for_a_turned_camera() -> None:
     turned = CAMERA.model_copy(update={"yaw_rad": 0.5})
     middle = (609.0, 329.0, 671.0, 391.0)
     tracks = CarTracks(turned, RULES)
-    tracks([found(middle)], STILL)
+    tracks([found(middle, moved(300.0))], STILL)
 
-    (made,) = tracks([found(middle)], STILL)
+    made, _ = tracks([found(middle, moved(300.0))], STILL)
 
     assert made.distance_m == pytest.approx(20.0 * math.cos(0.5), rel=1e-3)
     assert made.bearing == pytest.approx(math.tan(-0.5), rel=1e-2)
     behind = CarTracks(CAMERA.model_copy(update={"yaw_rad": math.pi}), RULES)
     behind([found(middle)], STILL)
     assert behind.seen == 0
+    # At 60 degrees to the left, a car at the left edge is behind, and one in the middle is not.
+    aside = CarTracks(CAMERA.model_copy(update={"yaw_rad": math.pi / 3}), RULES)
+    aside([found(middle, moved(-590.0, box=middle))], STILL)
+    assert aside.seen == 1
 
 
 @pytest.mark.parametrize("center_px", [(600.0, 400.0), None])
@@ -147,6 +151,7 @@ def test_ends_of_a_car_are_seen_at_half_its_height(center_px: tuple[float, float
         ((600.0, 656.0, 724.0, 718.0), True),
         ((600.0, 656.0, 724.0, 718.1), False),
         ((600.0, 300.0, 600.0, 362.0), False),
+        ((600.0, 300.0, 724.0, 300.0), False),
         ((600.0, 362.0, 724.0, 300.0), False),
         ((600.0, 300.0, 600.5, 362.0), True),
         (sized(12.41), True),  # 99.9 m
@@ -167,6 +172,9 @@ def test_cars_without_a_focal_length_are_not_seen() -> None:
     tracks([found(CAR)], STILL)
 
     assert tracks.seen == 0
+    short = CarTracks(CAMERA.model_copy(update={"focal_px": 1.0}), RULES)
+    short([found((600.0, 300.0, 602.0, 301.0))], STILL)
+    assert short.seen == 1
 
 
 def test_distance_of_cars_past_is_120_metres_or_15_pixels() -> None:
@@ -195,6 +203,8 @@ def test_unsure_box_continues_a_track_and_begins_none() -> None:
     assert tracks([found(CAR, scores=[0.5])], STILL) == []
     assert tracks.longer() == tracks.standing() == []
     (made,) = tracks([found(CAR)], STILL)
+    assert len(tracks.longer(lambda seen: len(seen) == 3)) == 1
+    assert tracks.standing(lambda seen: len(seen) != 3) == []
 
     assert (made.number, made.frames) == (1, 3)
     assert [one.frames for one in tracks.longer()] == [3]
@@ -296,9 +306,10 @@ ASIDE: Box = (1000.0, 300.0, 1124.0, 362.0)
         # At 85.2 px 0.3178 is above 0.1289 + 0.1874 = 0.3163.
         (CAR, (750.0, 300.0, 900.0, 385.2), 0.0, False),
         # A standing car that is 10 m nearer is twice as high, and its ends are twice as far from
-        # the centre. The boxes overlap by 0.25 only. After 25 m it would be behind.
+        # the centre. The boxes overlap by 0.25 only. After 20 m it would be beside the camera.
         (CAR, NEARER, 10.0, True),
         (CAR, NEARER, 0.0, False),
+        (CAR, NEARER, 20.0, False),
         (CAR, NEARER, 25.0, False),
         # After 19.2 m it is 0.8 m ahead, and a box of 700 px looks 1.771 m away:
         # ln(1.771 / 0.8) = 0.795 < 4 * 0.03 + ln(1 + 3 / 1.771) = 1.11.
@@ -315,6 +326,22 @@ def test_box_is_of_a_car_that_may_have_moved_there(
     made = followed(found(first), found(second), ego=CarStep(way_m, 0.0, 0.0, 0.1))
 
     assert (len(made) == 1) == is_same_car
+
+
+def test_distance_of_a_standing_car_is_the_mean_of_its_ends() -> None:
+    """The camera turns by 0.3 rad: the ends are 19.34 and 18.42 m ahead, 18.88 m on average.
+
+    At 51.2 px, 24.22 m, it is |ln(24.22 / 18.88)| = 0.249, below 0.143 + ln(1 + 3 / 24.22) = 0.260.
+    """
+    second = (850.0, 300.0, 974.0, 351.2)
+
+    assert followed(found(CAR), found(second), ego=CarStep(0.0, 0.0, 0.3, 0.1))
+
+
+def test_cars_are_followed_to_exactly_the_larger_distance() -> None:
+    rules = RULES.model_copy(update={"within_m": 10.0, "past_within_m": 20.0})
+
+    assert followed(found(CAR), found(CAR), rules=rules)
 
 
 def test_each_box_continues_the_track_it_fits_best() -> None:

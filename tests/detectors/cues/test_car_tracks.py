@@ -12,11 +12,7 @@ from hypothesis import strategies as st
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
-from crosscue.detectors.cues.candidates import ELSEWHERE
-from crosscue.detectors.cues.cars import CarCandidates, count_in_leg, no_pairs
 from crosscue.detectors.cues.observed import (
-    NONE,
-    CarCounts,
     Place,
     Sides,
     Ways,
@@ -31,7 +27,7 @@ from crosscue.detectors.cues.tracked.judge import (
 from crosscue.detectors.cues.tracked.motion import CAR_HEIGHT_M, CarMotion
 from crosscue.detectors.cues.tracked.tracks import CarTracks
 from crosscue.detectors.ranging.object_tracks import CarStep
-from crosscue.replay.vehicle.vehicle import CUES, SIMULATED_CAR, Camera, Cars, Vehicle
+from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Camera, Cars, Vehicle
 
 SIZE = (1280, 720)
 CAMERA = Camera(x_m=1.7, z_m=1.4, focal_px=704.0, center_px=(640.0, 360.0))
@@ -296,6 +292,9 @@ def test_car_rules_default_to_pairs_only_for_the_simulated_car() -> None:
         (-8.0, 6.0, 30.0, Sides(0, 0)),
         (-20.0, 0.0, 30.0, Sides(0, 0)),
         (-20.0, 6.0, 70.0, Sides(0, 0)),
+        # At the side of the ego road.
+        (-12.0, 6.0, 32.0, Sides(0, 0)),
+        (12.0, 6.0, 32.0, Sides(0, 0)),
     ],
 )
 def test_car_that_moves_across_counts_for_the_leg_in_which_it_is(
@@ -306,17 +305,5 @@ def test_car_that_moves_across_counts_for_the_leg_in_which_it_is(
 
     assert in_legs([car], CAMERA, RULES, Place(25.0, 40.0, 1.0)) == legs
     assert in_legs([car], CAMERA, RULES, None) is None
-
-
-def test_traffic_in_legs_is_looked_for_on_request_only() -> None:
-    judged = CarCounts(NONE, NONE, NONE, NONE, 1, 1, in_leg=Sides(2, 0))
-    pairs = replace(no_pairs(640), judged=judged, cars=CarCandidates((0.9, 0.9, 0.9)))
-    wanted = Vehicle(version=1, cars=Cars(leg_traffic=True))
-
-    for side, number in (("left", 2), ("right", 0)):
-        cue = CUES[f"leg_traffic_{side}"]
-        found = count_in_leg(pairs, wanted, cue)
-        assert found is not None
-        assert (found.number, found.skipped[ELSEWHERE]) == (number, 3 - number)
-        assert count_in_leg(pairs, Vehicle(version=1), cue) is None
-        assert count_in_leg(no_pairs(640), wanted, cue) is None
+    assert in_legs([car], CAMERA, RULES, Place(-10.0, 0.0, 1.0)) is None
+    assert in_legs([car], CAMERA, RULES, Place(-10.0, 1.0, 1.0)) == Sides(0, 0)

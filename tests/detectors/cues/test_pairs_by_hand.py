@@ -1,17 +1,21 @@
 """Cars in two frames (eq. 15, 16) and the nose of a car, with numbers worked out by hand."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections
+from crosscue.detectors.cues.candidates import BELOW_SCORE, ELSEWHERE, Count
 from crosscue.detectors.cues.cars import (
+    CarCandidates,
     CarShapes,
     Pairs,
     car_shapes,
     count_crossing,
+    count_in_leg,
     count_oncoming,
     count_outgoing,
     count_parked,
@@ -20,7 +24,7 @@ from crosscue.detectors.cues.cars import (
     pair_cars,
     parked_cars,
 )
-from crosscue.detectors.cues.observed import CarCounts, Sides, Ways, nose_of, of_side
+from crosscue.detectors.cues.observed import NONE, CarCounts, Sides, Ways, nose_of, of_side
 from crosscue.replay.vehicle.cue_table import CUES
 from crosscue.replay.vehicle.vehicle import Cars, Vehicle
 
@@ -293,3 +297,19 @@ def test_cues_of_tracked_cars_are_those_judged_over_frames() -> None:
 def test_side_is_that_which_the_cue_supports() -> None:
     assert of_side(Sides(1, 2), CUES["road_left"]) == 1
     assert of_side(Sides(1, 2), CUES["road_right"]) == 2
+
+
+def test_traffic_in_legs_is_looked_for_on_request_only() -> None:
+    """Of four cars one has a low score; of the others, two are in the left leg."""
+    judged = CarCounts(NONE, NONE, NONE, NONE, 1, 1, in_leg=Sides(2, 0))
+    cars = CarCandidates((0.9, 0.9, 0.9, 0.4), 1, (0.5,))
+    pairs = replace(no_pairs(640), judged=judged, cars=cars)
+    wanted = Vehicle(version=1, cars=Cars(leg_traffic=True))
+
+    for side, number in (("left", 2), ("right", 0)):
+        cue = CUES[f"leg_traffic_{side}"]
+        skipped = {BELOW_SCORE: 1, ELSEWHERE: 3 - number}
+        expected = Count(number, cars.scores, skipped, cars.thresholds, "[cars] score")
+        assert count_in_leg(pairs, wanted, cue) == expected
+        assert count_in_leg(pairs, Vehicle(version=1), cue) is None
+        assert count_in_leg(no_pairs(640), wanted, cue) is None
