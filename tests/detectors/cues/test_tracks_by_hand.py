@@ -318,6 +318,9 @@ def a_drive(seed: int, frames: int, jitter: float) -> list[Observation]:
         (5, 6, 0.06),
         (6, 9, 0.02),
         (7, 5, 0.2),
+        # Misfits of 5.5 and 2.9, of 2 frames and of 3.
+        (2, 2, 0.2),
+        (52, 3, 0.02),
     ],
 )
 def test_motion_is_the_least_squares_fit_of_both_ends(
