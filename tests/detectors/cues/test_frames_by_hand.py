@@ -399,6 +399,7 @@ def test_rules_get_the_tracked_cars_and_their_judgement(monkeypatch: pytest.Monk
     """Of two cars, one stands and one moves by (6, 2) px; their noses are unknown.
 
     Centres are (55, 25) and (205 + 6, 25 + 2). They are judged with camera, settings and place.
+    Both may be parked, and both are past the intersection in the third frame.
     """
     given: list[Pairs] = []
     judged_with: list[tuple[object, ...]] = []
@@ -415,16 +416,25 @@ def test_rules_get_the_tracked_cars_and_their_judgement(monkeypatch: pytest.Monk
         judged_with.append(arguments)
         return Ways(3, 4)
 
+    def legs_as(*arguments: object) -> Sides:
+        judged_with.append(arguments)
+        return Sides(5, 6)
+
     monkeypatch.setattr(frame, "counts_of", rules)
     monkeypatch.setattr(frame, "count_cars", judged_as)
     monkeypatch.setattr(frame, "cars_past", past_as)
+    monkeypatch.setattr(frame, "in_legs", legs_as)
+    monkeypatch.setattr(frame, "may_be_parked", lambda seen, cars: True)
+    monkeypatch.setattr(frame, "is_past", lambda one, *_: one.t_s == 1.5)
     cues, place = CuePass(TRACKED), Place(10.0, 26.0, 1.0)
-    still = EGO._replace(way_m=0.0)
-    boxes = [(5.0, 5.0, 105.0, 45.0), (161.0, 7.0, 261.0, 47.0)]
-    cues(FrameDetections(0, (found(("car", 0.9), ("car", 0.9)),)), still, place)
-    cues(FrameDetections(1, (found(("car", 0.9), ("car", 0.9), boxes=boxes),)), still, place)
+    still = EGO._replace(way_m=0.0, seconds=0.5)
+    boxes = [(5.0, 5.0, 105.0, 45.0), (161.0, 7.0, 261.0, 47.0), (400.0, 5.0, 500.0, 45.0)]
+    for t in range(2):
+        cues(FrameDetections(t, (found(("car", 0.9), ("car", 0.9)),)), still, place)
+    cars = ("car", 0.9), ("car", 0.9), ("car", 0.4)
+    cues(FrameDetections(2, (found(*cars, boxes=boxes),)), still, place)
 
-    none, both = given
+    none, _, both = given
     assert none.step_px.shape == none.center_px.shape == (0, 2)
     assert none.nose.shape == (0,)
     assert sorted(both.step_px.tolist()) == [[0.0, 0.0], [6.0, 2.0]]
@@ -434,9 +444,33 @@ def test_rules_get_the_tracked_cars_and_their_judgement(monkeypatch: pytest.Monk
     assert both.width_px == 640
     assert both.judged is not None
     assert (both.judged.seen, both.judged.past) == (2, Ways(3, 4))
+    assert both.judged.in_leg == Sides(5, 6)
+    assert (both.cars.low, both.cars.shapes) == (1, 0)
     for arguments in judged_with:
         assert arguments[-3:] in ((CAMERA, TRACKED.cars, place),)
-    assert len(judged_with) == 4
+    # Followed and standing cars, cars past the intersection, and followed cars, in each frame.
+    numbers = [len(one) for args in judged_with for one in args if isinstance(one, list)]
+    assert numbers == [0, 0, 0, 0, 2, 2, 0, 2, 2, 2, 2, 2]
+    CuePass(VEHICLE)(FrameDetections(0, (found(("car", 0.9)),)))
+    assert given[-1].width_px == 640
+
+
+def test_controls_get_the_ego_motion_or_the_time_since_the_frame_before() -> None:
+    """Without odometry only the time is known; it is 0 for the first frame and an earlier one."""
+    given: list[CarStep] = []
+    followed = (found(("stop sign", 0.7)),)
+
+    def controls(objects: Sequence[Detections], motion: CarStep) -> tuple[Detections, ...]:
+        given.append(motion)
+        return followed
+
+    cues, _ = _cues()
+    cues.controls = controls  # type: ignore[assignment]
+    for t_ms, ego in ((1000, None), (2500, None), (2000, None), (2100, EGO)):
+        frame = FrameDetections(t_ms * MS, (found(("stop sign", 0.9)),))
+        assert cues(frame, ego).objects is followed
+
+    assert given == [*(CarStep(None, 0.0, 0.0, s) for s in (0.0, 1.5, 0.0)), EGO]
 
 
 def skipped(tally: dict[str, Candidates], name: str) -> tuple[int, int, dict[str, int]]:
