@@ -275,7 +275,7 @@ def _cue(name: str, t_ns: int) -> list[dict[str, object]]:
         (_truth(**LONG_DRIVE, cues=_cue("stop_sign", 10**11)), "cues.0 (stop_sign)"),
         (_truth(cues=_cue("stop_sing", 0)), "did you mean stop_s"),
         (_truth(cues=_cue("Zebra!", 0)), "cues.0.cue"),
-        (_truth(cues=_cue("stop_sign", 7)), "at any of 1 moments"),
+        (_truth(cues=_cue("stop_sign", 7)), "no picture at their times, 1 in all"),
         (_truth(log_sha256={"a": "b"}), "by its hash"),
         (_truth(pose="../secret.tum"), "secret.tum"),
         (_truth(objects="gone.json"), "gone.json"),
