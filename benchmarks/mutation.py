@@ -130,6 +130,7 @@ PARTS: Final = {
             for name in (
                 "approaches",
                 "calibrated",
+                "combined",
                 "factor_graph",
                 "intersection_range",
                 "persistence",
@@ -150,7 +151,9 @@ PARTS: Final = {
     ),
     "fits": Part(
         ("fusion/fit/*.py",),
-        ("tests/fusion/test_message_fit.py", "tests/fusion/test_temporal_fit.py"),
+        tuple(
+            f"tests/fusion/test_{name}.py" for name in ("combined", "message_fit", "temporal_fit")
+        ),
         tuple(
             f"tests/fusion/test_temporal_fit.py::test_{name}"
             for name in (

@@ -356,6 +356,19 @@ def test_motion_is_the_least_squares_fit_of_both_ends(
     )
     assert made.long == sorted(one.long for one in seen)[frames // 2] or frames % 2 == 0
     assert made.nose == pytest.approx(sum(noses) / len(noses) if noses else 0.0)
+    # Each car is fitted alone; in a mirror its ends and its side change places.
+    mirrored = [
+        one._replace(
+            pose=(one.pose[0], -one.pose[1], -one.pose[2]),
+            edges_rad=(-one.edges_rad[1], -one.edges_rad[0]),
+        )
+        for one in seen
+    ]
+    again, other, _ = motions_of([seen, mirrored, a_drive(8, frames + 2, 0.0)], aside_mps)
+    assert again[:11] == pytest.approx(made[:11])
+    assert (other.right_mps, other.right_sd_mps) == pytest.approx(
+        (-made.right_mps, made.right_sd_mps)
+    )
 
 
 @pytest.mark.parametrize(
