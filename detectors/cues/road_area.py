@@ -24,6 +24,8 @@ from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.camera import Camera
 
 CELL_M: Final = 0.25
+# Fractions of a cell in which places are added: whole numbers are added in a third of the time.
+FRACTIONS: Final = 2**20
 # Half of the side of the square grid.
 HALF_M: Final = 70.0
 CELLS: Final = round(2 * HALF_M / CELL_M)
@@ -183,15 +185,17 @@ class RoadArea:
         ahead_m = np.arange(-behind_m, self.reach_m + self.camera.x_m, CELL_M) + 0.5 * CELL_M
         left_m = np.arange(ASIDE_M, -ASIDE_M, -CELL_M) - 0.5 * CELL_M
         cos, sin = math.cos(self._heading), math.sin(self._heading)
-        at_m = self._scratch.view(np.float64)[0, : len(ahead_m) * len(left_m)]
-        at_m = at_m.reshape(len(ahead_m), len(left_m))
-        cells = _index(np.subtract.outer(self._xy_m[0] + ahead_m * cos, left_m * sin, out=at_m))
+        x, y = self._xy_m
+        cells = _cells(x + ahead_m * cos, -left_m * sin)
         cells *= CELLS
-        cells += _index(np.add.outer(self._xy_m[1] + ahead_m * sin, left_m * cos, out=at_m))
+        cells += _cells(y + ahead_m * sin, left_m * cos)
         seen, road = (grid.take(cells, mode="clip") for grid in (self._seen, self._road))
         is_seen = seen >= min_weight
-        road /= np.maximum(seen, 1e-9, out=seen)
-        return RoadPlan(ahead_m, left_m, np.where(is_seen, road, np.nan))
+        # 0 / 0 is NaN; that takes a third of the time of a choice by cell.
+        seen *= is_seen
+        road *= is_seen
+        with np.errstate(invalid="ignore"):
+            return RoadPlan(ahead_m, left_m, np.divide(road, seen, out=road))
 
     @property
     def _far_m(self) -> float:
@@ -204,17 +208,21 @@ class RoadArea:
         away_m = (x * cos - (y * sin)[:, None], x * sin + (y * cos)[:, None])
         parts, middles_m = [], []
         for at_m, corners_m in zip(self._xy_m, away_m, strict=True):
-            first, last = _index(at_m + np.array([corners_m.min(), corners_m.max()])).tolist()
+            first, last = (
+                min(max(int((at_m + off_m + HALF_M) / CELL_M), 0), CELLS - 1)
+                for off_m in (corners_m.min(), corners_m.max())
+            )
             parts.append(slice(first, last + 1))
             middles_m.append((np.arange(first, last + 1) + 0.5) * CELL_M - HALF_M - at_m)
         return parts[0], parts[1], middles_m[0], middles_m[1]
 
 
-def _index(at_m: Floats) -> NDArray[np.int32]:
-    """Row or column of the grid; places are changed."""
-    at_m += HALF_M
-    at_m *= 1.0 / CELL_M
-    found = at_m.astype(np.int32)
+def _cells(along_m: Floats, across_m: Floats) -> NDArray[np.int32]:
+    """Rows or columns of the grid at the sums of two places, in whole fractions of a cell."""
+    along = np.rint((along_m + HALF_M) * (FRACTIONS / CELL_M)).astype(np.int32)
+    across = np.rint(across_m * (FRACTIONS / CELL_M)).astype(np.int32)
+    found = np.add.outer(along, across)
+    found //= FRACTIONS
     return np.clip(found, 0, CELLS - 1, out=found)
 
 

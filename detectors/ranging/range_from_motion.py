@@ -21,10 +21,10 @@ The scale of the errors is estimated with the range, from residuals and a weak p
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
-from functools import lru_cache
 from statistics import median
-from typing import Final, NamedTuple, Self, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from .standard_sizes import SizePrior
 
 Floats: TypeAlias = NDArray[np.float64]
+Limits: TypeAlias = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,12 +79,19 @@ class MotionRange:
 
 NEAREST_M: Final = 0.5
 FURTHEST_M: Final = 500.0
-GRID: Final = 101
-STEPS: Final = np.linspace(0.0, 1.0, GRID)
+WIDE: Final = np.linspace(0.0, 1.0, 101)
+# Half of the width of a fine grid in standard deviations of the posterior, and its steps: sums over
+# a smooth density are exact to rounding if a step is less than half a standard deviation.
+REACH_SD: Final = 8.0
+STEPS: Final = np.linspace(0.0, 1.0, 41)
+# A fine grid fits if the mean is at most so many standard deviations off its middle, and the
+# variance is right within a factor; else another grid follows.
+MAX_OFF_SD: Final = 0.5
+MAX_RATIO: Final = 1.25
 # Number of standard deviations beyond which an observation's weight decreases with the square of
 # its distance.
 OUTLIER: Final = 2.5
-# Number of rounds of reweighting; weights converge in three or four.
+# Maximum number of rounds of reweighting, which converges in three or four, and of fine grids.
 ROUNDS: Final = 8
 
 
@@ -111,24 +119,29 @@ def range_from_motion(
     log_mean, log_var = size.log_mean, size.log_var
     nearest_m = max(NEAREST_M, 1.01 * -float(seen.ahead_m.min()))
     furthest_m = max(FURTHEST_M, 2.0 * nearest_m)
-    wide = _Grid.of(seen, *_ranges(nearest_m, furthest_m))
-    weights = seen.worth * _first_weights(wide.off, seen.var)
-    post = _refined(seen, wide, weights, log_var)
-    for _ in range(ROUNDS):
-        new = seen.worth * _weights(seen, seen.off(post.mean_m) - post.at_mean, errors)
+    limits = (math.log(nearest_m), math.log(furthest_m))
+    range_m = np.exp(limits[0] + (limits[1] - limits[0]) * WIDE)
+    off = seen.off(range_m[:, None])
+    new = seen.worth * _first_weights(off, seen.var)
+    post, at_mean = _on_grid(range_m, WIDE, off, new, log_var), 0.0
+    for _ in range(1 + ROUNDS):
+        weights = new
+        post = _refined(seen, post, limits, weights, log_var)
+        off = seen.off(post.mean_m)
+        at_mean = float(off.dot(weights)) / post.precision
+        new = _weights(seen, off - at_mean, errors)
         if (np.abs(new - weights) <= 1e-3 * weights).all():
             break
-        weights = new
-        post = _refined(seen, wide, weights, log_var)
     excess = median(one + log_mean for one in seen.log_excess[-5:].tolist())
     log_range_var = float(seen.var[-1]) + log_var
-    before_m2 = _var_of_one_m2(log_mean - excess, log_range_var, (nearest_m, furthest_m))
-    by_motion = min(max(1.0 - post.var_m2 / before_m2, 0.0), 1.0)
+    before_m2 = _var_of_one_m2(log_mean - excess, log_range_var, limits)
+    var_m2 = max(_moments(post.density, post.range_m)[1], 1e-12)
+    by_motion = min(max(1.0 - var_m2 / before_m2, 0.0), 1.0)
     log_height, log_height_var = post.log_height()
     return MotionRange(
         post.mean_m,
-        post.var_m2,
-        math.exp(log_mean + post.at_mean),
+        var_m2,
+        math.exp(log_mean + at_mean),
         by_motion,
         log_mean + log_height,
         log_height_var,
@@ -178,11 +191,11 @@ def _checked(
         raise ValueError(
             f"travelled_m, height_px: expected (N,), got {travelled_m.shape}, {height_px.shape}"
         )
-    if not (np.isfinite(travelled_m).all() and np.isfinite(height_px).all()):
+    if not math.isfinite(travelled_m.dot(travelled_m) + height_px.dot(height_px)):
         raise ValueError("travelled_m, height_px: expected finite numbers")
-    if not ((height_px > 0.0).all() and 0.0 < focal_px < np.inf):
+    if not (np.minimum.reduce(height_px) > 0.0 and 0.0 < focal_px < np.inf):
         raise ValueError("height_px, focal_px: expected positive numbers")
-    step_m = np.abs(np.diff(travelled_m))
+    step_m = np.abs(travelled_m[1:] - travelled_m[:-1])
     # With a correlation of exp(-step / length) to the previous one, the weight of an observation is
     # tanh(step / length / 2).
     worth = np.concatenate(([1.0], np.tanh(0.5 * step_m / errors.resemble_m)))
@@ -191,31 +204,10 @@ def _checked(
     return _Observations(travelled_m[-1] - travelled_m, log_excess, var, worth)
 
 
-class _Grid(NamedTuple):
-    """Ranges, shape (G,), with their prior, and log height above its mean, shape (G, N)."""
-
-    range_m: Floats
-    prior: Floats
-    off: Floats
-    squares: Floats
-
-    @classmethod
-    def of(cls, seen: _Observations, range_m: Floats, prior: Floats) -> Self:
-        """Compute the heights."""
-        off = seen.off(range_m[:, None])
-        return cls(range_m, prior, off, off * off)
-
-
-@lru_cache(maxsize=8)
-def _ranges(nearest_m: float, furthest_m: float) -> tuple[Floats, Floats]:
-    range_m = np.geomspace(nearest_m, furthest_m, GRID)
-    return range_m, np.asarray(np.gradient(range_m) / range_m, np.float64)
-
-
-def _var_of_one_m2(log_mean: float, log_var: float, limits_m: tuple[float, float]) -> float:
-    """Variance of the range from one observation: that of a lognormal within limits."""
+def _var_of_one_m2(log_mean: float, log_var: float, limits: Limits) -> float:
+    """Variance of the range from one observation: that of a lognormal within limits of the log."""
     sd = math.sqrt(log_var)
-    ends = [(math.log(one) - log_mean) / sd for one in limits_m]
+    ends = [(one - log_mean) / sd for one in limits]
     # Integrals of the powers 0, 1 and 2.
     none, one, two = (
         math.exp(k * log_mean + 0.5 * (k * sd) ** 2)
@@ -245,21 +237,27 @@ def _medians(rows: Floats) -> Floats:
 
 
 def _weights(seen: _Observations, residual: Floats, errors: HeightErrors) -> Floats:
-    """Inverse variances, with the errors' scale from the residuals and its prior."""
+    """Worth times inverse variances, with the errors' scale from the residuals and its prior."""
     squares = residual * residual / seen.var
-    most, weighted = float(squares.max()), float(seen.worth.dot(squares))
-    count, scale, before = float(np.add.reduce(seen.worth)), 1.0, math.nan
+    # Sums over the nearest and over the furthest observations, of every number of them.
+    order = squares.argsort()
+    worth, ordered = seen.worth[order], squares[order]
+    sums = np.zeros((4, len(order) + 1))
+    sums[0, 1:], sums[1, 1:] = worth, worth * ordered
+    sums[2, 1:], sums[3, 1:] = worth[::-1], (worth / np.maximum(ordered, 1e-300))[::-1]
+    near, near_squares, far, far_shares = sums.cumsum(axis=1).tolist()
+    limits, scale, before = ordered.tolist(), 1.0, math.nan
     for _ in range(ROUNDS):
         if scale == before:
             break
-        total, of_squares = count, weighted
-        if most / scale > OUTLIER**2:
-            trust = seen.worth * _trust(squares / scale)
-            total, of_squares = float(np.add.reduce(trust)), float(trust.dot(squares))
+        limit = OUTLIER**2 * scale
+        count = bisect_right(limits, limit)
+        total = near[count] + limit * far_shares[len(limits) - count]
+        of_squares = near_squares[count] + limit * far[len(limits) - count]
         # Range and size use up two degrees of freedom.
         left = max(total - 2.0, 0.0)
         before, scale = scale, (errors.worth + of_squares) / (errors.worth + left)
-    return np.asarray(_trust(squares / scale) / (scale * seen.var), np.float64)
+    return np.asarray(seen.worth * _trust(squares / scale) / (scale * seen.var), np.float64)
 
 
 def _trust(squares: Floats) -> Floats:
@@ -268,23 +266,27 @@ def _trust(squares: Floats) -> Floats:
 
 
 class _Posterior(NamedTuple):
-    """Posterior of the range, with the size integrated out.
+    """Posterior of the range, with the size integrated out, on a grid of equal steps of its log.
 
     Attributes:
-        mean_m: Its mean.
-        var_m2: Its variance.
+        range_m: Shape (G,): the grid.
         density: Shape (G,), of sum 1.
         pull: Shape (G,): weighted sum of the log heights at each range.
-        at_mean: Log height at the mean range, above its prior mean.
         precision: Inverse variance of the log height at a given range.
+        mean_m: Mean of the range.
+        log_mean: Mean of its logarithm.
+        log_var: Variance of its logarithm.
+        step: Step of the logarithm.
     """
 
-    mean_m: float
-    var_m2: float
+    range_m: Floats
     density: Floats
     pull: Floats
-    at_mean: float
     precision: float
+    mean_m: float
+    log_mean: float
+    log_var: float
+    step: float
 
     def log_height(self) -> tuple[float, float]:
         """Mean above its prior mean, and variance, of the logarithm of the height."""
@@ -292,31 +294,41 @@ class _Posterior(NamedTuple):
         return mean, var + 1.0 / self.precision
 
 
-def _refined(seen: _Observations, grid: _Grid, weights: Floats, log_var: float) -> _Posterior:
-    """Compute the posterior on successively finer grids; it can be narrower than a grid's steps."""
-    precision = float(np.add.reduce(weights)) + 1.0 / log_var
-    mean_m, var_m2, density, pull = _on_grid(grid, weights, precision)
-    for _ in range(2):
-        range_m = grid.range_m
-        near = max(int(range_m.searchsorted(mean_m)), 1)
-        step_m = float(range_m[min(near, GRID - 1)] - range_m[near - 1])
-        reach_m = max(8.0 * math.sqrt(var_m2), 2.0 * step_m)
-        near_m = max(mean_m - reach_m, float(range_m[0]))
-        range_m = near_m + (min(mean_m + reach_m, float(range_m[-1])) - near_m) * STEPS
-        grid = _Grid.of(seen, range_m, 1.0 / range_m)
-        mean_m, var_m2, density, pull = _on_grid(grid, weights, precision)
-    at_mean = float(seen.off(mean_m).dot(weights)) / precision
-    return _Posterior(mean_m, max(var_m2, 1e-12), density, pull, at_mean, precision)
+def _refined(
+    seen: _Observations, post: _Posterior, limits: Limits, weights: Floats, log_var: float
+) -> _Posterior:
+    """Compute the posterior on grids around the last one, until a grid fits its posterior."""
+    for _ in range(ROUNDS):
+        old, reach = post, max(REACH_SD * math.sqrt(post.log_var), 2.0 * post.step)
+        ends = max(post.log_mean - reach, limits[0]), min(post.log_mean + reach, limits[1])
+        range_m = np.exp(ends[0] + (ends[1] - ends[0]) * STEPS)
+        post = _on_grid(range_m, STEPS, seen.off(range_m[:, None]), weights, log_var)
+        is_near = abs(post.log_mean - old.log_mean) <= MAX_OFF_SD * math.sqrt(post.log_var)
+        if is_near and 1.0 / MAX_RATIO <= post.log_var / old.log_var <= MAX_RATIO:
+            break
+    return post
 
 
-def _on_grid(grid: _Grid, weights: Floats, precision: float) -> tuple[float, float, Floats, Floats]:
-    """Mean, variance and density of the range, and weighted sums of the log heights."""
+def _on_grid(
+    range_m: Floats, steps: Floats, off: Floats, weights: Floats, size_var: float
+) -> _Posterior:
+    """Posterior from log heights, shape (G, N), at ranges whose logarithms are at ``steps``."""
     # Methods and ufuncs take half of the time of operators and functions on arrays of this size.
-    pull = grid.off.dot(weights)
-    log_density = pull * pull / precision - grid.squares.dot(weights)
-    density = np.exp(0.5 * (log_density - np.maximum.reduce(log_density))) * grid.prior
+    precision = float(np.add.reduce(weights)) + 1.0 / size_var
+    pull = off.dot(weights)
+    density = pull * pull
+    density *= 0.5 / precision
+    density -= (off * off).dot(0.5 * weights)
+    density -= np.maximum.reduce(density)
+    np.exp(density, out=density)
+    # The trapezoidal rule, for a density that the limits cut off.
+    density[:: len(steps) - 1] *= 0.5
     density /= np.add.reduce(density)
-    return *_moments(density, grid.range_m), density, pull
+    first, wide = math.log(range_m[0]), math.log(range_m[-1] / range_m[0])
+    (mean, var), mean_m = _moments(density, steps), float(density.dot(range_m))
+    log_mean, log_var = first + mean * wide, max(var * wide * wide, 1e-12)
+    step = wide * float(steps[1])
+    return _Posterior(range_m, density, pull, precision, mean_m, log_mean, log_var, step)
 
 
 def _moments(density: Floats, values: Floats) -> tuple[float, float]:

@@ -13,6 +13,8 @@ from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.road_area import (
     BESIDE_M,
     CELL_M,
+    CELLS,
+    HALF_M,
     HIDDEN,
     SHOWS_BEHIND,
     SHOWS_GROUND,
@@ -100,6 +102,26 @@ def driven(
         area.see(mask(ground, pose, pitch_rad, flipped, wall_m), boxes_px, pitch_rad)
         found.append(openings(area.plan(), STEP_M if i else 0.0, turn_rad if i else 0.0))
     return found
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.3, 1.5, -2.4])
+def test_plan_shows_the_cells_of_the_grid_below(turn_rad: float) -> None:
+    area, rng = RoadArea(CAMERA, 60.0), np.random.default_rng(3)
+    area.move(14.9, turn_rad)
+    area._seen[:] = rng.random(area._seen.shape) * 0.1
+    area._road[:] = area._seen * rng.random(area._seen.shape)
+
+    plan = area.plan()
+
+    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+    x_m, y_m = 14.9 * math.cos(0.5 * turn_rad), 14.9 * math.sin(0.5 * turn_rad)
+    ahead_m, left_m = plan.ahead_m[:, None], plan.left_m
+    at_m = (x_m + ahead_m * cos - left_m * sin, y_m + ahead_m * sin + left_m * cos)
+    cells = tuple(np.clip(np.floor((m + HALF_M) / CELL_M).astype(int), 0, CELLS - 1) for m in at_m)
+    seen = area._seen[cells]
+    expected = np.where(seen >= 0.05, area._road[cells] / seen, np.nan)
+    # A place on the border of two cells may be either's.
+    assert np.isclose(plan.road, expected, equal_nan=True).mean() > 0.9999
 
 
 def straight(x: Floats, y: Floats) -> NDArray[np.bool_]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
+from crosscue.detectors.ranging import range_from_motion as module
 from crosscue.detectors.ranging.height_to_range import FAMILIES, Family, fit_range, range_of
 from crosscue.detectors.ranging.object_tracks import (
     SAME_MAKE,
@@ -16,8 +17,12 @@ from crosscue.detectors.ranging.object_tracks import (
     shared_size,
 )
 from crosscue.detectors.ranging.range_from_motion import (
+    OUTLIER,
+    ROUNDS,
     HeightErrors,
     MotionRange,
+    _checked,
+    _weights,
     range_from_motion,
 )
 from crosscue.detectors.ranging.standard_sizes import SizePrior, light_size
@@ -167,6 +172,56 @@ def test_track_without_errors_yields_exact_range_and_height(height_m: float, las
 
     assert found.mean_m == pytest.approx(last_m, rel=2e-3)
     assert found.height_m == pytest.approx(height_m, rel=2e-3)
+
+
+@pytest.mark.parametrize("height_px", [300.0, 60.0, 30.0])
+def test_range_of_one_observation_is_lognormal_to_rounding(height_px: float) -> None:
+    """Neither the tails nor the steps of the grid show."""
+    found = range_from_motion(np.zeros(1), np.array([height_px]), 1000.0, LIGHT)
+
+    errors = HeightErrors()
+    var = LIGHT.log_var + errors.fraction**2 + (errors.edges_px / height_px) ** 2
+    mean_m = 1000.0 / height_px * np.exp(LIGHT.log_mean + 0.5 * var)
+    assert found.mean_m == pytest.approx(mean_m, rel=1e-9)
+    assert found.var_m2 == pytest.approx(mean_m**2 * np.expm1(var), rel=1e-8)
+    assert found.by_motion < 1e-8
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_finer_and_wider_grids_change_nothing(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sizes spread so little that the greatest range cuts no distribution off."""
+    rng, size = np.random.default_rng(seed), SizePrior(1.2, 0.12)
+    travelled_m = np.cumsum(rng.uniform(-0.1, 1.0, 5 + 8 * seed))
+    height_px, _ = track(travelled_m, rng, size)
+    height_px[::6] *= 1.5
+    found = range_from_motion(travelled_m, height_px, FOCAL_PX, size)
+
+    monkeypatch.setattr(module, "STEPS", np.linspace(0.0, 1.0, 2001))
+    monkeypatch.setattr(module, "REACH_SD", 12.0)
+
+    finest = range_from_motion(travelled_m, height_px, FOCAL_PX, size)
+    for name in MotionRange.__slots__:
+        assert getattr(found, name) == pytest.approx(getattr(finest, name), rel=1e-8), name
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_scale_of_errors_by_sums_is_that_of_all_observations(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 400))
+    travelled_m = np.cumsum(rng.uniform(-1.0, 1.0, count) * (rng.random(count) < 0.8))
+    errors = HeightErrors()
+    seen = _checked(travelled_m, rng.uniform(8.0, 90.0, count), FOCAL_PX, LIGHT, errors)
+    residual = 0.1 * rng.standard_cauchy(count) * (rng.random(count) < 0.9)
+
+    squares, scale = residual**2 / seen.var, 1.0
+    for _ in range(ROUNDS):
+        trust = OUTLIER**2 / np.maximum(squares / scale, OUTLIER**2)
+        total, of_squares = (seen.worth * trust).sum(), (seen.worth * trust * squares).sum()
+        scale = (errors.worth + of_squares) / (errors.worth + max(total - 2.0, 0.0))
+    trust = OUTLIER**2 / np.maximum(squares / scale, OUTLIER**2)
+
+    expected = seen.worth * trust / (scale * seen.var)
+    np.testing.assert_allclose(_weights(seen, residual, errors), expected, rtol=1e-9)
 
 
 @pytest.mark.slow
