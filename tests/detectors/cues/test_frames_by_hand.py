@@ -291,7 +291,7 @@ def _cues(vehicle: Vehicle = VEHICLE) -> tuple[CuePass, dict[str, Candidates]]:
 
 def test_frame_counts_each_kind_of_cue() -> None:
     """1 sure light, 2 signs, 1 zebra and 1 dog; road fills the left and the straight region."""
-    cues, _ = _cues()
+    cues, tally = _cues()
     objects = found(("traffic light", 0.7), ("traffic light", 0.6), ("zebra", 0.4), ("dog", 0.5))
     signs = found(("one way left", 0.1), ("no entry", 0.2), ("dog", 0.6))
 
@@ -301,6 +301,7 @@ def test_frame_counts_each_kind_of_cue() -> None:
     counts = dict.fromkeys((*once, "road_left", "road_straight"), 1)
     assert made.counts == counts | dict.fromkeys(("stop_sign", "one_way_right", "road_right"), 0)
     assert made.road == RoadFractions(1.0, 1.0, 0.0)
+    assert tally["crossing"].setting == "[cues.own.crossing] score"
     assert cues(FrameDetections(1)).counts == {}
     assert cues(FrameDetections(1)).road is None
 
@@ -432,7 +433,8 @@ def test_rules_get_the_tracked_cars_and_their_judgement(monkeypatch: pytest.Monk
     for t in range(2):
         cues(FrameDetections(t, (found(("car", 0.9), ("car", 0.9)),)), still, place)
     cars = ("car", 0.9), ("car", 0.9), ("car", 0.4)
-    cues(FrameDetections(2, (found(*cars, boxes=boxes),)), still, place)
+    last = found(*cars, boxes=boxes, min_scores=(0.3, 0.3, 0.3))
+    cues(FrameDetections(2, (last,)), still, place)
 
     none, _, both = given
     assert none.step_px.shape == none.center_px.shape == (0, 2)
