@@ -275,6 +275,7 @@ def test_graph_without_cue_drops_only_that_cue() -> None:
     less = DEFAULT_GRAPH.without("stop_sign")
 
     assert {c.name for c in DEFAULT_GRAPH.cues} - {c.name for c in less.cues} == {"stop_sign"}
+    assert {e.cue for e in DEFAULT_GRAPH.edges} - {e.cue for e in less.edges} == {"stop_sign"}
     assert probabilities_after(less, [{"stop_sign": 1, "road_left": 1}])["intersection"] == 0.5
     there_are = ", ".join(node.name for node in DEFAULT_GRAPH.cues)
     with pytest.raises(ValueError, match=f"^no cue 'stop_sgn'; there are: {there_are}$"):

@@ -302,6 +302,9 @@ def test_frame_counts_each_kind_of_cue() -> None:
     assert made.counts == counts | dict.fromkeys(("stop_sign", "one_way_right", "road_right"), 0)
     assert made.road == RoadFractions(1.0, 1.0, 0.0)
     assert tally["crossing"].setting == "[cues.own.crossing] score"
+    lights = tally["traffic_light"]
+    assert (lights.used, lights.skipped) == (1, {BELOW_SCORE: 1})
+    assert (lights.threshold, lights.setting) == (0.6, "[cues] traffic_light_score")
     assert cues(FrameDetections(1)).counts == {}
     assert cues(FrameDetections(1)).road is None
 
