@@ -328,7 +328,11 @@ def test_an_unseen_road_is_no_count_and_one_picture_alone_shows_no_road_area() -
 
     assert unknown.counts == {"road_left": 1, "road_right": 0}
     assert tally["road_straight"].skipped == {REGION_NOT_SEEN: 1}
-    assert (tally["road_straight"].seen, tally["road_straight"].used) == (1, 0)
+    straight = tally["road_straight"]
+    assert (straight.seen, straight.used) == (1, 0)
+    assert (straight.threshold, straight.setting, straight.unit) == (
+        *(0.2, "[cues] road_fraction", "frames"),
+    )
     assert alone.road is not None
     assert math.isnan(alone.road.left)
     assert alone.counts == {}

@@ -1,5 +1,7 @@
 """Tests of the fractions of road in regions of the picture."""
 
+from collections.abc import Collection
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,9 +11,9 @@ from numpy.typing import NDArray
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.observed import RoadFractions
-from crosscue.detectors.cues.road import outlines, road_fractions
+from crosscue.detectors.cues.road import is_on_map, outlines, road_fractions
 from crosscue.replay.errors import VehicleError
-from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Regions, Vehicle, parse
+from crosscue.replay.vehicle.vehicle import CUES, SIMULATED_CAR, Regions, Vehicle, parse
 
 
 def _mask(road: NDArray[np.bool_]) -> RoadMask:
@@ -82,3 +84,10 @@ def test_outlines_are_the_polygons_in_pixels_and_none_of_the_accumulated_road() 
     np.testing.assert_array_equal(found[0], [(0.0, 100.0), (100.0, 100.0), (100.0, 150.0)])
     assert len(found) == 3
     assert outlines(regions.model_copy(update={"kind": "area"}), (400, 200)) == ()
+
+
+@pytest.mark.parametrize("sides", [{"left", "right"}, {"straight"}, ()])
+def test_way_out_on_the_map_counts_for_its_side(sides: Collection[str]) -> None:
+    for side in ("left", "straight", "right"):
+        counted = is_on_map(sides, Vehicle(version=1), CUES[f"map_{side}"])
+        assert counted == (side in sides)
