@@ -575,8 +575,10 @@ def test_road_that_comes_up_belongs_to_the_next_once_another_one_is_passed(
 ) -> None:
     """The second street begins within the network's reach behind the first, so none is free."""
     following = [by_shape(i, left=left, right=3.0) for i in range(5, 10)]
-    steps = run_steps([*STREET, *following], approaches(Vehicle(version=1).fusion))
+    loop = approaches(Vehicle(version=1).fusion)
+    steps = run_steps([*STREET, *following], loop)
     assert {one.approach for one in steps} == numbers
+    assert loop.counts.get("approaches closed: another ahead", 0) == len(numbers) - 1
     assert steps[-1].probabilities["right"] > 0.9
     assert (steps[-1].probabilities["left"] > 0.9) is (len(numbers) == 1)
 
@@ -596,6 +598,9 @@ GONE = range(5, 12)
     [
         pytest.param([by_shape(i, left=1.0) for i in GONE], id="undecided"),
         pytest.param([by_shape(i, light=1, left=-1.0) for i in GONE], id="light in view"),
+        pytest.param(
+            [replace(by_shape(i, left=-1.0), signs=(sign(30.0),)) for i in GONE], id="sign in view"
+        ),
         pytest.param([by_shape(i, 0.0, left=-1.0) for i in GONE], id="standing"),
     ],
 )
