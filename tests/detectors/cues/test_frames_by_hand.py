@@ -177,13 +177,16 @@ def _taken(
 def test_number_of_a_rule_is_explained_by_the_labels_and_threshold_of_its_row(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A plug-in's rule returns a number: lights of 0.5 and 0.7, of which it counts one."""
+    """A plug-in's rule returns a number: lights of 0.55 and 0.7, of which it counts one."""
     row = replace(CUES["traffic_light"], rule=f"{__name__}:one_of_them")
     monkeypatch.setitem(CUES, "traffic_light", row)
 
-    lights = _taken("objects", [found(("traffic light", 0.5), ("traffic light", 0.7))])
+    lights = _taken("objects", [found(("traffic light", 0.55), ("traffic light", 0.7))])
 
     assert skipped(lights, "traffic_light") == (2, 1, {BELOW_SCORE: 1})
+    monkeypatch.setitem(CUES, "do_not_enter", replace(CUES["do_not_enter"], rule=row.rule))
+    signs = _taken("signs", [found(("no entry", 0.9))])
+    assert skipped(signs, "do_not_enter") == (1, 1, {})
     left = replace(CUES["cross_traffic_left"], rule=row.rule)
     monkeypatch.setitem(CUES, "cross_traffic_left", left)
     assert "cross_traffic_left" not in _taken("car pairs", no_pairs(640))
