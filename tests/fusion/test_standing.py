@@ -12,7 +12,7 @@ from crosscue.fusion.approaches import Approaches, Step
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior, SignRange
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
-from crosscue.replay.vehicle.fusion import Calibrated, Fusion, RangeFilter, Rates
+from crosscue.replay.vehicle.fusion import Calibrated, Fade, Fusion, RangeFilter, Rates
 from crosscue.replay.vehicle.temporal import Combined, CueChain, Temporal
 from support.fusion import NONE_SEEN
 
@@ -173,6 +173,18 @@ def test_light_is_believed_as_long_as_a_car_stands_before_it(kind: str) -> None:
         for one in steps[late + 6 :]:
             assert one.probabilities == pytest.approx(steps[late + 5].probabilities)
         assert {**steps[-1].counts} == LIGHT
+
+
+@pytest.mark.parametrize("cue", ["traffic_light", "road_left"])
+def test_static_cue_whose_errors_fade_over_time_counts_once_while_standing(cue: str) -> None:
+    fades = {cue: Fade(time_s=0.5)}
+    fusion = Fusion(kind="calibrated", calibrated=CALIBRATED.model_copy(update={"fades": fades}))
+    look = ({**LIGHT, cue: 1}, None, None, True, {})
+    drive, standing = [evidence(look, 2.0)] * 4, [evidence(look)] * 50
+
+    steps = believed([*drive, *standing], fusion)
+
+    assert_same(steps[-1:], steps[len(drive) : len(drive) + 1])
 
 
 def left_while_standing(seen: Sequence[int], kind: str = "temporal") -> list[float]:
