@@ -179,7 +179,7 @@ def test_light_is_believed_as_long_as_a_car_stands_before_it(kind: str) -> None:
 def test_static_cue_whose_errors_fade_over_time_counts_once_while_standing(cue: str) -> None:
     fades = {cue: Fade(time_s=0.5)}
     fusion = Fusion(kind="calibrated", calibrated=CALIBRATED.model_copy(update={"fades": fades}))
-    look = ({**LIGHT, cue: 1}, None, None, True, {})
+    look: Look = ({**LIGHT, cue: 1}, None, None, True, {})
     drive, standing = [evidence(look, 2.0)] * 4, [evidence(look)] * 50
 
     steps = believed([*drive, *standing], fusion)
