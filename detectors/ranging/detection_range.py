@@ -27,7 +27,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .ground_plane import GroundPlane
 from .height_to_range import range_of
 from .standard_sizes import VEHICLES, SizePrior, size_prior
-from .usable import BORDER_PX
+from .usable import is_cut
 
 EDGE_PX: Final = 1.0
 # Standard deviation of a box's edge as a fraction of the box's height, added to ``EDGE_PX`` in
@@ -145,11 +145,7 @@ def detection_range(
     curve = ranges.traffic_light if label in cues.traffic_light_labels else curve
     if curve is not None:
         return OneRange(float(range_of(np.array([height_px]), curve)[0]), curve.residual_sd_m)
-    x0, y0, x1, y1 = box_px.tolist()
-    ends_px = (size_px[0] - BORDER_PX, size_px[1] - BORDER_PX)
-    # As ``are_cut``, which takes arrays.
-    is_cut = min(x0, y0) < BORDER_PX or x1 > ends_px[0] or y1 > ends_px[1]
-    if is_cut or not _has_defaults(vehicle):
+    if is_cut(box_px, size_px) or not _has_defaults(vehicle):
         return None
     found = _by_size(vehicle, label, box_px, height_px, size_px)
     return None if found is None else OneRange(found.mean_m + vehicle.camera.x_m, found.sd_m)

@@ -33,6 +33,13 @@ def are_cut(boxes_px: NDArray[np.float64], size_px: tuple[int, int]) -> NDArray[
     return are_near | (boxes_px[:, 2:] > np.array(size_px) - BORDER_PX).any(axis=1)
 
 
+def is_cut(box_px: NDArray[np.float64], size_px: tuple[int, int]) -> bool:
+    """Return whether the picture's edge cuts one box; ``are_cut`` in plain numbers."""
+    x0, y0, x1, y1 = box_px.tolist()
+    is_past: bool = x1 > size_px[0] - BORDER_PX or y1 > size_px[1] - BORDER_PX
+    return is_past or min(x0, y0) < BORDER_PX
+
+
 def why_not(
     found: Detections,
     i: int,
@@ -44,6 +51,6 @@ def why_not(
         return BELOW_SCORE
     if found.heights_px[i] <= 0.0:
         return NO_HEIGHT
-    if are_cut(found.boxes_px[[i]], found.size_px)[0]:
+    if is_cut(found.boxes_px[i], found.size_px):
         return CUT
     return NO_CURVE if source is None else None

@@ -18,7 +18,6 @@ from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW, wilson
 
 Floats: TypeAlias = NDArray[np.float64]
 
-Z_95: Final = 1.959964
 REPLICATES: Final = 400
 NEWTON_STEPS: Final = 40
 RIDGE: Final = 1e-6

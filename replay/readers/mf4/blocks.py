@@ -34,7 +34,6 @@ CYCLE_COUNTERS: Final = 0x01
 LAST_DATA_LENGTH: Final = 0x04
 LAST_REDUCED_LENGTH: Final = 0x08
 LAST_DATA_LIST: Final = 0x10
-VARIABLE_BYTES: Final = 0x20
 # Flags of an unfinalized file for the parts that the logger did not write.
 VARIABLE_OFFSETS: Final = 0x40
 

@@ -21,6 +21,7 @@ from crosscue.detectors.ranging.detection_range import (
 )
 from crosscue.detectors.ranging.ground_plane import GroundPlane, turned
 from crosscue.detectors.ranging.standard_sizes import VEHICLES, SizePrior
+from crosscue.detectors.ranging.usable import are_cut, is_cut
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle, parse
 
 CAMERA = GroundCamera(focal_px=1500.0, height_m=1.5)
@@ -183,3 +184,10 @@ def test_horizon_is_the_projection_of_distant_ground(
     ((x, y),) = mounted.seen_at(far)
 
     assert mounted.horizon_px(np.array([x]))[0] == pytest.approx(y, abs=1e-6)
+
+
+@given(box=st.lists(st.sampled_from([0.0, 1.9, 2.0, 50.0, 98.0, 98.1]), min_size=4, max_size=4))
+def test_one_box_is_cut_as_boxes_are(box: list[float]) -> None:
+    box_px = np.array(box)
+
+    assert is_cut(box_px, (100, 52)) == are_cut(box_px[None], (100, 52))[0]
