@@ -99,7 +99,6 @@ PARTS: Final = {
                 "road_area",
                 "road_by_hand",
                 "road_openings_by_hand",
-                "trackers",
             )
         ),
         (
@@ -130,9 +129,7 @@ PARTS: Final = {
             for name in (
                 "approaches",
                 "calibrated",
-                "combined",
                 "factor_graph",
-                "intersection_range",
                 "persistence",
                 "range_track",
                 "temporal",
@@ -143,8 +140,7 @@ PARTS: Final = {
             for name in (
                 "approaches.py::test_range_errors_over_drives_match_reported_variance",
                 "calibrated.py::test_calibrated_model_beats_source_on_held_out_simulated_approaches",
-                "intersection_range.py::"
-                "test_filter_errors_match_variance_with_distance_correlated_noise",
+                "range_track.py::test_filter_errors_match_variance_with_distance_correlated_noise",
                 "range_track.py::test_followed_range_errors_match_reported_variance",
             )
         ),
@@ -152,13 +148,14 @@ PARTS: Final = {
     "fits": Part(
         ("fusion/fit/*.py",),
         tuple(
-            f"tests/fusion/test_{name}.py" for name in ("combined", "message_fit", "temporal_fit")
+            f"tests/fusion/test_{name}.py" for name in ("calibrated", "message_fit", "temporal_fit")
         ),
         tuple(
-            f"tests/fusion/test_temporal_fit.py::test_{name}"
+            f"tests/fusion/test_{name}"
             for name in (
-                "redundant_cue_lowers_exponent",
-                "filter_recovers_features_of_held_out_drives",
+                "calibrated.py::test_calibrated_model_beats_source_on_held_out_simulated_approaches",
+                "temporal_fit.py::test_redundant_cue_lowers_exponent",
+                "temporal_fit.py::test_filter_recovers_features_of_held_out_drives",
             )
         ),
     ),

@@ -1,9 +1,9 @@
-"""Every cue is one row of the table and one rule; everything else iterates over the table."""
+"""Every cue and every built-in detector fulfils its contract."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow.compute as pc
@@ -11,13 +11,15 @@ import pytest
 
 import crosscue
 from crosscue.datasets.scenes.scene_truth import SIMULATED
-from crosscue.detectors.base import Detections, Found, Frame
+from crosscue.detectors.base import Detections, DetectorChoice, Found, Frame
 from crosscue.detectors.cues.rules import rule_of
+from crosscue.detectors.registry import BUILTIN, make
 from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.cue_table import CUES, groups
 from crosscue.replay.vehicle.fusion import Fusion
 from crosscue.replay.vehicle.vehicle import Vehicle
-from crosscue.testing import check_cue
+from crosscue.testing import check_cue, check_detector
+from support.detecting import BrightBlob, BrightSettings, build, too_few, yolox_card
 from support.gap_drive import Clock, GreyNumber, write_drive
 from support.recordings import cells
 
@@ -144,3 +146,72 @@ def test_dummy_cue_appears_in_tables_scores_report_and_recording(
     assert "<td>zebra</td>" in scored.report.read_text()
     (colour,) = cells(recording, "/cues/zebra", "colors", is_static=True)
     assert colour[1] == [int.from_bytes((1, 2, 3, 255))]
+
+
+NEEDS_A_CARD: Final = {"model"}
+
+
+@pytest.mark.parametrize("name", sorted(BUILTIN.keys() - NEEDS_A_CARD))
+def test_every_detector_fulfils_contract(name: str) -> None:
+    check_detector(lambda: make(DetectorChoice(name, name)))
+
+
+def test_detector_of_model_card_fulfils_contract(tmp_path: Path) -> None:
+    card = str(yolox_card(tmp_path))
+
+    check_detector(lambda: make(DetectorChoice("yolox", "model", {"card": card})))
+
+
+class _WrongTime(BrightBlob):
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        return [replace(self._one(frame), t_ns=frame.t_ns + 1) for frame in frames]
+
+
+class _BoxOutsidePicture(BrightBlob):
+    def _one(self, frame: Frame) -> Detections:
+        found = super()._one(frame)
+        return replace(found, boxes_px=found.boxes_px + 1.0)
+
+
+class _ScoreAboveOne(BrightBlob):
+    def _one(self, frame: Frame) -> Detections:
+        found = super()._one(frame)
+        return replace(found, scores=found.scores * 1.01)
+
+
+class _ChangesPixels(BrightBlob):
+    def _one(self, frame: Frame) -> Detections:
+        found = super()._one(frame)
+        np.asarray(frame.pixels)[0] = 0
+        return found
+
+
+class _UndeclaredLabel(BrightBlob):
+    labels = ("zebra",)
+
+
+class _RepeatsFirstFrame(BrightBlob):
+    def __call__(self, frames: Sequence[Frame], /) -> Sequence[Found]:
+        return [self._one(frames[0]) for _ in frames]
+
+
+@pytest.mark.parametrize(
+    ("kind", "match"),
+    [
+        (_WrongTime, "time and size of the result"),
+        (_BoxOutsidePicture, "not inside the picture"),
+        (_ScoreAboveOne, "expected 0 to 1"),
+        (_ChangesPixels, "changed a frame's pixels"),
+        (_UndeclaredLabel, "label not declared; expected one of zebra"),
+        (_RepeatsFirstFrame, "frame 17: time and size"),
+    ],
+)
+def test_contract_check_reports_invalid_detector(kind: type[BrightBlob], match: str) -> None:
+    with pytest.raises(AssertionError, match=match):
+        check_detector(lambda: kind(BrightSettings()))
+
+
+def test_contract_check_reports_missing_results() -> None:
+    check_detector(build)
+    with pytest.raises(AssertionError, match="3 frames, 0 results"):
+        check_detector(too_few)

@@ -1,35 +1,44 @@
-"""Every example in the documentation is valid, or a test runs it.
-
-Commands are expanded by bash and parsed by their own parsers, Python is compared with the public
-interface, settings are read as the files they belong to, and queries run on a small catalog.
-"""
+"""Every example in the documentation is valid, or a test runs it."""
 
 import re
+import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final
+from textwrap import dedent
+from types import SimpleNamespace
+from typing import Any, Final
 
 import pytest
 
 import crosscue
-from crosscue.detectors.registry import BUILTIN
+from crosscue.detectors.base import DetectorChoice
+from crosscue.detectors.registry import BUILTIN, make
 from crosscue.eval import cli
 from crosscue.eval.scoring.gates import load_gates
+from crosscue.replay.errors import UsageError
+from crosscue.replay.formats import FORMATS, Format
 from crosscue.replay.plugins import GROUPS
+from crosscue.replay.vehicle.cue_spec import CueSpec
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
+from crosscue.testing import check_cue, check_detector, check_reader
+from support import one_row
 from support.catalog_runs import runs_below
+from support.commands import output_of
+from support.every_format import _bytes
 from support.pages import NOTEBOOKS as NOTEBOOK_FILES
 from support.pages import PAGES, ROOT, Code, code_of_notebooks, code_of_pages, commands_of
 from support.public_calls import faults_in
+from support.refusals import refusal
 
 CODE: Final = code_of_pages()
 NOTEBOOKS: Final = code_of_notebooks()
 # Pages and languages of blocks that a test runs, and that test.
 EXECUTED: Final = {
-    ("CONTRIBUTING.md", "python"): "tests/contracts/test_contributing.py",
+    ("CONTRIBUTING.md", "python"): "tests/contracts/test_examples.py",
     ("docs/howto/query.md", "sql"): "tests/eval/catalog/test_remote_catalog.py",
 }
 # Options of other programs that occur in inline code and messages, and those programs.
@@ -292,3 +301,83 @@ def test_every_figure_is_on_a_page_and_every_picture_of_a_page_exists() -> None:
             assert "://" in link or path.is_file(), f"{page.relative_to(ROOT)}: no file {link}"
             shown |= {path.name} if path.parent.name == "figures" else set()
     assert figures == shown
+
+
+PAGE = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text(encoding="utf-8")
+
+
+def _code(title: str) -> list[str]:
+    """Return the Python code blocks of one example."""
+    (part,) = re.findall(rf"^## Example: {title}\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE)
+    return re.findall(r"```python\n(.*?)```", part, re.DOTALL)
+
+
+def _row(code: str, **names: object) -> Any:
+    """Evaluate a row of a table without its trailing comma."""
+    code = dedent(code).strip().removesuffix(",")
+    return eval("{" + code + "}" if code.startswith('"') else code, names)
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, str], str]:
+    """Return a function that writes an importable module and returns its name."""
+
+    def write(name: str, code: str) -> str:
+        (tmp_path / f"{name}.py").write_text(code)
+        monkeypatch.syspath_prepend(tmp_path)
+        return name
+
+    return write
+
+
+def test_cue_example_fulfils_contract(module: Callable[[str, str], str]) -> None:
+    rule, row = _code("a cue")
+    cue: CueSpec = _row(
+        row.replace("crosscue.detectors.cues.pedestrians", module("example_cue", rule)),
+        CueSpec=CueSpec,
+    )
+
+    assert cue.name == "pedestrians"
+    check_cue(cue)
+
+
+def test_reader_example_fulfils_contract(
+    module: Callable[[str, str], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader, row, small_log, damage = _code("a reader")
+    place = module("example_reader", reader)
+    row = row.replace("crosscue.replay.readers.speed.reader", place)
+    monkeypatch.setitem(FORMATS, "speed", _row(row, Format=Format)["speed"])
+    every = _row(small_log, _bytes=_bytes)
+    write, damage_one = _row(damage, EVERY_FORMAT=every, _garbled_line=one_row._garbled_line)[
+        "speed"
+    ]
+
+    check_reader(write(tmp_path), damage_one)
+
+
+def test_detector_example_fulfils_contract(module: Callable[[str, str], str]) -> None:
+    (code,) = _code("a detector")
+    place = f"{module('example_detector', code)}:Lamp.build"
+
+    check_detector(lambda: make(DetectorChoice("lamp", "lamp"), {**BUILTIN, "lamp": place}))
+
+
+def test_command_example_has_the_described_options(
+    module: Callable[[str, str], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (code,) = _code("a command")
+    verb = vars(import_module(module("example_command", code)))["longest_gap"]
+    monkeypatch.setitem(cli.COMMANDS, "longest-gap", "eval.logs.longest_gap:longest_gap")
+    monkeypatch.setitem(
+        sys.modules, "crosscue.eval.logs.longest_gap", SimpleNamespace(longest_gap=verb)
+    )
+
+    help_text = output_of("longest-gap", "--help")
+    for option in ("LOG", "--from", "--to", "--topics", "--max-chunk", "--min-s S", "--json", "-q"):
+        assert option in help_text, option
+    assert "--min-s -1.0: expected more than 0" in refusal(
+        2, "longest-gap", "drive.mcap", "--min-s", "-1"
+    )
+    with pytest.raises(UsageError, match=r"min_s: -1\.0, expected more than 0"):
+        verb("drive.mcap", min_s=-1.0)

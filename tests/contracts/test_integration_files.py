@@ -1,4 +1,4 @@
-"""The action, the workflows, the container and the lock file name what exists."""
+"""The package: version, licences, and the files of its integrations."""
 
 import json
 import os
@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,9 +16,13 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from ruamel.yaml import YAML
 
+from crosscue.datasets.real import recordings
 from crosscue.datasets.simulated.drive import DriveSettings
 from crosscue.datasets.simulated.log_files import write_drive as simulated
+from crosscue.detectors.catalog import places
 from crosscue.eval import cli
+from crosscue.eval.drives.replay import cache_file
+from crosscue.replay.remote.logs import default_store
 
 ROOT: Final = Path(__file__).parents[2]
 SCRIPT: Final = ROOT / ".github" / "replay_score_compare.sh"
@@ -184,3 +189,103 @@ def test_shell_scripts_of_the_repository_parse() -> None:
     for script in (SCRIPT, ROOT / ".ci/run", ROOT / ".ci/lowest"):
         assert script.stat().st_mode & 0o100 or script is SCRIPT, script
         assert subprocess.run(["bash", "-n", script], check=False).returncode == 0
+
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+VERSION = PROJECT["version"]
+PACKAGES = ("replay", "detectors", "fusion", "localization", "datasets", "eval", "docs")
+
+
+def newest_heading() -> str:
+    found = re.search(r"^## (.+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert found
+    return found[1]
+
+
+def test_changelog_and_citation_have_version_of_package() -> None:
+    cited = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+
+    assert newest_heading().split()[0] == VERSION
+    assert cited
+    assert cited[1] == VERSION
+
+
+def test_release_tag_has_version_of_package_and_dated_changelog() -> None:
+    command = ["git", "-C", str(ROOT), "tag", "--points-at", "HEAD", "v*"]
+    tags = subprocess.run(command, capture_output=True, text=True, check=False).stdout.split()
+
+    assert tags in ([], [f"v{VERSION}"])
+    if tags:
+        assert re.fullmatch(r"\S+ \(\d{4}-\d\d-\d\d\)", newest_heading())
+
+
+def test_hints_name_packages_that_pip_finds() -> None:
+    extras = PROJECT["optional-dependencies"]
+    wanted = [*PROJECT["dependencies"], *(one for name in extras for one in extras[name])]
+    known = {re.split(r"[<>=;\[]", one)[0] for one in wanted}
+    files = [
+        path
+        for folder in PACKAGES
+        for path in (ROOT / folder).rglob("*")
+        if path.suffix in (".py", ".md") and "_build" not in path.parts
+    ]
+    text = "\n".join(path.read_text(encoding="utf-8") for path in files)
+    hints = set(re.findall(r"pip install ([a-z][\w-]*)", text))
+
+    # crosscue itself is on no index, so "pip install 'crosscue[onnx]'" finds nothing.
+    assert "crosscue[" not in text
+    assert {"openvino", "ray", "mlflow-skinny"} <= hints
+    # A database as MLflow's store needs the whole of it; see the page on scores.
+    assert hints - known == {"mlflow"}
+
+
+PAGE: Final = ROOT / "docs" / "reference" / "licences.md"
+RESTRICTED: Final = re.compile(r"GPL|NVIDIA|Proprietary", re.IGNORECASE)
+NAME: Final = re.compile(r"[A-Za-z0-9._-]+")
+
+
+def _required(name: str, found: dict[str, str]) -> dict[str, str]:
+    """Add the licence of each installed package that a package requires, by name."""
+    try:
+        package = distribution(name)
+    except PackageNotFoundError:
+        return found
+    metadata = package.metadata
+    fields = ("License-Expression", "License", "Classifier")
+    texts = (text for field in fields for text in metadata.get_all(field, []))
+    # A whole licence in the field begins with its title.
+    found[name] = " ".join(text[:80] for text in texts if "Intended" not in text)
+    for requirement in package.requires or ():
+        match = NAME.match(requirement)
+        assert match is not None
+        if "extra ==" not in requirement and match[0].lower() not in found:
+            _required(match[0].lower(), found)
+    return found
+
+
+def test_page_and_readme_name_dependencies_that_are_not_permissive() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    restricted = {
+        name for name, text in _required("crosscue", {}).items() if RESTRICTED.search(text)
+    }
+
+    assert "python-can" in restricted
+    families = {"`nvidia-" if one.startswith("nvidia-") else one for one in restricted}
+    families = {"`cuda-" if one.startswith("cuda-") else one for one in families}
+    assert {one for one in families if one not in page} == set()
+    readme = (ROOT / "README.md").read_text(encoding="utf-8").partition("## Licence")[2]
+    assert "python-can" in readme
+    assert "CUDA" in readme
+
+
+def test_no_cache_of_a_test_is_the_users() -> None:
+    detections = cache_file()
+    assert detections is not None
+    folders = (
+        detections,
+        places.model_folder(),
+        default_store().folder,
+        recordings.recording_folder(recordings.recording("pandaset_002")),
+    )
+
+    assert [one for one in folders if Path.home() / ".cache" in one.parents] == []

@@ -1,9 +1,11 @@
-"""Reading, decoding, replaying and scoring a drive import none of the heavy libraries."""
+"""Modules import neither themselves nor, to read and score a drive, a heavy library."""
 
 import json
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Final
 
+import grimp
 import pyarrow.parquet as pq
 import pytest
 
@@ -120,3 +122,16 @@ def test_replay_with_onnx_detector_and_score_need_no_heavy_library(drive: Path) 
     assert "<svg" not in page
     # Pictures of frames are JPEG; figures would be PNG.
     assert page.count("<img") == page.count("data:image/jpeg")
+
+
+PACKAGES = [
+    f"crosscue.{name}"
+    for name in ("replay", "detectors", "fusion", "localization", "datasets", "eval")
+]
+
+
+def test_imports_have_no_cycle() -> None:
+    graph = grimp.build_graph(*PACKAGES, cache_dir=None)
+    imports = {name: graph.find_modules_directly_imported_by(name) for name in graph.modules}
+
+    assert len([*TopologicalSorter(imports).static_order()]) == len(imports) > 100

@@ -54,14 +54,14 @@ NONEXISTENT: Final[dict[str, tuple[str, ...]]] = {
 # Options whose value is not the name of something that exists.
 NAMES_NOTHING: Final[dict[str, str]] = {
     "--at": "a time",
-    "--by": "a tag that runs may lack; if all do, the result is empty, see test_history.py",
+    "--by": "a tag that runs may lack; if all do, the result is empty, see test_paired.py",
     "--classes": "new names of the user",
     "--experiment": "made if missing",
     "--from": "a time",
     "--label": "a label that files may lack; if all do, the result is empty",
     "--max-chunk": "a number",
-    "--metrics": "a pattern; one that fits nothing has an empty result, see test_history.py",
-    "--mlflow": "an address that only the server can refuse, see test_mlflow_sink.py",
+    "--metrics": "a pattern; one that fits nothing has an empty result, see test_paired.py",
+    "--mlflow": "an address that only the server can refuse, see test_pages.py",
     "--near": "numbers",
     "--output": "written",
     "--ray": "an address that only a cluster can refuse",

@@ -14,7 +14,7 @@ import pytest
 import crosscue
 from crosscue.detectors.base import Detections, Frame
 from crosscue.detectors.catalog.recognise import guesses, input_settings, plausible, read_interface
-from crosscue.detectors.decoders.base import Guess, Size, cell_grid, decoder_name
+from crosscue.detectors.decoders.base import BoxOutput, Guess, Size, cell_grid, decoder_name
 from crosscue.detectors.decoders.table import DECODERS
 from crosscue.detectors.networks.model_detector import build
 from crosscue.replay.errors import VehicleError
@@ -23,9 +23,11 @@ from support.decoder_samples import (
     CLASS,
     CLASSES,
     EVERY,
+    SAMPLES,
     SCORE,
     SIZE,
     TALL,
+    Sample,
     export,
     nanodet_of_coco,
 )
@@ -342,3 +344,35 @@ def test_old_openvino_file_is_not_called_incomplete(tmp_path: Path) -> None:
         read_interface(old)
 
     assert "not a complete" not in str(e.value)
+
+
+@pytest.fixture(params=DECODERS, ids=decoder_name)
+def decoder(request: pytest.FixtureRequest) -> type[BoxOutput]:
+    found: type[BoxOutput] = request.param
+    return found
+
+
+def _built(decoder: type[BoxOutput]) -> tuple[BoxOutput, Sample]:
+    sample = SAMPLES[decoder_name(decoder)]()
+    return decoder.model_validate({"classes": CLASSES, **sample.settings}), sample
+
+
+def test_masks_cover_the_network_input(decoder: type[BoxOutput]) -> None:
+    output, sample = _built(decoder)
+    found = output.candidates(sample.outputs, SIZE)
+
+    assert (found.masks is not None) == sample.is_masked
+    if found.masks is not None:
+        (mask,) = found.masks(np.array([int(found.scores.argmax())]))
+        columns = (mask > 0.5).mean(axis=0)
+        middle = BOX[[0, 2]].mean() / SIZE[0] * len(columns)
+        np.testing.assert_array_equal(columns, np.arange(len(columns)) < int(middle))
+
+
+def test_output_of_another_shape_is_refused(decoder: type[BoxOutput]) -> None:
+    output, sample = _built(decoder)
+    for name in sample.outputs:
+        changed = {**sample.outputs, name: np.zeros((1, 5, 11, 2, 2))}
+
+        with pytest.raises(ValueError, match=r"expected|boxes|masks|prototypes"):
+            output.candidates(changed, SIZE)

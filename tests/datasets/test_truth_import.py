@@ -1,17 +1,22 @@
-"""COCO and CVAT annotations as truth, and the check of a truth file against its log."""
+"""COCO and CVAT annotations and a plug-in's truth, and the check of a truth against its log."""
 
 import json
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from crosscue.datasets.truth import truth as truth_file
 from crosscue.datasets.truth.label_xml import read_cvat
 from crosscue.datasets.truth.truth import read_truth
 from crosscue.eval import cli
 from crosscue.replay.errors import AnnotationError, SchemaError
+from crosscue.replay.formats import DataSet, Format
 from support.refusals import refusal
 from support.trees import written
 
@@ -322,3 +327,27 @@ def test_every_missing_field_of_a_truth_is_named_in_one_line(tmp_path: Path) -> 
         f"{path}: start_ns, end_ns, {', '.join(named)}, approaches.1.intersection: missing; "
         "add them (and 4 more)"
     )
+
+
+NAME = "line-drive"
+FUNCTION = "dummy_lines:truth"
+
+
+def _install(monkeypatch: pytest.MonkeyPatch, function: Callable[[Path, Path], object]) -> None:
+    module = ModuleType("dummy_lines")
+    vars(module)["truth"] = function
+    monkeypatch.setitem(sys.modules, "dummy_lines", module)
+    data_set = DataSet(Format((), ("drive.lines",), "dummy_lines:open_drive", "folder"), FUNCTION)
+    monkeypatch.setattr(truth_file, "data_sets", lambda: {NAME: data_set})
+
+
+def test_plugin_error_about_log_is_unchanged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def truth(log: Path, folder: Path) -> Path:
+        raise AnnotationError(f"{log}: no times; record it again")
+
+    _install(monkeypatch, truth)
+
+    with pytest.raises(AnnotationError, match=r"no times; record it again$"):
+        truth_file.write_carried(NAME, tmp_path, tmp_path / "out")

@@ -1,5 +1,7 @@
-"""Many drives in parallel: a failure affects only its drive, and no drive is processed twice."""
+"""Many drives in parallel: progress, shards, and failures that affect only their drive."""
 
+import json
+import math
 import os
 import signal
 import subprocess
@@ -9,7 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+import crosscue
+from crosscue.eval.batch import journal
+from crosscue.eval.batch.drive_list import Shard, read_shard
 from crosscue.eval.batch.jobs import (
     Engine,
     Job,
@@ -20,9 +27,21 @@ from crosscue.eval.batch.jobs import (
     run_many,
     state_of,
 )
+from crosscue.eval.batch.journal import (
+    DriveState,
+    drives_of_folder,
+    entry_path,
+    error_of,
+    pace_of,
+    write_entry,
+    write_plan,
+)
 from crosscue.eval.batch.ray_jobs import Processes
+from crosscue.eval.cli import run
 from crosscue.eval.drives.many import ReplayedDrives
 from crosscue.eval.pipeline.outcome import Outcome
+from crosscue.eval.runs.folder import FAILURE, LOCK, signature
+from crosscue.replay.errors import UsageError
 from crosscue.replay.losses import losses_heard
 from support.drive_work import letters, write_jobs
 from support.trees import tree
@@ -204,3 +223,132 @@ def test_forty_drives_print_25_lines_with_the_failed_ones_first() -> None:
     assert len(printed) == 25
     assert printed[0] == "failed   d39: a.mcap: cut"
     assert printed[-2:] == ["drives   39 of 40, 1 failed", "tables   runs/merged"]
+
+
+WORDS = ("plain", "damaged", "bug", "loss")
+
+
+@pytest.fixture
+def batch(tmp_path: Path) -> list[Job]:
+    """Four processed drives, two of which failed, and one planned drive."""
+    jobs = write_jobs(tmp_path, WORDS)
+    write_plan(tmp_path / "runs", [*(job.name for job in jobs), "later"], "all")
+    run_many(jobs, letters, in_turn)
+    return jobs
+
+
+def states(folder: Path) -> dict[str, str]:
+    return {one.run.name: one.state.value for one in drives_of_folder(folder)}
+
+
+def test_each_planned_drive_has_one_state(batch: list[Job], tmp_path: Path) -> None:
+    folder = tmp_path / "runs"
+
+    assert states(folder) == {
+        "drive0": "done",
+        "drive1": "failed",
+        "drive2": "failed",
+        "drive3": "done",
+        "later": "waiting",
+    }
+    found = crosscue.batch_status(folder)
+    assert [found.count(state) for state in DriveState] == [2, 0, 2, 0, 1]
+    # Four drives have just ended, and no worker processes the last.
+    assert found.pace.per_hour > 4.0
+    assert math.isnan(found.pace.left_s)
+
+
+def test_failed_drive_writes_failure_log_to_its_run_folder(
+    batch: list[Job], tmp_path: Path
+) -> None:
+    text = (batch[2].run / FAILURE).read_text()
+
+    assert "error     ZeroDivisionError: a bug; a bug in crosscue" in text
+    assert "Traceback" in text
+    assert str(error_of(batch[1].run)).endswith("cut; copy it again")
+    assert f"{batch[2].run / FAILURE}" in repr(crosscue.batch_status(tmp_path / "runs"))
+
+    Path(batch[2].logs[0]).write_text("healed")
+    run_many(batch, letters, in_turn)
+    assert not (batch[2].run / FAILURE).exists()
+    assert states(tmp_path / "runs")["drive2"] == "done"
+
+
+def test_drive_of_a_dead_worker_is_stale(
+    batch: list[Job], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "runs"
+    later = folder / "later"
+    gone = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True
+    )
+    pid, host, started = signature().split(" ", 2)
+    dead = f"{int(gone.stdout)} {host} {started}"
+    elsewhere = f"{pid} another-machine {started}"
+
+    for worker, state in ((signature(), "running"), (dead, "stale"), (elsewhere, "running")):
+        write_entry(later, {"inputs": None, "worker": worker})
+        assert states(folder)["later"] == state
+    assert pace_of(drives_of_folder(folder), folder).left_s > 0.0
+
+    monkeypatch.setattr(journal, "STALE_S", 60.0)
+    os.utime(entry_path(later), (1.0e9, 1.0e9))
+    assert states(folder)["later"] == "stale"
+    assert "later: its worker on another-machine is gone, last update" in repr(
+        crosscue.batch_status(folder)
+    )
+    assert run(["status", str(folder), "-q"]) == 3
+
+
+def test_stale_drive_of_another_machine_is_processed_again(tmp_path: Path) -> None:
+    (job,) = write_jobs(tmp_path, ["plain"])
+    dead = "4711 another-machine boot 99"
+    job.run.mkdir(parents=True)
+
+    def error_of_abandoned_drive(entry_s: float) -> str | None:
+        """Return the error of a drive that a worker began at ``entry_s`` and left locked."""
+        write_entry(job.run, {"inputs": None, "worker": dead})
+        os.utime(entry_path(job.run), (entry_s, entry_s))
+        job.run.joinpath(LOCK).write_text(dead)
+        (done,) = run_many([job], letters, in_turn)
+        return done.error
+
+    assert "process 4711 on another-machine is writing it" in str(
+        error_of_abandoned_drive(time.time())
+    )
+    assert states(tmp_path / "runs") == {"drive0": "running"}
+    assert error_of_abandoned_drive(1.0e9) is None
+    assert states(tmp_path / "runs") == {"drive0": "done"}
+
+
+@pytest.mark.parametrize("torn", ["", "[]", '{"drives": 3}', "{"])
+def test_invalid_plan_does_not_hide_started_drives(
+    batch: list[Job], tmp_path: Path, torn: str
+) -> None:
+    folder = tmp_path / "runs"
+    (folder / ".drives" / "plans" / "all.json").write_text(torn)
+
+    assert len(states(folder)) == len(batch)
+    assert json.loads((folder / ".drives" / "drive0.json").read_text())["exit_status"] == 0
+
+
+IDENTITIES = st.sets(st.text("0123456789abcdef", min_size=8, max_size=8), max_size=40)
+
+
+@given(IDENTITIES, st.integers(1, 9))
+def test_every_drive_is_in_exactly_one_shard(identities: set[str], count: int) -> None:
+    shards = [Shard(number, count) for number in range(1, count + 1)]
+
+    for identity in identities:
+        assert sum(shard.holds(identity) for shard in shards) == 1
+
+
+def test_shard_option_is_read() -> None:
+    assert read_shard("2/4") == Shard(2, 4)
+    assert read_shard(str(Shard(2, 4))) == Shard(2, 4)
+
+
+@pytest.mark.parametrize("text", ["0/4", "5/4", "1/0", "two"])
+def test_invalid_shard_option_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="expected i/n with i from 1 to n"):
+        read_shard(text)

@@ -1,4 +1,4 @@
-"""Errors of commands: one line, the documented exit status, no traceback without -v."""
+"""Commands: progress, and errors in one line with the documented exit status."""
 
 import contextlib
 import io
@@ -13,7 +13,10 @@ from types import ModuleType
 import pytest
 
 from crosscue.eval import cli
+from crosscue.eval import terminal as progress
+from crosscue.eval.terminal import ProgressLine
 from crosscue.replay.errors import CrosscueError, LogError, UsageError
+from crosscue.replay.progress import Progress
 from crosscue.results import Result
 from support.commands import output_of
 from support.refusals import refusal
@@ -151,3 +154,42 @@ def test_bare_help_and_version_take_under_a_fifth_of_a_cpu_second(argument: str)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
 
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 0.2
+
+
+class Terminal(io.StringIO):
+    """Stream that records what is written and reports that it is a terminal."""
+
+    def isatty(self) -> bool:
+        """Return True."""
+        return True
+
+
+def replaced_stderr(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+    """Replace stderr; called inside the test, because pytest replaces stderr before it."""
+    made = Terminal()
+    monkeypatch.setattr(sys, "stderr", made)
+    monkeypatch.setattr(progress, "EVERY_S", 0.0)
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setenv("TERM", "xterm")
+    return made
+
+
+def shown_text(line: ProgressLine, terminal: Terminal) -> str:
+    assert line._bar is not None
+    terminal.truncate(0)
+    line._bar.refresh()
+    return terminal.getvalue()
+
+
+def test_line_shows_amount_rate_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = replaced_stderr(monkeypatch)
+    with ProgressLine(is_shown=True) as line:
+        line.at(Progress("converting", 1500, 6000, "rows"))
+        text = shown_text(line, terminal)
+        line.at(Progress("converting", 3000, 6000, "rows"))
+
+        assert "converting" in text
+        assert "1,500 of 6,000 rows" in text
+        assert "a second" in text
+        assert "left" in text
+        assert "3,000 of 6,000 rows" in shown_text(line, terminal)

@@ -1,25 +1,45 @@
-"""Files of a run folder: manifest, tags and what replaces them."""
+"""Files of a run folder: manifest, tags and what replaces them, and the columns of its tables."""
+
+from __future__ import annotations
 
 import errno
 import json
+import math
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import crosscue
+from crosscue.detectors.box_detector import ScoredBox
 from crosscue.eval import cli
 from crosscue.eval.batch.merge import gathered, merge_runs
 from crosscue.eval.runs.account import account
 from crosscue.eval.runs.folder import RunFolder, create, open_run, write_manifest
 from crosscue.eval.runs.manifest import FORMAT_VERSION, Manifest, TimeSegments
+from crosscue.eval.runs.tables.columns import (
+    INDEXED,
+    LOG_TIME,
+    OF_RUN,
+    OF_SCORE,
+    QUERIED,
+    Column,
+    arrow_schema,
+)
+from crosscue.eval.runs.tables.parquet import arrow_column
 from crosscue.replay.errors import OutputError, RunError, UnreadableRunError, UsageError
 from crosscue.replay.files.whole_file import write_text, write_whole
+from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.time.segments import Cause, Epoch, EpochMarks, LogClock, TimeSegment
 from support.catalog_runs import add_run, runs_below
 from support.commands import output_of
 from support.manifests import detected, estimated, log_account
 from support.refusals import refusal
+from support.scenes import shorten
 from support.trees import tree
 
 SET_BACK = TimeSegments(
@@ -178,3 +198,122 @@ def test_removing_the_last_tag_restores_the_run_folder(runs: Path) -> None:
     crosscue.tag_runs([runs / "a/monday"], remove=["weather", "never_set"])
 
     assert tree(runs / "a/monday") == before
+
+
+KINDS = pa.dictionary(pa.int8(), pa.string())
+
+
+@pytest.mark.parametrize(
+    ("values", "kind"),
+    [
+        ([1, None, 3], pa.int64()),
+        (range(4), pa.int64()),
+        (np.arange(10)[::2], pa.int64()),
+        (np.arange(5, dtype=np.uint8), pa.int32()),
+        (np.arange(3), pa.float64()),
+        ([1.0, None, math.inf], pa.float64()),
+        (np.array([1.5, -0.0], np.float32), pa.float64()),
+        ([True, None, False], pa.bool_()),
+        (np.arange(19) % 3 == 0, pa.bool_()),
+        (("a", None, "", "größer"), pa.string()),
+        (np.array(["a", "bb"]), pa.string()),
+        (["x", "y", "x"], KINDS),
+        ([[1.0], None, []], pa.list_(pa.float64())),
+        ([b"a", None], pa.binary()),
+        *(([], kind) for kind in (pa.int64(), pa.float64(), pa.bool_(), pa.string(), KINDS)),
+    ],
+    ids=str,
+)
+def test_column_equals_that_of_arrow(values: object, kind: pa.DataType) -> None:
+    column = arrow_column(values, kind)
+
+    column.validate(full=True)
+    assert column.equals(pa.array(values, kind))
+
+
+def test_missing_number_is_not_nan() -> None:
+    column = arrow_column([math.nan, None], pa.float64())
+
+    assert column.is_null().to_pylist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("values", "kind"),
+    [([1.5], pa.int64()), (["a"], pa.float64()), ([1], pa.bool_()), ([2**70], pa.int64())],
+    ids=str,
+)
+def test_value_of_another_type_is_refused(values: object, kind: pa.DataType) -> None:
+    with pytest.raises((TypeError, ValueError, OverflowError)):
+        arrow_column(values, kind)
+
+
+TABLES = [*INDEXED.items(), *OF_RUN.items(), *OF_SCORE.items(), *QUERIED.items()]
+
+
+@pytest.mark.parametrize(("name", "columns"), TABLES)
+def test_every_column_has_a_type_and_a_meaning(name: str, columns: Mapping[str, Column]) -> None:
+    assert arrow_schema(columns).names == [*columns]
+    for column in columns.values():
+        assert column.meaning.strip(), name
+
+
+def test_streams_of_the_device_have_the_columns_that_are_decoded() -> None:
+    assert [*OF_RUN["mobileye_obstacles"]] == ["t_ns", *OBSTACLE_COLUMNS]
+    assert [*OF_RUN["mobileye_lanes"]] == ["t_ns", *LANE_COLUMNS]
+
+
+def test_column_not_null_refuses_a_missing_value() -> None:
+    schema = arrow_schema({"a": Column("BIGINT NOT NULL", ""), "b": Column("BIGINT", "")})
+
+    assert [one.nullable for one in schema] == [False, True]
+
+
+class Whole(crosscue.BoxDetector):
+    """One box around the whole picture."""
+
+    name, labels = "whole", ("stop sign",)
+
+    def boxes_in(self, frame: crosscue.Frame) -> Iterator[ScoredBox]:
+        """Return the box."""
+        high, wide, _ = frame.pixels.shape
+        yield "stop sign", 0.9, (0.0, 0.0, wide, high)
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory: pytest.TempPathFactory) -> dict[str, pa.Schema]:
+    """Schemas of all tables of a scored run of a simulated scene."""
+    folder = tmp_path_factory.mktemp("run")
+    with pytest.MonkeyPatch.context() as patch:
+        shorten(patch, pictures=40)
+        files = crosscue.simulate_approach(folder / "scene", width_px=320)
+    run = crosscue.replay_drive(files.log, folder / "run", detectors=[Whole])
+    crosscue.score_run(run, files.truth, has_figures=False)
+    found = (folder / "run").rglob("*.parquet")
+    return {str(path.relative_to(folder / "run")): pq.read_schema(path) for path in found}
+
+
+def test_files_of_a_run_and_its_score_have_the_declared_columns(
+    tables: Mapping[str, pa.Schema],
+) -> None:
+    of_run = {f"{name}.parquet": {**one, **LOG_TIME} for name, one in OF_RUN.items()}
+    declared = of_run | {f"score/{name}.parquet": one for name, one in OF_SCORE.items()}
+
+    assert {"frames.parquet", "detections.parquet", "belief.parquet", "pose.parquet"} <= {*tables}
+    for name, schema in tables.items():
+        expected = arrow_schema(declared[name])
+        # Only some kinds of belief have reasons why a cue was not used.
+        named = [one for one in expected.names if one in schema.names or one != "not_believed"]
+        assert schema.names == named, name
+        assert schema.types == [expected.field(one).type for one in named], name
+
+
+def test_columns_are_declared_in_one_module() -> None:
+    """A log's own topics have columns that only the log knows."""
+    rooms = ("replay", "detectors", "fusion", "localization", "datasets", "eval")
+    root = Path(__file__).parents[3]
+    files = [path for room in rooms for path in (root / room).rglob("*.py")]
+    with_schema = {
+        str(path.relative_to(root)) for path in files if "pa.schema(" in path.read_text()
+    }
+
+    assert with_schema == {"eval/runs/tables/columns.py", "eval/logs/log.py"}
