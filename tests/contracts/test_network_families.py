@@ -130,12 +130,8 @@ def test_number_of_coco_s_classes_decides_between_families(tmp_path: Path, size:
 @pytest.mark.parametrize("shape", [(1000, 600), (600, 1000)], ids=["tall", "wide"])
 def test_doubt_about_fit_is_said_with_both_results(tmp_path: Path, shape: tuple[int, int]) -> None:
     net, street = tmp_path / "net.onnx", tmp_path / "street.png"
-    model = onnx.load_model_from_string(bright_box_model())
     # Pixels are scaled to 0..1 in such a network's card.
-    model.graph.node[0].attribute[0].t.CopyFrom(
-        onnx.numpy_helper.from_array(np.array(0.5, np.float32))
-    )
-    net.write_bytes(model.SerializeToString())
+    net.write_bytes(bright_box_model(above=0.5))
     cv2.imwrite(str(street), np.full((*shape, 3), 255, np.uint8))
 
     drafted = crosscue.draft_card(net, class_names=["bright"], size_px=(96, 64), picture=street)

@@ -274,17 +274,6 @@ def test_pixel_boxes_read_as_fractions_are_refused(tmp_path: Path) -> None:
         check_card(card_of_boxes(tmp_path, model, output))
 
 
-def blue_box_model() -> bytes:
-    """The network that finds a bright box, in the first channel only."""
-    model = onnx.load_model_from_string(bright_box_model())
-    graph = model.graph
-    graph.initializer.append(onnx.numpy_helper.from_array(np.array([0]), "first"))
-    grey = next(node for node in graph.node if "images" in node.input)
-    grey.input[0] = "blue"
-    graph.node.insert(0, onnx.helper.make_node("Gather", ["images", "first"], ["blue"], axis=1))
-    return bytes(model.SerializeToString())
-
-
 @pytest.mark.parametrize(
     ("key", "line", "said"),
     [
@@ -296,7 +285,7 @@ def blue_box_model() -> bytes:
 def test_check_says_with_which_input_a_network_finds_something(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], key: str, line: str, said: str
 ) -> None:
-    model = blue_box_model() if key == "colour" else bright_box_model()
+    model = bright_box_model(channels="blue" if key == "colour" else "images")
     path = card_of_boxes(tmp_path, model, END_TO_END)
     text = path.read_text()
     street = tmp_path / "street.png"

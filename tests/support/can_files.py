@@ -4,7 +4,7 @@ import random
 import struct
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import can
@@ -124,25 +124,18 @@ def trc(frames: Sequence[Sent], version: str = "2.1") -> bytes:
         identifier = f"{frame.arbitration_id:0{8 if frame.is_extended else 4}X}"
         length = len(frame.payload)
         rest = "RTR" if frame.kind == REMOTE else _hex(frame.payload)
-        match version:
-            case "1.0":
-                lines.append(f"{k:>6}) {time:>12}  {identifier:>8}  {length}  {rest}")
-            case "1.1":
-                lines.append(f"{k:>6}) {time:>12}  Rx  {identifier:>8}  {length}  {rest} ")
-            case "1.2":
-                lines.append(
-                    f"{k:>6}) {time:>12} {frame.bus}  Rx  {identifier:>8}  {length}  {rest}"
-                )
-            case "1.3":
-                lines.append(
-                    f"{k:>6}) {time:>12} {frame.bus}  Rx {identifier:>8} -  {length}  {rest}"
-                )
-            case _:
-                kind = "RR" if frame.kind == REMOTE else "FB" if frame.is_fd else "DT"
-                code = FD_LENGTHS.index(length)
-                rest = "" if frame.kind == REMOTE else rest
-                start = f"{k:>7} {time:>13} {kind} {frame.bus:>2} {identifier:>8}"
-                lines.append(f"{start} Rx -  {code:<4} {rest}")
+        rest = "" if version >= "2" and frame.kind == REMOTE else rest
+        kind = "RR" if frame.kind == REMOTE else "FB" if frame.is_fd else "DT"
+        bus, code = frame.bus, FD_LENGTHS.index(length)
+        lines.append(
+            {
+                "1.0": f"{k:>6}) {time:>12}  {identifier:>8}  {length}  {rest}",
+                "1.1": f"{k:>6}) {time:>12}  Rx  {identifier:>8}  {length}  {rest} ",
+                "1.2": f"{k:>6}) {time:>12} {bus}  Rx  {identifier:>8}  {length}  {rest}",
+                "1.3": f"{k:>6}) {time:>12} {bus}  Rx {identifier:>8} -  {length}  {rest}",
+                "2.1": f"{k:>7} {time:>13} {kind} {bus:>2} {identifier:>8} Rx -  {code:<4} {rest}",
+            }[version]
+        )
     return "".join(line + "\r\n" for line in lines).encode()
 
 
@@ -172,30 +165,12 @@ def blf(
             "<4sHHLLH6xL4x", b"LOBJ", 16, 1, 32 + len(coded), 10, 0 if stored else 2, len(part)
         )
         body += head + coded + bytes(len(coded) % 4)
-    start = (2015, 7, 5, 10, 12, 0, 0, 0)
-    stop = (2038, 7, 5, 10, 12, 0, 0, 0)
-    if not is_closed:
-        start = stop = (0,) * 8
-    size, count = (144 + len(body), len(frames)) if is_closed else (144, 0)
-    header = struct.pack(
-        "<4sL8BQQLL8H8H",
-        b"LOGG",
-        144,
-        5,
-        0,
-        0,
-        0,
-        2,
-        6,
-        8,
-        1,
-        size,
-        144 + len(content),
-        count,
-        0,
-        *start,
-        *stop,
-    )
+    start, stop = (2015, 7, 5, 10, 12, 0, 0, 0), (2038, 7, 5, 10, 12, 0, 0, 0)
+    times, count = ((*start, *stop), len(frames)) if is_closed else ((0,) * 16, 0)
+    size = 144 + len(body) if is_closed else 144
+    # Size of the header, application, its version, and BLF's; sizes, objects, and times.
+    head = (b"LOGG", 144, *(5, 0, 0, 0), *(2, 6, 8, 1))
+    header = struct.pack("<4sL8BQQLL16H", *head, size, 144 + len(content), count, 0, *times)
     return header.ljust(144, b"\0") + body
 
 
@@ -282,9 +257,7 @@ def by_bus(frames: Sequence[Sent], spelled: str = "can/{}") -> dict[str, list[Se
     found: dict[str, list[Sent]] = {}
     for f in frames:
         name = spelled.format(f.bus)
-        found.setdefault(name, []).append(
-            Sent(f.t_ns, name, f.arbitration_id, f.payload, f.is_extended, f.kind, f.is_fd)
-        )
+        found.setdefault(name, []).append(replace(f, bus=name))
     return found
 
 

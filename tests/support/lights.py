@@ -34,6 +34,6 @@ def write_lights(folder: Path, pictures: int) -> Path:
     row = f"0 {24 / 64} {16 / 48} {16 / 64} {16 / 48}\n"
     for number, there in enumerate(is_light):
         (labels / f"frame_{number}.txt").write_text(row if there else "")
-    card = write_card(folder, bright_box_model(by_brightness=True), OUTPUT)
+    card = write_card(folder, bright_box_model(score="share"), OUTPUT)
     crosscue.detect_drive(folder / "log", folder / "run", detectors=[str(card)])
     return folder

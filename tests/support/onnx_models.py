@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import onnx.parser
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
@@ -60,58 +61,54 @@ def open_model(
     return _file(helper.make_graph([node], "open", [given], [found]), metadata)
 
 
-def bright_box_model(*, by_brightness: bool = False) -> bytes:
-    """A network that returns one box around all pixels above 127, shape (N, 1, 6), with class 0.
+BRIGHT_BOX = """<ir_version: 8, opset_import: ["" : 17]>
+bright_box (float[n, 3, h, w] images) => (float[n, 1, 6] boxes) {{
+  first = Constant <value_ints = [0]> ()
+  blue = Gather <axis = 1> (images, first)
+  grey = ReduceMax <axes = [1], keepdims = 0> ({channels})
+  limit = Constant <value_float = {above}> ()
+  bright = Greater (grey, limit)
+  light = Cast <to = 1> (bright)
+  columns = ReduceMax <axes = [1], keepdims = 0> (light)
+  rows = ReduceMax <axes = [2], keepdims = 0> (light)
+  x0 = ArgMax <axis = 1, select_last_index = 0> (columns)
+  y0 = ArgMax <axis = 1, select_last_index = 0> (rows)
+  x1 = ArgMax <axis = 1, select_last_index = 1> (columns)
+  y1 = ArgMax <axis = 1, select_last_index = 1> (rows)
+  pixels = Concat <axis = 1> (x0, y0, x1, y1)
+  first_to_last = Cast <to = 1> (pixels)
+  inclusive = Constant <value_floats = [0.0, 0.0, 1.0, 1.0]> ()
+  corners = Add (first_to_last, inclusive)
+  any = ReduceMax <axes = [1], keepdims = 1> (columns)
+  brightest = ReduceMax <axes = [1, 2], keepdims = 0> (grey)
+  one = Constant <value_ints = [1]> ()
+  most = Unsqueeze (brightest, one)
+  each = Constant <value_float = 0.003921569> ()
+  share = Mul (most, each)
+  zero = Constant <value_float = 0.0> ()
+  class = Mul (any, zero)
+  row = Concat <axis = 1> (corners, {score}, class)
+  boxes = Unsqueeze (row, one)
+}}"""
 
-    The input has shape (N, 3, H, W) of any size. The score is 1 if any pixel is bright and 0
-    otherwise; with ``by_brightness`` it is the value of the brightest pixel divided by 255.
+
+def bright_box_model(
+    *, score: str = "any", channels: str = "images", above: float = 127.0
+) -> bytes:
+    """A network that returns one box around all bright pixels, shape (N, 1, 6), with class 0.
+
+    The input has shape (N, 3, H, W) of any size.
+
+    Args:
+        score: ``any`` for 1 if any pixel is bright and 0 otherwise; ``share`` for the value of the
+            brightest pixel divided by 255.
+        channels: ``images`` for all channels, ``blue`` for the first one only.
+        above: Values of bright pixels are higher.
     """
-    scored = [helper.make_node("ReduceMax", ["columns"], ["score"], axes=[1], keepdims=1)]
-    if by_brightness:
-        scored = [
-            helper.make_node("ReduceMax", ["grey"], ["brightest"], axes=[1], keepdims=0),
-            helper.make_node("ReduceMax", ["brightest"], ["most"], axes=[1], keepdims=1),
-            helper.make_node("Constant", [], ["each"], value=_scalar(1.0 / 255.0)),
-            helper.make_node("Mul", ["most", "each"], ["score"]),
-        ]
-    nodes = [
-        helper.make_node("Constant", [], ["half"], value=_scalar(127.0)),
-        helper.make_node("ReduceMax", ["images"], ["grey"], axes=[1], keepdims=0),
-        helper.make_node("Greater", ["grey", "half"], ["bright"]),
-        helper.make_node("Cast", ["bright"], ["light"], to=TensorProto.FLOAT),
-        helper.make_node("ReduceMax", ["light"], ["columns"], axes=[1], keepdims=0),
-        helper.make_node("ReduceMax", ["light"], ["rows"], axes=[2], keepdims=0),
-        *scored,
-    ]
-    ends = []
-    for name in ("columns", "rows"):
-        for last in (0, 1):
-            end = f"{name}{last}"
-            nodes.append(
-                helper.make_node(
-                    "ArgMax", [name], [f"{end}_index"], axis=1, keepdims=1, select_last_index=last
-                )
-            )
-            nodes.append(
-                helper.make_node("Cast", [f"{end}_index"], [f"{end}_raw"], to=TensorProto.FLOAT)
-            )
-            nodes.append(
-                helper.make_node("Constant", [], [f"{end}_plus"], value=_scalar(float(last)))
-            )
-            nodes.append(helper.make_node("Add", [f"{end}_raw", f"{end}_plus"], [end]))
-            ends.append(end)
-    nodes += [
-        helper.make_node("Constant", [], ["zero"], value=_scalar(0.0)),
-        helper.make_node("Mul", ["score", "zero"], ["class"]),
-        helper.make_node(
-            "Concat", [ends[0], ends[2], ends[1], ends[3], "score", "class"], ["row"], axis=1
-        ),
-        helper.make_node("Constant", [], ["axis"], value=numpy_helper.from_array(np.array([1]))),
-        helper.make_node("Unsqueeze", ["row", "axis"], ["boxes"]),
-    ]
-    given = helper.make_tensor_value_info("images", TensorProto.FLOAT, ["n", 3, "h", "w"])
-    out = helper.make_tensor_value_info("boxes", TensorProto.FLOAT, ["n", 1, 6])
-    return _file(helper.make_graph(nodes, "bright box", [given], [out]))
+    text = BRIGHT_BOX.format(score=score, channels=channels, above=above)
+    model = onnx.parser.parse_model(text)
+    onnx.checker.check_model(model)
+    return bytes(model.SerializeToString())
 
 
 def write_card(
@@ -125,10 +122,6 @@ def write_card(
         f"[input]\nwidth_px = {size[0]}\nheight_px = {size[1]}\n{more}\n[output]\n{output}\n"
     )
     return path
-
-
-def _scalar(value: float) -> TensorProto:
-    return numpy_helper.from_array(np.array(value, np.float32))
 
 
 def _file(graph: onnx.GraphProto, metadata: Mapping[str, str] | None = None) -> bytes:
