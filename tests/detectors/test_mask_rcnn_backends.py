@@ -76,15 +76,13 @@ def _torchvision(network: Any, objectness: float = 0.0) -> Any:
     return own
 
 
-def _found_by_torchvision(
-    checkpoint: Checkpoint, frame: Frame, objectness: float = 0.0
-) -> Detections:
+def _found_by_torchvision(checkpoint: Checkpoint, frame: Frame) -> Detections:
     """Run torchvision's modules in torchvision's order; keep detections above the score."""
     from torchvision.models.detection.image_list import ImageList
 
     plan = checkpoint.facts.plan
     placed = place_picture(frame.pixels, plan)
-    network = _torchvision(checkpoint.network, objectness)
+    network = _torchvision(checkpoint.network, 0.0)
     with torch.inference_mode():
         pictures = as_input(placed.pixels[None], CPU)
         sizes = [(int(pictures.shape[2]), int(pictures.shape[3]))]

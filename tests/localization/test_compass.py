@@ -52,9 +52,7 @@ IRON = CompassSettings(
 )
 
 
-def readings(
-    heading_rad: Floats, compass: CompassSettings, sd_t: float = 0.0, seed: int = 0
-) -> Floats:
+def readings(heading_rad: Floats, compass: CompassSettings, sd_t: float = 0.0) -> Floats:
     """Simulate the magnetometer of a level car with this heading."""
     north = math.pi / 2 - compass.declination_rad - heading_rad - compass.mounting_yaw_rad
     level = np.column_stack(
@@ -62,7 +60,7 @@ def readings(
     )
     sensor = level @ np.array(compass.mounting_rotation)
     raw = np.linalg.solve(np.array(compass.soft_iron), sensor.T).T + compass.hard_iron_t
-    return raw + np.random.default_rng(seed).normal(0.0, sd_t, raw.shape) if sd_t else raw
+    return raw + np.random.default_rng(0).normal(0.0, sd_t, raw.shape)
 
 
 def times(n: int, period_s: float = 0.1) -> Int64s:

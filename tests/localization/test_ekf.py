@@ -40,11 +40,9 @@ HEADINGS = st.floats(-math.pi, math.pi)
 NOISE = (0.01, 0.002, 0.05)
 
 
-def belief(
-    x: float = 3.0, y: float = -2.0, heading: float = 0.4, speed: float = 8.0, seed: int = 1
-) -> PoseBelief:
+def belief(y: float = -2.0, heading: float = 0.4, speed: float = 8.0, seed: int = 1) -> PoseBelief:
     root = np.random.default_rng(seed).normal(size=(4, 4)) * [[1.0], [1.0], [0.05], [0.5]]
-    return PoseBelief(1_000, np.array([x, y, heading, speed]), root @ root.T)
+    return PoseBelief(1_000, np.array([3.0, y, heading, speed]), root @ root.T)
 
 
 def moved(

@@ -115,13 +115,11 @@ def killed_before(folder: Path, operation: int, argv: Sequence[str]) -> Ended:
     return forked(lambda: watched(folder, CHANGES, then), argv)
 
 
-def failing_from(
-    folder: Path, operation: int, argv: Sequence[str], *, code: int = errno.ENOSPC, once: bool
-) -> Ended:
+def failing_from(folder: Path, operation: int, argv: Sequence[str], *, once: bool) -> Ended:
     """Let the ``operation``-th write into ``folder`` fail, and all later ones unless ``once``."""
 
     def then(number: int, what: str) -> None:
         if number == operation or (number > operation and not once):
-            raise OSError(code, os.strerror(code), what)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), what)
 
     return forked(lambda: watched(folder, WRITES, then), argv)

@@ -164,12 +164,10 @@ def _numbers(observed_by: Input, observed: object) -> dict[str, int | None]:
     return {cue: one.number for cue, one in counts_of(observed_by, observed, VEHICLE).items()}
 
 
-def _taken(
-    observed_by: Input, observed: object, vehicle: Vehicle = VEHICLE
-) -> dict[str, Candidates]:
+def _taken(observed_by: Input, observed: object) -> dict[str, Candidates]:
     """Return the candidates of every cue of one kind of input, in one frame."""
     found: dict[str, Candidates] = {}
-    for cue, one in counts_of(observed_by, observed, vehicle).items():
+    for cue, one in counts_of(observed_by, observed, VEHICLE).items():
         take(found, cue, one)
     return found
 

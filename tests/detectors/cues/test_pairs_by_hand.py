@@ -320,17 +320,15 @@ def test_traffic_in_legs_is_looked_for_on_request_only() -> None:
 STRICT = Cars(score=0.95)
 
 
-def _car(
-    x: int, nose: int, t_ns: int, y: int = 60, length: int = 90, score: float = 0.99
-) -> Detections:
+def _car(x: int, nose: int, t_ns: int, y: int = 60, score: float = 0.99) -> Detections:
     """Build a car with a lower end (its nose) at the left (-1) or right (1)."""
     height = 30
-    profile = np.full(length, height)
-    quarter = length // 3
+    profile = np.full(90, height)
+    quarter = 90 // 3
     profile[:quarter] = 18 if nose < 0 else height
     profile[-quarter:] = 18 if nose > 0 else height
     mask = np.arange(height)[:, None] >= height - profile[None, :]
-    box = np.array([[x, y, x + length, y + height]], np.float64)
+    box = np.array([[x, y, x + 90, y + height]], np.float64)
     text = rle.encode_mask(mask, (x, y), SIZE)
     return Detections(t_ns, SIZE, box, np.array([score]), ("car",), (text,))
 

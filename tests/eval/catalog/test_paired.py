@@ -166,9 +166,7 @@ def values(rng: np.random.Generator, places: int, metrics: int, loss: float) -> 
     ]
 
 
-def at_places(
-    rng: np.random.Generator, places: int, each: int, *, is_known: bool = True
-) -> list[DriveMetric]:
+def at_places(rng: np.random.Generator, places: int, each: int) -> list[DriveMetric]:
     """Drives of one run whose errors are partly those of their place."""
     found = []
     for place in range(places):
@@ -177,7 +175,7 @@ def at_places(
             rows = int(rng.integers(20, 40))
             level = 1.0 / (1.0 + math.exp(-(1.0 + error + rng.normal(0.0, 0.1))))
             right = float(rng.binomial(rows, level))
-            name = [f"place {place}"] if is_known else []
+            name = [f"place {place}"]
             found.append(
                 DriveMetric(f"{place}-{drive}", "cues.a.recall", "mean", right, rows, name)
             )

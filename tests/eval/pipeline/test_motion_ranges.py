@@ -55,9 +55,7 @@ class Drive:
         return self.ranges(self.tracks.tracks, motion, without)
 
 
-def found(
-    things: Sequence[Thing], gone_m: float, t_ns: int = 0, lenses: Sequence[str] = ()
-) -> Detections:
+def found(things: Sequence[Thing], gone_m: float, lenses: Sequence[str] = ()) -> Detections:
     boxes = []
     for _, start_m, right_m, height_m in things:
         scale = 1500.0 / (start_m - gone_m)
@@ -65,7 +63,7 @@ def found(
         boxes.append([x - 0.4 * half, y - half, x + 0.4 * half, y + half])
     labels = tuple(one[0] for one in things)
     return Detections(
-        t_ns,
+        0,
         SIZE,
         np.array(boxes).reshape(-1, 4),
         np.full(len(boxes), 0.95),

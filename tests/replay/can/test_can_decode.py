@@ -227,11 +227,9 @@ EMPTY = CanMessage("Empty", 0x500, False, 8, (), problem="message has no signals
 DATABASE = CanDatabase.of([SPEED, TWIN, LONG, CLASSIC, SWITCH, EMPTY])
 
 
-def decoder(
-    allow_longer: bool = False, selected: list[str] | None = None
-) -> tuple[BusDecoder, Ledger]:
+def decoder(allow_longer: bool = False) -> tuple[BusDecoder, Ledger]:
     ledger = Ledger("made up")
-    return BusDecoder(DATABASE, "can0", ledger, selected, allow_longer=allow_longer), ledger
+    return BusDecoder(DATABASE, "can0", ledger, None, allow_longer=allow_longer), ledger
 
 
 def test_number_of_counted_unknown_ids_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

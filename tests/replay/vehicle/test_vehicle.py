@@ -242,15 +242,13 @@ def candidate_signal(
     return one, Series.of(name, T_NS, values)
 
 
-def wheels(
-    message: str, speed: Floats, yaw_rate: Floats, scale: float = 1.0
-) -> list[tuple[Candidate, Series]]:
+def wheels(message: str, speed: Floats, yaw_rate: Floats) -> list[tuple[Candidate, Series]]:
     sides = {"left": -1.0, "right": 1.0}
     return [
         candidate_signal(
             SignalKind.WHEEL,
             f"{message}.{wheel}",
-            scale * (speed + sides[wheel.rpartition("_")[2]] * 0.775 * yaw_rate),
+            speed + sides[wheel.rpartition("_")[2]] * 0.775 * yaw_rate,
             wheel,
         )
         for wheel in WHEELS
