@@ -133,7 +133,7 @@ def recorded_drives() -> Iterator[tuple[str, Drive]]:
                 folder,
                 pictures,
                 one["rate_hz"],
-                _KITTI_0926 if one.get("is_kitti") else "",
+                _CAMERAS[one["camera"]] if "camera" in one else "",
                 tuple(
                     Approach(first, last, approach["features"])
                     for approach in one["approaches"]
@@ -147,7 +147,12 @@ def recorded_drives() -> Iterator[tuple[str, Drive]]:
         )
 
 
-_KITTI_0926: Final = f"focal_px = 721.5\ncenter_px = [609.6, 172.9]\n{KITTI}"
+# Cameras of KITTI by the month and day of their calibration.
+_CAMERAS: Final = {
+    "kitti_0926": f"focal_px = 721.5\ncenter_px = [609.6, 172.9]\n{KITTI}",
+    "kitti_0930": f"focal_px = 707.0912\ncenter_px = [601.8873, 183.1104]\n{KITTI}",
+    "kitti_1003": f"focal_px = 718.856\ncenter_px = [607.1928, 185.2157]\n{KITTI}",
+}
 _PANDASET: Final = Drive(
     "pandaset_002",
     "camera/front_camera/*.jpg",
@@ -162,7 +167,7 @@ DRIVES: Final[dict[str, Drive]] = {
         "kitti_t_junction",
         "image_0/*",
         9.64,
-        f"focal_px = 707.0912\ncenter_px = [601.8873, 183.1104]\n{KITTI}",
+        _CAMERAS["kitti_0930"],
         # By eye: kerb corners in pictures 28 and 40, on the ground by the camera's height.
         mouth_m=(45.0, 61.0),
         travelled=kitti_travelled,
@@ -171,7 +176,7 @@ DRIVES: Final[dict[str, Drive]] = {
         "kitti_seq2_right_turn_98deg",
         "image_l/*",
         9.64,
-        f"focal_px = 718.856\ncenter_px = [607.1928, 185.2157]\n{KITTI}",
+        _CAMERAS["kitti_1003"],
         # By eye: a slip road that meets a carriageway, which carries on to the right only.
         (Approach(0, 28, {"intersection": True, "left": None, "right": True, "straight": False}),),
         travelled=kitti_travelled,
@@ -182,7 +187,7 @@ DRIVES: Final[dict[str, Drive]] = {
         "kitti_red_light_queue",
         "*.jpg",
         10.0,
-        _KITTI_0926,
+        _CAMERAS["kitti_0926"],
     ),
     "camvid_0016e5_light": Drive("camvid_0016e5_light", "*.jpg", 15.0),
     "highway_straight": Drive("highway_straight", "*.mp4", 12.5, cut=(0, 10**6, 2)),

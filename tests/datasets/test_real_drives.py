@@ -174,3 +174,17 @@ def test_belief_is_judged_in_each_annotated_frame_and_outside_approaches_by_its_
     score = NAMES["scored"](run, Drive("one", "*.jpg", 10.0, approaches=(approach,)))
 
     assert score.brier == [pytest.approx((0.5**2 + 0.1**2) / 2.0)]
+
+
+def test_annotations_of_recorded_drives_lie_within_the_pictures_of_their_cut() -> None:
+    drives = dict(NAMES["recorded_drives"]())
+
+    for name, drive in drives.items():
+        first, last, step = drive.cut
+        stretches = [(one.first, one.last) for one in drive.approaches]
+        stretches += [cue[:2] for cues in drive.in_view.values() for cue in cues]
+        assert stretches, name
+        for start, end in stretches:
+            assert 0 <= start <= end <= (last - first) // step, name
+        for one in drive.approaches:
+            assert set(one.features) == {"intersection", *NAMES["FEATURES"]}, name
