@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -98,7 +99,7 @@ def injected(seen: Pictures, count: int, seed: int) -> Iterator[tuple[float, lis
         first = int(rng.integers(0, length - kept + 1))
         part = seen.motion.take(np.isin(np.arange(length), np.arange(first, first + kept)))
         late_ns = round(delay_s * 1e9)
-        part = part._replace(start_ns=part.start_ns + late_ns, t_ns=part.t_ns + late_ns)
+        part = replace(part, start_ns=part.start_ns + late_ns, t_ns=part.t_ns + late_ns)
         yield delay_s, [delay_by_yaw_rate(part, t_ns, rate), delay_by_speed(part, t_ns, speed)]
 
 

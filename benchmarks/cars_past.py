@@ -15,9 +15,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from annotate_pandaset import (  # type: ignore[import-not-found]  # a script next to this one
+    BEHIND_M,
+    FAR_KERB_M,
+    VehicleBoxes,
+)
 
 from crosscue.datasets.adapters.pandaset import read_pandaset_poses
-from crosscue.datasets.real.annotate_pandaset import BEHIND_M, FAR_KERB_M, VehicleBoxes
 from crosscue.detectors.base import Detections
 from crosscue.detectors.boxes import box_ious
 from crosscue.detectors.cues.observed import Place

@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 import crosscue
 from crosscue.datasets.scenes.drive import Imager, picture_times, write_scene
-from crosscue.datasets.scenes.faulty_labels import DETECTORS, PERFECT_LABELS
+from crosscue.datasets.scenes.faulty_labels import DETECTORS, label_pictures, png
 from crosscue.datasets.scenes.layout import SCORED
 from crosscue.datasets.scenes.rendering.render import PictureSettings, RenderedFrame, Renderer
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
@@ -50,7 +50,7 @@ from crosscue.eval.scoring.runs import read_run_tables
 from crosscue.eval.scoring.truth import read_scored_truth as load_truth
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
-from support.perfect_boxes import frames, is_there, role_at, true_cars
+from support.perfect_boxes import NO_FAULTS, frames, is_there, role_at, true_cars
 
 VISIBLE = (0.3, 0.5, 0.7, 0.9)
 # Visibility threshold for which errors are listed by their cause.
@@ -58,6 +58,16 @@ SHOWN = 0.7
 RULES = {"cross_traffic": cross_traffic, "parked": parked_cars}
 LABELLED = {"stop_sign": "stop sign", "traffic_light": "traffic light"}
 Claims = dict[str, tuple[list[bool], list[int]]]
+
+
+def perfect_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, RenderedFrame]]:
+    """Yield label images of a faultless detector in dry daylight."""
+    clear = replace(world, conditions=replace(world.conditions, light="noon", rain=0.0))
+    return label_pictures(clear, settings, NO_FAULTS)
+
+
+# Label images of the faultless detector, which show the best possible result of the rules.
+PERFECT_LABELS = Imager("perfect labels 1", perfect_pictures, png, "png", is_painted=False)
 
 
 def counts(drive: Path, vehicle: Vehicle, min_visible: float) -> Iterator[tuple[int, str, int]]:

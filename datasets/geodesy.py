@@ -10,7 +10,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from crosscue.replay.columns import Floats
 
 SEMI_MAJOR_M: Final = 6_378_137.0
 FLATTENING: Final = 1.0 / 298.257_223_563
@@ -23,9 +25,7 @@ SECOND_ECCENTRICITY_2: Final = FIRST_ECCENTRICITY_2 / (1.0 - FIRST_ECCENTRICITY_
 _BOWRING_STEPS: Final = 3
 
 
-def geodetic_to_ecef(
-    lat_deg: ArrayLike, lon_deg: ArrayLike, alt_m: ArrayLike
-) -> NDArray[np.float64]:
+def geodetic_to_ecef(lat_deg: ArrayLike, lon_deg: ArrayLike, alt_m: ArrayLike) -> Floats:
     """Convert geodetic coordinates to earth-fixed positions.
 
     Args:
@@ -52,9 +52,7 @@ def geodetic_to_ecef(
     )
 
 
-def ecef_to_geodetic(
-    xyz_m: ArrayLike,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def ecef_to_geodetic(xyz_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
     """Convert earth-fixed positions to latitude and longitude in degrees and height in metres.
 
     Args:
@@ -87,7 +85,7 @@ def ecef_to_geodetic(
     return np.degrees(np.arctan2(sin_lat, cos_lat)), np.degrees(np.arctan2(y, x)), alt_m
 
 
-def ecef_to_enu_matrix(lat_rad: float, lon_rad: float) -> NDArray[np.float64]:
+def ecef_to_enu_matrix(lat_rad: float, lon_rad: float) -> Floats:
     """Return the rotation ``enu_R_ecef`` at a place: ``enu_m = matrix @ (xyz_m - origin_m)``.
 
     Args:
@@ -110,7 +108,7 @@ def ecef_to_enu_matrix(lat_rad: float, lon_rad: float) -> NDArray[np.float64]:
 
 def geodetic_to_enu(
     lat_deg: ArrayLike, lon_deg: ArrayLike, alt_m: ArrayLike, origin: tuple[float, float, float]
-) -> NDArray[np.float64]:
+) -> Floats:
     """Convert geodetic coordinates near ``origin`` to local east, north, up.
 
     Args:
@@ -124,12 +122,10 @@ def geodetic_to_enu(
     """
     enu_from_ecef = ecef_to_enu_matrix(np.radians(origin[0]), np.radians(origin[1]))
     away_m = geodetic_to_ecef(lat_deg, lon_deg, alt_m) - geodetic_to_ecef(*origin)
-    rotated: NDArray[np.float64] = away_m @ enu_from_ecef.T
+    rotated: Floats = away_m @ enu_from_ecef.T
     return rotated
 
 
-def _unit(
-    opposite: NDArray[np.float64], adjacent: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _unit(opposite: Floats, adjacent: Floats) -> tuple[Floats, Floats]:
     length = np.hypot(opposite, adjacent)
     return opposite / length, adjacent / length

@@ -6,7 +6,8 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats, Int64s
 
 TWO_PI: Final = 2.0 * math.pi
 
@@ -18,17 +19,14 @@ def wrap(angle_rad: float) -> float:
     return angle_rad - TWO_PI * math.ceil((angle_rad - math.pi) / TWO_PI)
 
 
-def wrap_all(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+def wrap_all(angles_rad: Floats) -> Floats:
     """``wrap`` for an array of any shape."""
     return angles_rad - TWO_PI * np.ceil((angles_rad - math.pi) / TWO_PI)
 
 
 def interpolate_angle(
-    at_ns: NDArray[np.int64],
-    t_ns: NDArray[np.int64],
-    angles_rad: NDArray[np.float64],
-    max_gap_ns: int | None = None,
-) -> NDArray[np.float64]:
+    at_ns: Int64s, t_ns: Int64s, angles_rad: Floats, max_gap_ns: int | None = None
+) -> Floats:
     """Interpolate angles at other times, along the shorter arc between neighbours.
 
     Args:
@@ -55,7 +53,7 @@ def interpolate_angle(
     return np.where(is_known, found, np.nan)
 
 
-def circular_mean(angles_rad: NDArray[np.float64]) -> float:
+def circular_mean(angles_rad: Floats) -> float:
     """Direction of the mean unit vector.
 
     Raises:

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.columns import ColumnSet, Floats, Int64s
 from crosscue.replay.safe_text import counted
 
 Bools = NDArray[np.bool_]
@@ -55,7 +55,8 @@ GROWTH_SD: Final = 5e-4
 SCENE_SD: Final = 0.05
 
 
-class PictureMotion(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class PictureMotion(ColumnSet):
     """What N pairs of successive pictures show of the car's motion, as columns.
 
     Attributes:
@@ -71,16 +72,6 @@ class PictureMotion(NamedTuple):
     turn_rad: Floats
     expansion: Floats
     is_standing: Bools
-
-    def take(self, keep: Bools) -> Self:
-        """Return some of the pairs."""
-        return type(self)(
-            self.start_ns[keep],
-            self.t_ns[keep],
-            self.turn_rad[keep],
-            self.expansion[keep],
-            self.is_standing[keep],
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,17 +230,12 @@ class _Fit:
     seen: Floats
     integral: _Integral
     origin_ns: int
-    event: NDArray[np.int64] | None
+    event: Int64s | None
 
     def only(self, keep: Bools) -> _Fit:
-        return _Fit(
-            self.start_s[keep],
-            self.end_s[keep],
-            self.seen[keep],
-            self.integral,
-            self.origin_ns,
-            None if self.event is None else self.event[keep],
-        )
+        event = None if self.event is None else self.event[keep]
+        kept = (self.start_s[keep], self.end_s[keep], self.seen[keep])
+        return _Fit(*kept, self.integral, self.origin_ns, event)
 
     def known_for(self, reach_s: float, about_s: float = 0.0) -> Bools:
         """Return the pairs whose times are inside the signal for all delays searched."""
@@ -397,11 +383,7 @@ def _tridiagonal(bands: Floats, columns: Floats) -> Floats:
 
 
 def _fitted(
-    signal: str,
-    pairs: PictureMotion,
-    seen: Floats,
-    integral: _Integral,
-    event: NDArray[np.int64] | None,
+    signal: str, pairs: PictureMotion, seen: Floats, integral: _Integral, event: Int64s | None
 ) -> CameraDelay:
     """Fit delay and drift; scale and bias, or the scales of each standstill, are free."""
     if len(seen) < MIN_PAIRS or len(integral.t_ns) < MIN_PAIRS:

@@ -14,7 +14,8 @@ from dataclasses import dataclass, fields
 from typing import Final, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats, Int64s
 
 from .angles import interpolate_angle, wrap_all
 
@@ -65,10 +66,7 @@ class CompassSettings:
             raise ValueError(f"soft_iron: expected determinant > 0, got {self.soft_iron}")
 
 
-def heading(
-    field_t: NDArray[np.float64],
-    settings: CompassSettings,
-) -> NDArray[np.float64]:
+def heading(field_t: Floats, settings: CompassSettings) -> Floats:
     """Compute headings of the car, counter-clockwise from east.
 
     Args:
@@ -88,7 +86,7 @@ def heading(
     return np.where(np.hypot(forward, left) > 0.0, found, np.nan)
 
 
-def level_field(field_t: NDArray[np.float64], settings: CompassSettings) -> NDArray[np.float64]:
+def level_field(field_t: Floats, settings: CompassSettings) -> Floats:
     """Correct readings and rotate them to the axes forward, left, up, without the mounting yaw.
 
     Arguments and errors are those of ``heading``; the result has shape (N, 3).
@@ -97,18 +95,18 @@ def level_field(field_t: NDArray[np.float64], settings: CompassSettings) -> NDAr
     if field_t.shape != (n, 3):
         raise ValueError(f"field_t: expected ({n}, 3), got {field_t.shape}")
     to_car = np.array(settings.mounting_rotation) @ np.array(settings.soft_iron)
-    body: NDArray[np.float64] = (field_t - np.array(settings.hard_iron_t)) @ to_car.T
+    body: Floats = (field_t - np.array(settings.hard_iron_t)) @ to_car.T
     return body
 
 
 def course_at(
-    at_ns: NDArray[np.int64],
-    course_t_ns: NDArray[np.int64],
-    course_rad: NDArray[np.float64],
-    speed_mps: NDArray[np.float64],
+    at_ns: Int64s,
+    course_t_ns: Int64s,
+    course_rad: Floats,
+    speed_mps: Floats,
     min_speed_mps: float = 3.0,
     max_gap_s: float = 1.5,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Interpolate the course over ground at other times; NaN where the car was too slow.
 
     Args:

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats
 
 from .pose_filter import HEADING, SPEED, State, arc, at_point, update_position
-
-Floats: TypeAlias = NDArray[np.float64]
 
 _ROUNDING: Final = 1e-9
 

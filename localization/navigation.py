@@ -11,14 +11,16 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.columns import Floats, Int64s
+
 from .angles import wrap
 
-Ints = NDArray[np.int64]
+Numbers = TypeVar("Numbers", Floats, Int64s)
 # Index that stands for no place, no option or no landmark.
 NONE: Final = -1
 PLACES, OPTIONS = 0, 1
@@ -48,11 +50,7 @@ def option_cost(heading_rad: float, bearing_rad: float, penalty_rad: float) -> f
     return abs(wrap(heading_rad - bearing_rad)) + penalty_rad
 
 
-def choose_option(
-    headings_rad: NDArray[np.float64],
-    bearings_rad: NDArray[np.float64],
-    penalties_rad: NDArray[np.float64],
-) -> int:
+def choose_option(headings_rad: Floats, bearings_rad: Floats, penalties_rad: Floats) -> int:
     """Index of the option of least cost (eq. 4), the first of equal ones.
 
     Args:
@@ -104,13 +102,13 @@ class Memory(NamedTuple):
         times: Number of times that each option was taken.
     """
 
-    sizes: Ints
-    x_m: NDArray[np.float64]
-    y_m: NDArray[np.float64]
-    first: Ints
-    following: Ints
-    headings_rad: NDArray[np.float64]
-    times: NDArray[np.float64]
+    sizes: Int64s
+    x_m: Floats
+    y_m: Floats
+    first: Int64s
+    following: Int64s
+    headings_rad: Floats
+    times: Floats
 
 
 def empty_memory() -> Memory:
@@ -191,26 +189,16 @@ def remember(
 
 def _with_room_for_places(memory: Memory) -> Memory:
     sizes, x_m, y_m, first, following, headings, times = memory
-    return Memory(
-        sizes, _doubled(x_m), _doubled(y_m), _doubled_ints(first), following, headings, times
-    )
+    return Memory(sizes, _doubled(x_m), _doubled(y_m), _doubled(first), following, headings, times)
 
 
 def _with_room_for_options(memory: Memory) -> Memory:
     sizes, x_m, y_m, first, following, headings, times = memory
-    return Memory(
-        sizes, x_m, y_m, first, _doubled_ints(following), _doubled(headings), _doubled(times)
-    )
+    return Memory(sizes, x_m, y_m, first, _doubled(following), _doubled(headings), _doubled(times))
 
 
-def _doubled(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    larger = np.empty(2 * len(numbers))
-    larger[: len(numbers)] = numbers
-    return larger
-
-
-def _doubled_ints(numbers: Ints) -> Ints:
-    larger = np.empty(2 * len(numbers), np.int64)
+def _doubled(numbers: Numbers) -> Numbers:
+    larger = np.empty(2 * len(numbers), numbers.dtype)
     larger[: len(numbers)] = numbers
     return larger
 
@@ -220,7 +208,7 @@ def landmark_ahead(
     y_m: float,
     goal_x_m: float,
     goal_y_m: float,
-    landmarks_m: NDArray[np.float64],
+    landmarks_m: Floats,
     is_visited: NDArray[np.bool_],
 ) -> int:
     """Index of the nearest landmark that brings the car closer to its goal, or ``NONE``.

@@ -19,9 +19,7 @@ from typing import Final, Literal, NamedTuple, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Floats: TypeAlias = NDArray[np.float64]
-Int64s: TypeAlias = NDArray[np.int64]
-
+from crosscue.replay.columns import ColumnSet, Floats, Int64s
 
 Bools: TypeAlias = NDArray[np.bool_]
 TurnKind: TypeAlias = Literal["yaw rate", "steering"]
@@ -105,7 +103,7 @@ class OdometrySettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WheelSamples:
+class WheelSamples(ColumnSet):
     """N samples of two rear or of all four wheels.
 
     Attributes:
@@ -116,9 +114,6 @@ class WheelSamples:
 
     t_ns: Int64s
     wheels_mps: Floats
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,7 +167,7 @@ class OdometryCounts:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Increments:
+class Increments(ColumnSet):
     """N intervals between consecutive wheel samples.
 
     Attributes:
@@ -199,9 +194,6 @@ class Increments:
     speed_var_m2ps2: Floats
     turn_source: NDArray[np.uint8]
     is_gap: Bools
-
-    def __len__(self) -> int:
-        return len(self.start_ns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,19 +21,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import Final, NamedTuple, Protocol, Self, TypeAlias
+from typing import Final, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+from crosscue.replay.columns import ColumnSet, Floats, Int64s
 
 from .angles import wrap
 from .constants import Constants, coast_constants, predict_constants, update_constants
 from .ekf import PoseBelief, coast, pack_belief, unpack_belief
 from .odometry import Increments
 from .pose_filter import HEADING, SPEED, State, major_axis_m, predict_pose, update_state
-
-Floats: TypeAlias = NDArray[np.float64]
-Int64s: TypeAlias = NDArray[np.int64]
 
 ACCEPTED: Final = 0
 REJECTED: Final = 1
@@ -60,7 +59,7 @@ class TrackSettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Headings:
+class Headings(ColumnSet):
     """N compass readings.
 
     Attributes:
@@ -72,9 +71,6 @@ class Headings:
     t_ns: Int64s
     heading_rad: Floats
     var_rad2: Floats
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
 
 
 NO_HEADINGS: Final = Headings(np.empty(0, np.int64), np.empty(0), np.empty(0))
@@ -140,7 +136,7 @@ class TrackState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PoseColumns:
+class PoseColumns(ColumnSet):
     """N rows of a pose track.
 
     Attributes:
@@ -163,19 +159,15 @@ class PoseColumns:
     major_axis_m: Floats
     travelled_m: Floats
 
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeadingColumns:
+class HeadingColumns(ColumnSet):
     """N headings that reached the filter.
 
     Attributes:
         t_ns: Shape (N,), int64.
         heading_rad: Shape (N,): as measured.
         var_rad2: Shape (N,): variance of the measurement.
-        innovation_rad: Shape (N,): measured minus expected, wrapped.
         nis: Shape (N,): normalised innovation squared, chi-square with one degree of freedom.
         outcome: Shape (N,), uint8: ``ACCEPTED`` or ``REJECTED`` by the gate.
     """
@@ -183,12 +175,8 @@ class HeadingColumns:
     t_ns: Int64s
     heading_rad: Floats
     var_rad2: Floats
-    innovation_rad: Floats
     nis: Floats
     outcome: NDArray[np.uint8]
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
 
 
 class MeasurementSource(Protocol):
@@ -292,7 +280,8 @@ def advance_pose(
         The state for the next window, the rows, the outcome of each heading that reached the
         filter, and counts.
     """
-    headings = _by_time(_joined(state.waiting, headings))
+    headings = state.waiting + headings
+    headings = headings.take(np.argsort(headings.t_ns, kind="stable"))
     wanted = None
     if rows_ns is not None:
         wanted = np.sort(np.concatenate([state.waiting_rows_ns, rows_ns]))
@@ -340,7 +329,7 @@ class _Run:
         usable = np.isfinite(headings.heading_rad) & (headings.var_rad2 > 0.0)
         usable &= np.isfinite(headings.var_rad2)
         late = usable & (headings.t_ns < self.t_ns)
-        self.headings = _picked(headings, usable & ~late)
+        self.headings = headings.take(usable & ~late)
         self.heading_rows = list(
             zip(
                 self.headings.t_ns.tolist(),
@@ -360,7 +349,7 @@ class _Run:
         self.event_ns = 0
         self.poses: list[tuple[float, ...]] = []
         self.pose_times: list[int] = []
-        self.used: list[tuple[int, float, float, float, float, int]] = []
+        self.used: list[tuple[int, float, float, float, int]] = []
         self.tally = dict.fromkeys((f.name for f in fields(TrackCounts)), 0)
         self.tally["headings_bad"] = int((~usable).sum())
         self.tally["headings_late"] = int(late.sum())
@@ -489,7 +478,7 @@ class _Run:
         nis = innovation * innovation / (self.state.hh + var_rad2)
         gate = self.settings.heading_gate_nis
         outcome = ACCEPTED if gate is None or nis <= gate else REJECTED
-        self.used.append((self.t_ns, heading_rad, var_rad2, innovation, nis, outcome))
+        self.used.append((self.t_ns, heading_rad, var_rad2, nis, outcome))
         if outcome == REJECTED:
             self.tally["headings_rejected"] += 1
             return
@@ -516,50 +505,21 @@ class _Run:
 
     def result(self) -> Advance:
         poses = np.array(self.poses).reshape(-1, 12)
-        used = np.array(self.used, dtype=np.float64).reshape(-1, 6)
+        used = np.array(self.used, dtype=np.float64).reshape(-1, 5)
         state = TrackState(
             belief=unpack_belief(self.t_ns, self.state),
             travelled_m=self.travelled_m,
             counted_ns=self.counted_ns,
             counted_m=self.counted_m,
-            waiting=_picked(self.headings, slice(self.next_heading, None)),
+            waiting=self.headings.take(slice(self.next_heading, None)),
             waiting_rows_ns=self.rows[self.next_row :],
             constants=self.constants,
         )
-        columns = PoseColumns(
-            np.array(self.pose_times, np.int64),
-            poses[:, 0],
-            poses[:, 1],
-            poses[:, 2],
-            poses[:, 3],
-            poses[:, 4:10],
-            poses[:, 10],
-            poses[:, 11],
-        )
-        headings = HeadingColumns(
-            np.array([t for t, *_ in self.used], np.int64),
-            used[:, 1],
-            used[:, 2],
-            used[:, 3],
-            used[:, 4],
-            used[:, 5].astype(np.uint8),
-        )
+        x, y, heading, speed = poses[:, :4].T
+        axis, travelled = poses[:, 10:].T
+        t_ns = np.array(self.pose_times, np.int64)
+        columns = PoseColumns(t_ns, x, y, heading, speed, poses[:, 4:10], axis, travelled)
+        measured, var, nis, outcome = used[:, 1:].T
+        t_ns = np.array([t for t, *_ in self.used], np.int64)
+        headings = HeadingColumns(t_ns, measured, var, nis, outcome.astype(np.uint8))
         return Advance(state, columns, headings, TrackCounts(**self.tally))
-
-
-def _joined(first: Headings, second: Headings) -> Headings:
-    if not len(first):
-        return second
-    return Headings(
-        np.concatenate([first.t_ns, second.t_ns]),
-        np.concatenate([first.heading_rad, second.heading_rad]),
-        np.concatenate([first.var_rad2, second.var_rad2]),
-    )
-
-
-def _by_time(headings: Headings) -> Headings:
-    return _picked(headings, np.argsort(headings.t_ns, kind="stable"))
-
-
-def _picked(headings: Headings, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Headings:
-    return Headings(headings.t_ns[index], headings.heading_rad[index], headings.var_rad2[index])

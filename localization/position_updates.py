@@ -62,12 +62,7 @@ class PositionUpdates:
     def add(self, fixes: Fixes) -> None:
         """Add a window's positions; those later than the odometry wait."""
         self.counts.received += len(fixes)
-        if len(fixes):
-            self._waiting = Fixes(
-                np.concatenate([self._waiting.t_ns, fixes.t_ns]),
-                np.concatenate([self._waiting.xy_m, fixes.xy_m]),
-                np.concatenate([self._waiting.cov_m2, fixes.cov_m2]),
-            )
+        self._waiting += fixes
 
     def times_ns(self) -> Sequence[int]:
         """Times of waiting positions."""

@@ -6,7 +6,8 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats, Int64s
 
 from .angles import wrap
 from .fixes import Fixes
@@ -22,12 +23,12 @@ INDEPENDENT_S: Final = 1.0
 class Path(NamedTuple):
     """Dead reckoning from pose (0, 0, 0), as arrays of shape (N,)."""
 
-    x_m: NDArray[np.float64]
-    y_m: NDArray[np.float64]
-    heading_rad: NDArray[np.float64]
+    x_m: Floats
+    y_m: Floats
+    heading_rad: Floats
 
 
-def path_of(increments: Increments, at_ns: NDArray[np.int64], begin_ns: int) -> Path:
+def path_of(increments: Increments, at_ns: Int64s, begin_ns: int) -> Path:
     """Compute poses relative to the one at ``begin_ns``; linear inside increments."""
     heading = np.append(0.0, np.cumsum(increments.turn_rad))
     half = 0.5 * increments.turn_rad
@@ -43,10 +44,7 @@ def path_of(increments: Increments, at_ns: NDArray[np.int64], begin_ns: int) -> 
 
 
 def start_pose(
-    increments: Increments,
-    fixes: Fixes,
-    lever_m: tuple[float, float],
-    at_ns: int | None = None,
+    increments: Increments, fixes: Fixes, lever_m: tuple[float, float], at_ns: int | None = None
 ) -> State:
     """Estimate the pose of the rear axle by aligning the first seconds' odometry with the fixes.
 

@@ -276,10 +276,7 @@ class VisualOdometry:
         lever = per_pitch * shift.distance_m
         distance_m = shift.shift_m - lever * (self._pitch - resampled_at)
         spread_m = math.hypot(
-            shift.sd_m,
-            lever * math.sqrt(self._pitch_var),
-            HEIGHT_SD * shift.shift_m,
-            0.2 * CELL_M,
+            shift.sd_m, lever * math.sqrt(self._pitch_var), HEIGHT_SD * shift.shift_m, 0.2 * CELL_M
         )
         return step._replace(
             distance_m=distance_m,

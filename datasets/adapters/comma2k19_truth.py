@@ -57,15 +57,13 @@ def write_comma_truth(path: Path, folder: Path) -> Path:
     quat_wxyz = np.roll(enu_r_car.as_quat(canonical=True), 1, axis=1)
     track = Trajectory(t_ns, east_north_up, quat_wxyz)
     note = "comma2k19 global_pose: the camera in a local frame, x east, y north, z up"
-    mounting, source = mounting_in_car(track)
     return write_track_truth(
         folder,
         path.name,
         track,
         note,
         pose_point="camera",
-        mounting=mounting,
-        mounting_source=source,
+        **mounting_in_car(track),
         origin=Origin(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude),
         source="comma2k19: tightly coupled INS, GNSS and vision, smoothed offline",
     )

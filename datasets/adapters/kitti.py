@@ -51,6 +51,7 @@ PERIOD_STEP_S: Final = 1e-4
 MAX_PERIOD_ERROR: Final = 0.2
 ROWS_PER_BLOCK: Final = 100
 FRAMES_FOR_PERIOD: Final = 10_000
+NO_TIMES: Final[Int64s] = np.zeros(0, np.int64)
 # Topic, reason, count and detail of a stream that cannot be read.
 Unreadable: TypeAlias = tuple[str, str, int | None, str]
 
@@ -127,23 +128,10 @@ class KittiDrive(CameraDrive):
 
     format: Final = "kitti-raw"
 
-    def __init__(
-        self,
-        path: Path,
-        cameras: Sequence[PictureFiles],
-        oxts: Oxts | None,
-        limits: Limits,
-        touched: Touched,
-        *,
-        unreadable: Sequence[Unreadable] = (),
-        notices: Sequence[str] = (),
-    ) -> None:
-        """Build a drive; ``oxts`` are the packets of the GNSS and inertial box."""
-        numbers = () if oxts is None else (oxts,)
-        super().__init__(
-            path, cameras, numbers, limits, touched, unreadable=unreadable, notices=notices
-        )
-        self.oxts: Final = oxts
+    @property
+    def oxts(self) -> Oxts | None:
+        """Packets of the GNSS and inertial box."""
+        return next((one for one in self._numbers if isinstance(one, Oxts)), None)
 
     def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
         """Read like ``CameraDrive.read``, and report that packets have no checksum."""
@@ -247,7 +235,7 @@ def _open_raw(path: Path, limits: Limits) -> KittiDrive:
     return KittiDrive(
         path,
         cameras,
-        None if packets is None else Oxts(packets, touched=touched),
+        () if packets is None else (Oxts(packets, touched=touched),),
         limits,
         touched,
         unreadable=unreadable,
@@ -293,7 +281,7 @@ def _open_tracking(path: Path, limits: Limits) -> KittiDrive:
         )
     name = singles[0].stem
     cameras, touched = [], Touched()
-    oxts = Oxts(TimedFiles((), _no_times(), _no_times(), None, ()), singles[0], touched=touched)
+    oxts = Oxts(TimedFiles((), NO_TIMES, NO_TIMES, None, ()), singles[0], touched=touched)
     period_s = _driven_period_s(oxts)
     if period_s is not None:
         oxts = replace(oxts, period_ns=round(period_s / PERIOD_STEP_S) * round(PERIOD_STEP_S * 1e9))
@@ -303,14 +291,14 @@ def _open_tracking(path: Path, limits: Limits) -> KittiDrive:
             t_ns = np.array(
                 [_frame_ns(path.stem, oxts.period_ns) for path in paths], dtype=np.int64
             )
-            files = TimedFiles(tuple(paths), t_ns, _no_times(), None, ())
+            files = TimedFiles(tuple(paths), t_ns, NO_TIMES, None, ())
             cameras.append(camera_of(folder.parent.name, files, touched))
     why = "as published" if period_s is None else "with which speeds match distances"
     notice = (
         f"{name}: the tracking set has no times; they are computed from frame numbers, "
         f"{oxts.period_ns * 1e-6:g} ms each ({why}), starting at 0"
     )
-    return KittiDrive(path, cameras, oxts, limits, touched, notices=[notice])
+    return KittiDrive(path, cameras, (oxts,), limits, touched, notices=[notice])
 
 
 def _driven_period_s(oxts: Oxts) -> float | None:
@@ -390,9 +378,4 @@ def _packets(some: Sequence[Line]) -> Packets:
 
 def _in_time_order(packets: Packets) -> Packets:
     _, first = np.unique(packets.t_ns, return_index=True)
-    first = first[packets.t_ns[first] >= 0]
-    return Packets(packets.t_ns[first], packets.numbers[first])
-
-
-def _no_times() -> Int64s:
-    return np.zeros(0, dtype=np.int64)
+    return packets.take(first[packets.t_ns[first] >= 0])

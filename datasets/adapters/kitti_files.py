@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.datasets.truth.coco import Objects
-from crosscue.replay.columns import Floats, Int64s, Table
+from crosscue.replay.columns import ColumnSet, Floats, Int64s, Table
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.image_header import size_in_header
 
@@ -58,7 +58,7 @@ INS_SPEED: Final = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Packets:
+class Packets(ColumnSet):
     """N packets.
 
     Attributes:
@@ -68,9 +68,6 @@ class Packets:
 
     t_ns: Int64s
     numbers: Floats
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
 
     def __getitem__(self, name: str) -> Floats:
         """Return a column of ``COLUMNS``, shape (N,)."""

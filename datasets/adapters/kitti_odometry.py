@@ -188,15 +188,13 @@ def write_kitti_odometry_truth(path: Path, folder: Path) -> Path:
     note = "KITTI odometry: the left grey camera; x ahead, y left, z up of the first picture"
     wxyz = poses.turn.as_quat()[:, [3, 0, 1, 2]]
     track = Trajectory(poses.t_ns, poses.xyz_m, wxyz)
-    mounting, mounting_source = mounting_in_car(track, SETUP, x_m=1.03, y_m=0.0, z_m=1.65)
     return write_track_truth(
         folder,
         path.resolve().name,
         track,
         note,
         pose_point="camera",
-        mounting=mounting,
-        mounting_source=mounting_source,
+        **mounting_in_car(track, SETUP, x_m=1.03, y_m=0.0, z_m=1.65),
         source=(
             "KITTI odometry (CC BY-NC-SA 3.0): published poses of the left grey camera, image_0; "
             "other cameras sit beside it by -P[0, 3] / P[0, 0] of calib.txt, in metres to its right"

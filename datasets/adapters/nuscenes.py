@@ -425,12 +425,7 @@ MESSAGES: Final[dict[str, _Message]] = {
     "pose": _Message(
         "can/pose",
         "crosscue/Table",
-        (
-            *_axes("{}_m"),
-            *_QUATERNION,
-            *_axes("velocity_{}_mps"),
-            *_axes("rotation_rate_{}_radps"),
-        ),
+        (*_axes("{}_m"), *_QUATERNION, *_axes("velocity_{}_mps"), *_axes("rotation_rate_{}_radps")),
         _vectors(pos=3, orientation=4, vel=3, rotation_rate=3),
     ),
     "vehicle_monitor": _Message(

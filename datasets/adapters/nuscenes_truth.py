@@ -113,12 +113,10 @@ def _intersections(
 def _objects(tables: SceneTables) -> tuple[Objects, int]:
     """Return boxes of the front camera's key frames, and the number of damaged rows."""
     folder = tables.scene.tables
-    attributes = {
-        t: str(row["name"]) for t, row in whole_table(folder / "attribute.json", "name").items()
-    }
-    categories = {
-        t: str(row["name"]) for t, row in whole_table(folder / "category.json", "name").items()
-    }
+    attributes, categories = (
+        {token: str(row["name"]) for token, row in whole_table(folder / name, "name").items()}
+        for name in ("attribute.json", "category.json")
+    )
     table = RowsOf(checked(folder / "sample_annotation.json"))
     of_sample: dict[str, list[Row]] = {}
     for row in table:

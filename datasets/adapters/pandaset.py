@@ -174,15 +174,13 @@ def write_pandaset_truth(path: Path, folder: Path) -> Path:
     wxyz = turn.as_quat()[:, [3, 0, 1, 2]]
     note = "PandaSet: the front camera in the sequence's local frame, z up"
     track = Trajectory(poses.t_ns, poses.xyz_m, wxyz)
-    mounting, mounting_source = mounting_in_car(track)
     return write_track_truth(
         folder,
         path.resolve().name,
         track,
         note,
         pose_point="camera",
-        mounting=mounting,
-        mounting_source=mounting_source,
+        **mounting_in_car(track),
         source="PandaSet (Scale AI, Hesai; CC BY 4.0): published poses of the front camera",
     )
 

@@ -2,12 +2,13 @@
 
     python -m crosscue.datasets.real.label_pandaset SEQUENCE OUT.json
 
-SEQUENCE is the folder of the sequence with its 3-D boxes in ``annotations/cuboids.parquet``, as for
-``annotate_pandaset``. Each box is projected into the front camera and drawn from far to near, which
-yields the fraction that nearer boxes hide. An object that is more than half hidden, further than
-60 m, or neither car nor truck nor person, is a region that is not scored (``iscrowd``). Boxes have
-stamps about 50 ms after the picture, and a projected box is slightly wider than its object. Scores
-should therefore use an overlap of at most 0.5.
+SEQUENCE is the folder of the sequence with its 3-D boxes in ``annotations/cuboids.parquet``, one
+row for each box in each frame (the data set publishes them as pickles, which are not read). Each
+box is projected into the front camera and drawn from far to near, which yields the fraction that
+nearer boxes hide. An object that is more than half hidden, further than 60 m, or neither car nor
+truck nor person, is a region that is not scored (``iscrowd``). Boxes have stamps about 50 ms after
+the picture, and a projected box is slightly wider than its object. Scores should therefore use an
+overlap of at most 0.5.
 """
 
 from __future__ import annotations
@@ -15,16 +16,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from crosscue.datasets.adapters.pandaset import read_pandaset_poses
+from crosscue.datasets.adapters.pandaset import FRONT, PandasetPoses, read_pandaset_poses
+from crosscue.datasets.adapters.published import json_of
 from crosscue.datasets.truth.coco import CocoRows
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogFormatError
-
-from .annotate_pandaset import corners_m, intrinsics_of, read_boxes
 
 CATEGORIES: Final = {"car": 1, "truck": 2, "person": 3}
 LABELS: Final = {
@@ -91,6 +91,51 @@ def _visible(corners_px: Floats) -> Iterator[float]:
         shown = int((mine & ~hidden & 1).sum())
         hidden |= mine
         yield min(shown / max(whole, 1.0), 1.0)
+
+
+def read_boxes(sequence: Path) -> dict[str, Any]:
+    """Read the columns of a sequence's 3-D boxes.
+
+    Raises:
+        LogFormatError: There is no table of boxes.
+    """
+    import pyarrow.parquet as pq
+
+    path = sequence / "annotations" / "cuboids.parquet"
+    if not path.exists():
+        raise LogFormatError(
+            f"{path}: missing; the boxes are published as pickles, which are not read; "
+            "docs/reference/formats.md describes how to convert them to this table"
+        )
+    table = pq.read_table(path)
+    numbers = ("frame", "x_m", "y_m", "z_m", "yaw_rad", "width_m", "length_m", "height_m")
+    texts = {name: np.array(table[name].to_pylist()) for name in ("label", "motion")}
+    return {name: table[name].to_numpy() for name in numbers} | texts
+
+
+def corners_m(boxes: dict[str, Any], poses: PandasetPoses) -> Floats:
+    """Return the corners of N boxes ahead, left and up of the camera, shape (N, 8, 3)."""
+    frame = boxes["frame"]
+    forward, left = poses.forward[frame], poses.left[frame]
+    axes = np.stack([forward, left, np.cross(forward, left)], axis=1)
+    unit = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    own = unit * np.stack([boxes[f"{of}_m"] for of in ("width", "length", "height")], 1)[:, None]
+    cos, sin = np.cos(boxes["yaw_rad"])[:, None], np.sin(boxes["yaw_rad"])[:, None]
+    turned = [own[..., 0] * cos - own[..., 1] * sin, own[..., 0] * sin + own[..., 1] * cos]
+    corners = np.stack([*turned, own[..., 2]], axis=2) + middles_m(boxes, poses)[:, None]
+    return np.asarray(corners @ np.swapaxes(axes, 1, 2))
+
+
+def middles_m(boxes: dict[str, Any], poses: PandasetPoses) -> Floats:
+    """Return the centres of N boxes relative to their cameras, in the map's axes, shape (N, 3)."""
+    middles = np.stack([boxes["x_m"], boxes["y_m"], boxes["z_m"]], 1)
+    return np.asarray(middles - poses.xyz_m[boxes["frame"]])
+
+
+def intrinsics_of(sequence: Path) -> tuple[float, float, float, float]:
+    """Return both focal lengths, and column and row of the optical axis."""
+    found = json_of(sequence / "camera" / FRONT / "intrinsics.json")
+    return float(found["fx"]), float(found["fy"]), float(found["cx"]), float(found["cy"])
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.random import Generator
 
 from crosscue.datasets.scenes.rendering.mesh import (
-    Floats,
     Mesh,
     Rgb,
     disc,
@@ -20,6 +19,7 @@ from crosscue.datasets.scenes.rendering.mesh import (
     triangles,
     upright,
 )
+from crosscue.replay.columns import Floats
 
 SKIRT_M: Final = 0.24
 GLASS: Final[Rgb] = (0.09, 0.11, 0.13)
@@ -139,15 +139,11 @@ def car(look: Look, *, lamps_on: bool) -> Mesh:
     return merge_meshes(parts).placed(-shape.length_m / 2, 0.0)
 
 
-def _upper(points: tuple[tuple[float, float], ...]) -> Floats:
-    return np.array(points, np.float64)
-
-
 def _slab(
     top: tuple[tuple[float, float], ...], foot_m: float, low: float, high: float, rgb: Rgb
 ) -> Mesh:
     """Return a body below the polyline ``top``: sides from ``foot_m`` up, and the upper surface."""
-    edge = _upper(top)
+    edge = np.array(top)
     parts = []
     for (xa, za), (xb, zb) in pairwise(edge):
         parts += [
@@ -162,7 +158,7 @@ def _slab(
 
 
 def _cabin(shape: CarShape, paint: Rgb) -> list[Mesh]:
-    edge = _upper(shape.cabin)
+    edge = np.array(shape.cabin)
     belt = min(edge[0, 1], edge[-1, 1])
     roof = shape.height_m
     wide = shape.half_width_m - 0.05

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -351,30 +351,6 @@ def png(picture: RenderedFrame, _: PictureSettings) -> bytes:
     return bytes(cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
 
 
-# Faultless detector: exact masks of all objects that are visible by at least two thirds.
-NO_FAULTS: Final = DetectorFaults(
-    sights=dict.fromkeys(LABELS, Sight(1.0, 1e-3)),
-    height_sd_fraction=0.0,
-    false_things={},
-    false_per_frame=0.0,
-    turned_around=0.0,
-    road_half_m=1e6,
-    ahead_half_m=1e6,
-    road_best=1.0,
-    lot_as_road=0.0,
-    driveway_as_road=0.0,
-    false_road=0.0,
-    false_roads=0.0,
-)
-
-
-def _perfect_pictures(world: World, settings: SceneSettings) -> Iterator[tuple[int, RenderedFrame]]:
-    clear = replace(world, conditions=replace(world.conditions, light="noon", rain=0.0))
-    return label_pictures(clear, settings, NO_FAULTS)
-
-
-# Label images of the faultless detector, which show the best possible result of the rules.
-PERFECT_LABELS: Final = Imager("perfect labels 1", _perfect_pictures, png, "png", is_painted=False)
 # Label images with faults, which a drive's camera records instead of photographs.
 LABEL_IMAGES: Final = Imager("faulty labels 1", label_pictures, png, "png", is_painted=False)
 # Detectors that read label images.

@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats
 
 Control = Literal["stop_sign", "traffic_light", "none"]
 Kind = Literal[
@@ -80,7 +81,7 @@ class Layout:
         """Sign of y on the ego vehicle's half of the road."""
         return 1.0 if self.traffic == "left" else -1.0
 
-    def aside_m(self, x_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    def aside_m(self, x_m: Floats) -> Floats:
         """Return the lateral position of the road's centre line, to the left of the x axis.
 
         It is a parabola from ``CURVE_FROM_M`` to a slope of ``CURVE_SLOPE``, and a straight line
@@ -184,11 +185,7 @@ def any_layout(seed: int) -> Layout:
         one_way="left" if one_way == "left" else "right" if one_way == "right" else None,
         do_not_enter=closed or bool(arms == "t" and one_way and rng.random() < 0.5),
         ahead_is_closed=closed,
-        half_width_m=float(rng.uniform(4.2, 6.4)),
-        cross_width_m=float(rng.uniform(11.0 if parked else 8.0, 13.0)),
-        cross_traffic=float(rng.choice([1.0, 5.0, 12.0, 26.0])),
-        parked_cross=parked,
-        parked_past=int(rng.choice([0, 0, 2, 5])),
+        **_roads(rng, parked),
         vegetation=bool(rng.random() < 0.2),
         is_town=bool(rng.random() < 0.45),
         has_lot=bool(rng.random() < 0.6),
@@ -241,11 +238,7 @@ def mixed_layout(seed: int) -> Layout:
         one_way=side if kind.startswith("one_way") else None,
         do_not_enter=closed or (kind == "one_way_t" and bool(rng.random() < 0.5)),
         ahead_is_closed=closed,
-        half_width_m=float(rng.uniform(4.2, 6.4)),
-        cross_width_m=float(rng.uniform(11.0 if parked else 8.0, 13.0)),
-        cross_traffic=float(rng.choice([1.0, 5.0, 12.0, 26.0])),
-        parked_cross=parked,
-        parked_past=int(rng.choice([0, 0, 2, 5])),
+        **_roads(rng, parked),
         vegetation=bool(rng.random() < 0.15),
         # Only houses have driveways.
         is_town=kind not in ("driveways", "lot") and bool(rng.random() < 0.5),
@@ -256,6 +249,17 @@ def mixed_layout(seed: int) -> Layout:
 
 def _curve(rng: np.random.Generator, side: Side) -> float:
     return (1.0 if side == "left" else -1.0) / float(rng.uniform(130.0, 250.0))
+
+
+def _roads(rng: np.random.Generator, parked: int) -> dict[str, Any]:
+    """Draw the widths of both roads, and their traffic."""
+    return {
+        "half_width_m": float(rng.uniform(4.2, 6.4)),
+        "cross_width_m": float(rng.uniform(11.0 if parked else 8.0, 13.0)),
+        "cross_traffic": float(rng.choice([1.0, 5.0, 12.0, 26.0])),
+        "parked_cross": parked,
+        "parked_past": int(rng.choice([0, 0, 2, 5])),
+    }
 
 
 def layout_named(name: str) -> Layout:

@@ -8,8 +8,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.random import Generator
 
-from crosscue.datasets.scenes.rendering.mesh import Floats
 from crosscue.datasets.simulated.drive import RATE_HZ, TrueMotion, integrated
+from crosscue.replay.columns import Floats
 
 from .layout import NEAR_KERB_M, PARKING_LANE_M, Layout
 
@@ -123,14 +123,11 @@ def lane_y_m(layout: Layout) -> float:
 
 def approach(layout: Layout, conditions: Conditions, rng: Generator) -> ApproachMotion:
     """Simulate an approach from about 88 m, with a stop at sign or light, and the crossing."""
-    ways: list[Turn] = []
-    if layout.goes_ahead:
-        ways += ["ahead"] * 4
-    if layout.goes_left:
-        ways.append("left")
-    if layout.goes_right:
-        ways.append("right")
-    turn: Turn = ways[int(rng.integers(len(ways)))]
+    chances: dict[Turn, int] = {
+        "ahead": 4 * layout.goes_ahead, "left": layout.goes_left, "right": layout.goes_right,
+    }  # fmt: skip
+    turns = [turn for turn, count in chances.items() for _ in range(count)]
+    turn = turns[int(rng.integers(len(turns)))]
     start_x = -float(rng.uniform(84.0, 90.0))
     curvature = _curvature(layout, turn, start_x)
     stop_at = -start_x - FRONT_M - float(rng.uniform(0.2, 0.8))

@@ -73,6 +73,18 @@ def camera_of_width(width_px: int) -> SceneCamera:
     return SceneCamera(width_px=width_px, height_px=width_px * 9 // 16)
 
 
+def scenes_of(
+    layouts: Sequence[str], runs: int, seed: int, width_px: int
+) -> tuple[SceneSettings, ...]:
+    """Return the drives of a study: the first run of each layout, then the next."""
+    camera = camera_of_width(width_px)
+    return tuple(
+        SceneSettings(layout=layout, run=run, seed=seed, camera=camera)
+        for run in range(1, runs + 1)
+        for layout in layouts
+    )
+
+
 def world_of(
     settings: SceneSettings, *, is_painted: bool = True
 ) -> tuple[Layout, Conditions, World]:

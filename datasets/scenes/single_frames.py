@@ -19,7 +19,7 @@ from crosscue.datasets.scenes.rendering.render import Renderer
 from crosscue.datasets.simulated.drive import START_NS
 from crosscue.detectors.base import View
 from crosscue.detectors.images import decode, read_file
-from crosscue.replay.columns import Bytes, Floats
+from crosscue.replay.columns import Bytes, ColumnSet, Floats
 from crosscue.replay.errors import EmptyResultError, LogError, UsageError
 from crosscue.replay.files.whole_file import write_bytes
 
@@ -83,7 +83,7 @@ def merge_annotations(parts: Sequence[DriveAnnotations]) -> DriveAnnotations:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RoadFrames:
+class RoadFrames(ColumnSet):
     """N pictures of one size.
 
     Attributes:
@@ -93,9 +93,6 @@ class RoadFrames:
 
     pixels: NDArray[np.uint8]
     road: NDArray[np.uint8]
-
-    def __len__(self) -> int:
-        return len(self.pixels)
 
 
 def concatenate_frames(parts: Sequence[RoadFrames]) -> RoadFrames:

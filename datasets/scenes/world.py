@@ -18,7 +18,7 @@ from crosscue.datasets.scenes.rendering.ground import (
     unpainted,
     with_levels,
 )
-from crosscue.datasets.scenes.rendering.mesh import Floats, Mesh, merge_meshes
+from crosscue.datasets.scenes.rendering.mesh import Mesh, merge_meshes
 from crosscue.datasets.scenes.rendering.scenery import (
     Shadows,
     building,
@@ -35,6 +35,7 @@ from crosscue.datasets.scenes.rendering.scenery import (
 )
 from crosscue.datasets.scenes.rendering.textures import Atlas, make_atlas
 from crosscue.datasets.scenes.rendering.weather import Daylight, daylight
+from crosscue.replay.columns import Floats
 
 from .cars import Look, any_look, car
 from .layout import NEAR_KERB_M, Layout

@@ -11,17 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from crosscue.replay.columns import ColumnSet, Floats, Int64s
 from crosscue.replay.files.tree_text import toml_document
-
-Floats: TypeAlias = NDArray[np.float64]
-Int64s: TypeAlias = NDArray[np.int64]
-
 
 WHEELBASE_M: Final = 2.7
 TRACK_WIDTH_M: Final = 1.55
@@ -68,7 +64,7 @@ class DriveSettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TrueMotion:
+class TrueMotion(ColumnSet):
     """Motion of the car's rear axle at 100 Hz.
 
     Attributes:
@@ -86,9 +82,6 @@ class TrueMotion:
     heading_rad: Floats
     speed_mps: Floats
     yaw_rate_radps: Floats
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
 
 
 def true_motion(settings: DriveSettings) -> TrueMotion:

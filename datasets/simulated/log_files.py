@@ -12,16 +12,7 @@ from crosscue.datasets.truth.truth import Mounting
 from crosscue.datasets.truth.tum import Trajectory, planar, write_track_truth
 from crosscue.replay.can.database import CanDatabase
 from crosscue.replay.can.encode import encode
-from crosscue.replay.columns import (
-    DATA,
-    Block,
-    Bytes,
-    CanFrames,
-    Floats,
-    Int64s,
-    Table,
-    Topic,
-)
+from crosscue.replay.columns import DATA, Block, Bytes, CanFrames, Floats, Int64s, Table, Topic
 from crosscue.replay.files.whole_file import write_bytes, write_text
 from crosscue.replay.ledger import Ledger
 from crosscue.replay.write.convert import LogWriter
@@ -98,10 +89,7 @@ def _can_block(sensed: Sensed, rng: np.random.Generator) -> Block:
     wheels = encode(database.named("WHEEL_SPEEDS"), dict(zip(names, kmh.T, strict=True)))
     steering = encode(
         database.named("STEERING"),
-        {
-            "WHEEL_ANGLE": np.round(np.rad2deg(sensed.steering_rad), 1),
-            "COUNTER": np.arange(n) % 16,
-        },
+        {"WHEEL_ANGLE": np.round(np.rad2deg(sensed.steering_rad), 1), "COUNTER": np.arange(n) % 16},
     )
     frames = can_frames([176, 192], [wheels, steering])
     sent = np.repeat(sensed.wheel_t_ns, 2) + np.tile(np.array([0, 250_000]), n)

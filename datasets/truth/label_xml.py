@@ -18,6 +18,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
+from crosscue.replay.columns import Floats
 from crosscue.replay.errors import AnnotationError
 from crosscue.replay.files.bounded import read_whole
 from crosscue.replay.files.whole_file import write_text
@@ -201,7 +202,7 @@ class _CvatReader(XmlReader):
             label, box, track=track, place=place, segmentation=[points.ravel().tolist()]
         )
 
-    def _points(self, found: Mapping[str, str]) -> np.typing.NDArray[np.float64]:
+    def _points(self, found: Mapping[str, str]) -> Floats:
         text = self._text(found, "points")
         try:
             pairs = [[float(value) for value in pair.split(",")] for pair in text.split(";")]

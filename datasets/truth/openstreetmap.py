@@ -30,10 +30,7 @@ KINDS: Final = frozenset(
     for name in ("motorway", "trunk", "primary", "secondary", "tertiary")
     for link in ("", "_link")
 ) | {"unclassified", "residential", "living_street", "road"}
-_CONTROLS: Final[Mapping[str, Control]] = {
-    "traffic_signals": "traffic_light",
-    "stop": "stop_sign",
-}
+_CONTROLS: Final[Mapping[str, Control]] = {"traffic_signals": "traffic_light", "stop": "stop_sign"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple, TextIO
 
 import numpy as np
 
-from crosscue.replay.columns import Floats, Int64s
+from crosscue.replay.columns import ColumnSet, Floats, Int64s
 from crosscue.replay.errors import LogError, LogFormatError, LogTooLargeError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
@@ -30,7 +30,7 @@ _LATEST_S: Final = (2**63 - 1) // 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
+class Trajectory(ColumnSet):
     """N poses of one body in one frame.
 
     Attributes:
@@ -60,9 +60,6 @@ class Trajectory:
             raise ValueError("poses: expected finite numbers, got NaN or infinity")
         if (np.abs(np.linalg.norm(self.quat_wxyz, axis=1) - 1.0) > 1e-6).any():
             raise ValueError("quat_wxyz: expected unit quaternions")
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
 
 
 def planar(t_ns: Int64s, x_m: Floats, y_m: Floats, heading_rad: Floats) -> Trajectory:
@@ -277,29 +274,20 @@ def turned_by(trajectory: Trajectory) -> TurnedBy | None:
 
 
 def mounting_in_car(
-    track: Trajectory,
-    stated: str = "position not published",
-    *,
-    x_m: float | None = None,
-    y_m: float | None = None,
-    z_m: float | None = None,
-) -> tuple[Mounting, str]:
-    """Return the mounting of a body with unknown yaw, which is estimated from its travel.
+    track: Trajectory, stated: str = "position not published", **place_m: float
+) -> dict[str, Any]:
+    """Return a body's mounting, with the yaw estimated from its travel, as fields of ``Truth``.
 
     Args:
         track: Trajectory of the body.
         stated: Published description of its position, and its source.
-        x_m: Published position; see ``Mounting``.
-        y_m: Published position.
-        z_m: Published position.
-
-    Returns:
-        The mounting, and its source.
+        place_m: Published position: ``x_m``, ``y_m``, ``z_m`` of ``Mounting``.
     """
     found = turned_by(track)
-    yaw_rad = None if found is None else round(found.yaw_rad, 5)
-    mounting = Mounting(x_m=x_m, y_m=y_m, z_m=z_m, roll_rad=None, pitch_rad=None, yaw_rad=yaw_rad)
-    if found is None:
-        return mounting, f"{stated}; yaw unknown, and the drive does not determine it"
-    degrees = math.degrees(found.sd_rad)
-    return mounting, f"{stated}; yaw by its direction of travel, +- {degrees:.2f} deg"
+    place: dict[str, float | None] = {**dict.fromkeys(Mounting.model_fields), **place_m}
+    source = f"{stated}; yaw unknown, and the drive does not determine it"
+    if found is not None:
+        place["yaw_rad"] = round(found.yaw_rad, 5)
+        degrees = math.degrees(found.sd_rad)
+        source = f"{stated}; yaw by its direction of travel, +- {degrees:.2f} deg"
+    return {"mounting": Mounting(**place), "mounting_source": source}

@@ -62,7 +62,6 @@ class CompassFit:
         coverage_deg: Coverage of headings, in steps of 10 degrees.
         residual_sd_rad: S.d. of heading minus reference: the filter's compass noise. NaN without
             a reference.
-        residual_autocorrelation: Correlation of successive residuals; NaN where undetermined.
         persists_s: Time over which the residuals' autocorrelation falls to 1/e. Twice this is a
             good ``heading_interval_s`` of the filter.
         persists_is_bound: True if the autocorrelation does not fall to 1/e; ``persists_s`` is then
@@ -77,7 +76,6 @@ class CompassFit:
     readings_used: int
     coverage_deg: int
     residual_sd_rad: float
-    residual_autocorrelation: float
     persists_s: float
     persists_is_bound: bool
     mounting_yaw_sd_rad: float
@@ -91,10 +89,7 @@ class _Shape(NamedTuple):
 
 
 def fit_compass(
-    t_ns: Int64s,
-    field_t: Floats,
-    reference_rad: Floats | None,
-    given: CompassSettings,
+    t_ns: Int64s, field_t: Floats, reference_rad: Floats | None, given: CompassSettings
 ) -> CompassFit:
     """Fit the observable parameters of hard iron, soft iron and mounting.
 
@@ -136,11 +131,7 @@ def coverage_deg(directions_rad: Floats) -> int:
 
 
 def _fit_to(
-    t_ns: Int64s,
-    field_t: Floats,
-    reference_rad: Floats,
-    given: CompassSettings,
-    readings: int,
+    t_ns: Int64s, field_t: Floats, reference_rad: Floats, given: CompassSettings, readings: int
 ) -> CompassFit:
     covered = coverage_deg(reference_rad)
     north = np.exp(1j * (math.pi / 2 - given.declination_rad - reference_rad))
@@ -161,15 +152,12 @@ def _fit_to(
         settings=fitted,
         observable=observable,
         not_observable=_missing(
-            observable,
-            _short(covered, HARD_IRON_DEG),
-            _short(covered, SOFT_IRON_DEG),
+            observable, _short(covered, HARD_IRON_DEG), _short(covered, SOFT_IRON_DEG)
         ),
         readings=readings,
         readings_used=len(t_ns),
         coverage_deg=covered,
         residual_sd_rad=sd,
-        residual_autocorrelation=lasting.next_correlation,
         persists_s=lasting.seconds,
         persists_is_bound=lasting.is_bound,
         mounting_yaw_sd_rad=sd / math.sqrt(lasting.independent),
@@ -199,7 +187,6 @@ def _fit_alone(field_t: Floats, usable: NDArray[np.bool_], given: CompassSetting
         readings_used=int(usable.sum()),
         coverage_deg=covered,
         residual_sd_rad=math.nan,
-        residual_autocorrelation=math.nan,
         persists_s=math.nan,
         persists_is_bound=False,
         mounting_yaw_sd_rad=math.nan,

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from crosscue.localization.constants import (
-    NO_CONSTANTS,
-    Constants,
-    effects,
-)
+from crosscue.localization.constants import NO_CONSTANTS, Constants, effects
 from crosscue.localization.ekf import unpack_belief
 from crosscue.localization.fixes import Fixes
 from crosscue.localization.odometry import (
@@ -25,10 +20,8 @@ from crosscue.localization.odometry import (
 )
 from crosscue.localization.pose_filter import State, arc
 from crosscue.localization.start_pose import start_pose
+from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.compiled import kept
-
-Floats: TypeAlias = NDArray[np.float64]
-Int64s: TypeAlias = NDArray[np.int64]
 
 # Maximum duration of an arc of odometry.
 STEP_S: Final = 0.2

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
+from crosscue.replay.columns import Floats
 
 
 class Sighting(NamedTuple):
@@ -23,8 +22,8 @@ class Sighting(NamedTuple):
 
     t_ns: int
     name: str
-    xy_m: NDArray[np.float64]
-    cov_m2: NDArray[np.float64]
+    xy_m: Floats
+    cov_m2: Floats
     score: float
     nis: float
     outcome: int

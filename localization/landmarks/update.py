@@ -19,12 +19,12 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.localization.angles import wrap
 from crosscue.localization.ekf import PoseBelief, pack_belief, update_point
 from crosscue.localization.pose_filter import HEADING, SPEED, at_point
 from crosscue.localization.pose_track import ACCEPTED, REJECTED
+from crosscue.replay.columns import Floats
 
 from .database import LandmarkDatabase, LandmarkPosition, Nearby
 from .features import Keypoints, Match, Matcher
@@ -173,10 +173,7 @@ class LandmarkSearch:
         return taken
 
     def _best(
-        self,
-        camera_m: NDArray[np.float64],
-        cov_m2: NDArray[np.float64],
-        describe: Callable[[], Keypoints | None],
+        self, camera_m: Floats, cov_m2: Floats, describe: Callable[[], Keypoints | None]
     ) -> Best | None:
         settings = self.settings
         candidates = self.database.near(camera_m, cov_m2, settings.sigmas, settings.max_candidates)
@@ -235,7 +232,7 @@ class LandmarkSearch:
         self._counted_m[place.name] = travelled_m
         return done.belief
 
-    def _moved(self, belief: PoseBelief, travelled_m: float, peak: _Peak) -> NDArray[np.float64]:
+    def _moved(self, belief: PoseBelief, travelled_m: float, peak: _Peak) -> Floats:
         """Displacement of the camera since the peak.
 
         It is computed from distance and heading, not from the two estimated positions, because the

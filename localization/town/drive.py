@@ -4,9 +4,8 @@ Truth and estimate are separate except in three places: sensors measure the trut
 show the roads of the next intersection relative to the vehicle, and the result compares the two at
 the end. Decisions use the estimate.
 
-All functions are plain Python on numbers and arrays. ``simulate_town_drive`` runs them uncompiled,
-for example in a debugger; ``drive_many`` compiles the same functions and is thousands of times as
-fast.
+All functions are plain Python on numbers and arrays, which run uncompiled in a debugger, too;
+``drive_many`` compiles them, which makes them thousands of times as fast.
 """
 
 from __future__ import annotations
@@ -42,6 +41,7 @@ from crosscue.localization.pose_filter import (
     update_position,
     update_state,
 )
+from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.compiled import kept
 
 from . import settings as settings_of
@@ -82,7 +82,6 @@ from .vehicle import (
 )
 
 Keys = NDArray[np.uint64]
-Ints = NDArray[np.int64]
 
 CITY_STREAM: Final = np.uint64(1)
 PLACE_STREAM: Final = np.uint64(2)
@@ -176,8 +175,8 @@ class LandmarkArray(NamedTuple):
         is_visited: Shape (L,).
     """
 
-    nodes: Ints
-    places_m: NDArray[np.float64]
+    nodes: Int64s
+    places_m: Floats
     is_visited: NDArray[np.bool_]
 
 
@@ -200,12 +199,12 @@ class DriveRecord(NamedTuple):
         noted: Shape (1,): number of events so far.
     """
 
-    steps: NDArray[np.float64]
-    events: NDArray[np.float64]
-    noted: Ints
+    steps: Floats
+    events: Floats
+    noted: Int64s
 
 
-def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: DriveRecord) -> None:
+def drive_one(p: Parameters, seed: np.uint64, row: Floats, log: DriveRecord) -> None:
     """Simulate one drive.
 
     Args:
@@ -282,7 +281,7 @@ def drive_one(p: Parameters, seed: np.uint64, row: NDArray[np.float64], log: Dri
     _finish(p, row, vehicle, belief, last_fix_m, steps)
 
 
-def drive_each(p: Parameters, seeds: Keys, rows: NDArray[np.float64], log: DriveRecord) -> None:
+def drive_each(p: Parameters, seeds: Keys, rows: Floats, log: DriveRecord) -> None:
     """Run ``drive_one`` for each of N seeds; rows have shape (N, 22)."""
     for i in range(len(seeds)):
         drive_one(p, seeds[i], rows[i], log)
@@ -325,7 +324,7 @@ def _start(p: Parameters, streets: Streets, places: RandomStream) -> tuple[int, 
 
 def _one_landmark(
     p: Parameters, streets: Streets, places: RandomStream
-) -> tuple[Ints, RandomStream]:
+) -> tuple[Int64s, RandomStream]:
     """Draw at most one landmark, with the requested density on average."""
     number, places = uniform(places)
     nodes = np.empty(1 if number < p.landmarks_per_km2 * streets.area_km2 else 0, np.int64)
@@ -334,7 +333,7 @@ def _one_landmark(
     return nodes, places
 
 
-def _landmarks(streets: Streets, nodes: Ints) -> LandmarkArray:
+def _landmarks(streets: Streets, nodes: Int64s) -> LandmarkArray:
     places_m = np.empty((len(nodes), 2))
     for i in range(len(nodes)):
         places_m[i, 0], places_m[i, 1] = node_position(streets, nodes[i])
@@ -392,12 +391,7 @@ def _is_at_goal(
 
 
 def _arrived(
-    row: NDArray[np.float64],
-    streets: Streets,
-    targets: Targets,
-    vehicle: TownVehicle,
-    start: int,
-    axis_m: float,
+    row: Floats, streets: Streets, targets: Targets, vehicle: TownVehicle, start: int, axis_m: float
 ) -> None:
     x, y = node_position(streets, targets.goal)
     start_x, start_y = node_position(streets, start)
@@ -493,7 +487,7 @@ def _landmark_fix(
 
 
 def _describe_start(
-    row: NDArray[np.float64], streets: Streets, targets: Targets, goal_dx: float, goal_dy: float
+    row: Floats, streets: Streets, targets: Targets, goal_dx: float, goal_dy: float
 ) -> None:
     row[STRAIGHT_LINE] = math.hypot(goal_dx, goal_dy)
     row[MANHATTAN] = abs(goal_dx) + abs(goal_dy)
@@ -501,12 +495,7 @@ def _describe_start(
 
 
 def _finish(
-    p: Parameters,
-    row: NDArray[np.float64],
-    vehicle: TownVehicle,
-    belief: State,
-    last_fix_m: float,
-    steps: int,
+    p: Parameters, row: Floats, vehicle: TownVehicle, belief: State, last_fix_m: float, steps: int
 ) -> None:
     """Write the rest of the drive's ``DriveResult``."""
     axis_m = major_axis_m(belief.xx, belief.xy, belief.yy)
@@ -519,7 +508,7 @@ def _finish(
     row[LONGEST_GAP] = max(row[LONGEST_GAP], vehicle.travelled_m - last_fix_m)
 
 
-def _keep(kept: NDArray[np.float64], vehicle: TownVehicle, reading: Reading, belief: State) -> None:
+def _keep(kept: Floats, vehicle: TownVehicle, reading: Reading, belief: State) -> None:
     b = belief
     kept[0], kept[1], kept[2] = vehicle.x_m, vehicle.y_m, vehicle.heading_rad
     kept[3] = vehicle.speed_mps
@@ -556,17 +545,7 @@ def no_log() -> DriveRecord:
     )
 
 
-def simulate_town_drive(
-    settings: settings_of.TownDrive, seed: int, log: DriveRecord | None = None
-) -> DriveResult:
-    """Simulate one drive without compilation; slower, with the same result."""
-    row = np.empty(FIELDS)
-    with np.errstate(over="ignore"):
-        drive_one(parameters_of(settings), np.uint64(seed), row, no_log() if log is None else log)
-    return as_result(row)
-
-
-def drive_many(settings: settings_of.TownDrive, seeds: Keys) -> NDArray[np.float64]:
+def drive_many(settings: settings_of.TownDrive, seeds: Keys) -> Floats:
     """Simulate one drive per seed; the interpreter's lock is released meanwhile.
 
     Args:
@@ -602,20 +581,20 @@ class Traced:
     """A simulated drive with all its steps.
 
     Attributes:
-        result: Result of ``simulate_town_drive``.
+        result: Result of the drive.
         steps: Shape (S, 16), as in ``DriveRecord``.
         events: Shape (E, 6), as in ``DriveRecord``.
         first_belief: x, y, heading of the filter before the first step.
     """
 
     result: DriveResult
-    steps: NDArray[np.float64]
-    events: NDArray[np.float64]
+    steps: Floats
+    events: Floats
     first_belief: tuple[float, float, float]
 
-    def of_kind(self, *kinds: int) -> NDArray[np.float64]:
+    def of_kind(self, *kinds: int) -> Floats:
         """Select the events of these kinds, shape (K, 6)."""
-        chosen: NDArray[np.float64] = self.events[np.isin(self.events[:, 1], kinds)]
+        chosen: Floats = self.events[np.isin(self.events[:, 1], kinds)]
         return chosen
 
     def goal_to_goal_m(self) -> float:
@@ -645,7 +624,7 @@ def drive_traced(settings: settings_of.TownDrive, seed: int) -> Traced:
     return Traced(result, log.steps, log.events[: log.noted[0]], (x, y, heading))
 
 
-def as_result(row: NDArray[np.float64]) -> DriveResult:
+def as_result(row: Floats) -> DriveResult:
     """Convert a row to a ``DriveResult`` with integer counts."""
     kinds = get_type_hints(DriveResult)
     pairs = zip(DriveResult._fields, row.tolist(), strict=True)

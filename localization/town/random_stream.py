@@ -16,7 +16,8 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats
 
 GOLDEN: Final = np.uint64(0x9E3779B97F4A7C15)
 MIX_1: Final = np.uint64(0xBF58476D1CE4E5B9)
@@ -111,7 +112,7 @@ def _tail(stream: RandomStream) -> tuple[float, RandomStream]:
             return TAIL_FROM - x, stream
 
 
-def _layers() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _layers() -> tuple[Floats, Floats]:
     """Right edges of the layers, shape (257,), and the fraction of each inside the next, (256,).
 
     All layers have the same area; the first one includes the tail.

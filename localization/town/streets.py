@@ -14,6 +14,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.columns import Floats, Int64s
+
 from .random_stream import RandomStream, below, uniform
 from .settings import Parameters
 
@@ -38,8 +40,8 @@ class Streets(NamedTuple):
         area_km2: Requested area; the grid ends within a block of it.
     """
 
-    xs_m: NDArray[np.float64]
-    ys_m: NDArray[np.float64]
+    xs_m: Floats
+    ys_m: Floats
     ways: NDArray[np.uint8]
     inside: NDArray[np.bool_]
     area_km2: float
@@ -90,9 +92,7 @@ def make_streets(stream: RandomStream, p: Parameters) -> Streets:
     return Streets(xs, ys, ways, inside, area_km2)
 
 
-def _coordinates(
-    stream: RandomStream, side_m: float, p: Parameters
-) -> tuple[NDArray[np.float64], RandomStream]:
+def _coordinates(stream: RandomStream, side_m: float, p: Parameters) -> tuple[Floats, RandomStream]:
     span = p.max_block_m - p.min_block_m
     places = np.empty(3 + int(side_m / p.min_block_m))
     places[0], count = 0.0, 1
@@ -266,7 +266,7 @@ def draw_goal(
 
 def draw_landmarks(
     stream: RandomStream, streets: Streets, per_km2: float
-) -> tuple[NDArray[np.int64], RandomStream]:
+) -> tuple[Int64s, RandomStream]:
     """Draw distinct intersections with a landmark, in random order."""
     number, stream = uniform(stream)
     wanted = min(int(per_km2 * streets.area_km2 + number), streets.inside.sum())

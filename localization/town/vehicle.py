@@ -8,11 +8,9 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from crosscue.localization.angles import wrap
 from crosscue.localization.pose_filter import arc
+from crosscue.replay.columns import Floats
 
 from .random_stream import RandomStream, normal
 from .settings import Parameters
@@ -188,7 +186,7 @@ def wanted_mps(p: Parameters, streets: Streets, route: Route, vehicle: TownVehic
 
 
 def lane_of(
-    p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.float64], vehicle: TownVehicle
+    p: Parameters, streets: Streets, route: Route, arcs: Floats, vehicle: TownVehicle
 ) -> Lane:
     """Position of the vehicle relative to its lane."""
     c, s = math.cos(vehicle.heading_rad), math.sin(vehicle.heading_rad)
@@ -216,7 +214,7 @@ def advance_turn(route: Route, lane: Lane, distance_m: float) -> Route:
     return Route(route.way, route.node, route.turn, route.arc, route.arcs, along_m)
 
 
-def next_arc(route: Route, arcs: NDArray[np.float64]) -> Route:
+def next_arc(route: Route, arcs: Floats) -> Route:
     """Change to the next arc or the street at the end of an arc."""
     length_m = arcs[route.arc, 4]
     if route.along_m < length_m:
@@ -226,7 +224,7 @@ def next_arc(route: Route, arcs: NDArray[np.float64]) -> Route:
     return Route(route.way, route.node, route.turn, route.arc + 1, route.arcs, along_m)
 
 
-def enter(p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.float64]) -> Route:
+def enter(p: Parameters, streets: Streets, route: Route, arcs: Floats) -> Route:
     """Write the arcs of the decided turn to ``arcs``, and set the next intersection."""
     count = _lay_turn(p, streets, route, arcs)
     way = (route.way + route.turn) & 3
@@ -234,7 +232,7 @@ def enter(p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.float6
     return Route(way, node, UNDECIDED, 0, count, 0.0)
 
 
-def _lay_turn(p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.float64]) -> int:
+def _lay_turn(p: Parameters, streets: Streets, route: Route, arcs: Floats) -> int:
     if route.turn == STRAIGHT:
         return 0
     c, s, heading = COSINES[route.way], SINES[route.way], HEADINGS_RAD[route.way]
@@ -249,12 +247,7 @@ def _lay_turn(p: Parameters, streets: Streets, route: Route, arcs: NDArray[np.fl
 
 
 def _lay_turning_circle(
-    arcs: NDArray[np.float64],
-    x_m: float,
-    y_m: float,
-    heading_rad: float,
-    radius_m: float,
-    offset_m: float,
+    arcs: Floats, x_m: float, y_m: float, heading_rad: float, radius_m: float, offset_m: float
 ) -> int:
     """Write the arcs of a U-turn: a swing to the right, a left turn, and back into the lane."""
     swing = math.acos((offset_m + radius_m) / (2.0 * radius_m))
@@ -269,12 +262,6 @@ def _lay_turning_circle(
 
 
 def _lay(
-    arcs: NDArray[np.float64],
-    i: int,
-    x: float,
-    y: float,
-    heading: float,
-    curvature: float,
-    length: float,
+    arcs: Floats, i: int, x: float, y: float, heading: float, curvature: float, length: float
 ) -> None:
     arcs[i, 0], arcs[i, 1], arcs[i, 2], arcs[i, 3], arcs[i, 4] = x, y, heading, curvature, length

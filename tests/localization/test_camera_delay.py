@@ -1,5 +1,7 @@
 """Delay of pictures against signals of a car, on motions that are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -50,7 +52,7 @@ def test_drift_of_a_long_drive_is_found() -> None:
     edge_s = [column * 1e-9 - late_s for column in (seen.start_ns, seen.t_ns)]
     angle = [-0.2 / 0.9 * np.cos(0.9 * one) for one in edge_s]
 
-    found = delay_by_yaw_rate(seen._replace(turn_rad=angle[1] - angle[0]), t_ns, rate)
+    found = delay_by_yaw_rate(replace(seen, turn_rad=angle[1] - angle[0]), t_ns, rate)
 
     assert found.drift_ppm == pytest.approx(400.0, rel=0.2)
     assert found.delay_s == pytest.approx(0.05, abs=0.005)
@@ -58,7 +60,8 @@ def test_drift_of_a_long_drive_is_found() -> None:
 
 def test_straight_and_steady_drive_determines_nothing() -> None:
     seen = pictures(5, 0.1)
-    steady = seen._replace(
+    steady = replace(
+        seen,
         turn_rad=np.radians(0.01) * np.random.default_rng(5).normal(size=len(seen.t_ns)),
         is_standing=np.zeros(len(seen.t_ns), np.bool_),
     )
@@ -106,7 +109,7 @@ def test_errors_that_last_widen_the_interval() -> None:
     sds = []
     for noise in (white[9:], slow):
         turned = exact.turn_rad + np.radians(0.01) * noise
-        sds.append(delay_by_yaw_rate(exact._replace(turn_rad=turned), *yaw_rate(11)).sd_s)
+        sds.append(delay_by_yaw_rate(replace(exact, turn_rad=turned), *yaw_rate(11)).sd_s)
 
     assert sds[1] > 2.0 * sds[0]
 
@@ -128,7 +131,7 @@ def test_vibrations_of_a_straight_drive_are_no_turn() -> None:
     """As on PandaSet, where the pictures show 0.03 degrees a frame and nothing slower."""
     rng = np.random.default_rng(9)
     shaken = np.cumsum(np.radians(0.03) * rng.normal(size=len(pictures(9, 0.0).t_ns)))
-    seen = pictures(9, 0.1)._replace(turn_rad=np.diff(shaken, prepend=0.0))
+    seen = replace(pictures(9, 0.1), turn_rad=np.diff(shaken, prepend=0.0))
     edges_ns = np.concatenate([seen.start_ns[:1], seen.t_ns]) - 100_000_000
     rate = np.gradient(np.concatenate([[0.0], shaken]), edges_ns * 1e-9)
 

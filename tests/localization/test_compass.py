@@ -122,7 +122,7 @@ def test_residual_sd_of_the_fit_matches_the_noise() -> None:
     fit = fit_compass(times(3000), noisy, truth, without_calibration(IRON))
 
     assert math.degrees(fit.residual_sd_rad) == pytest.approx(1.25, rel=0.15)
-    assert abs(fit.residual_autocorrelation) < 0.1
+    assert fit.persists_s < 0.1
     check_correct(fit, 0.4)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from crosscue.datasets.scenes.faulty_labels import LABELS, DetectorFaults, Sight
 from crosscue.datasets.truth.truth import Truth
 from crosscue.detectors.base import Detections
 from crosscue.eval.scoring.truth import cue_at
@@ -21,6 +22,21 @@ KINDS = {
     "outgoing": "car ahead",
     "parked_past": "car parked past the intersection",
 }
+# Faultless detector: exact masks of all objects that are visible by at least two thirds.
+NO_FAULTS = DetectorFaults(
+    sights=dict.fromkeys(LABELS, Sight(1.0, 1e-3)),
+    height_sd_fraction=0.0,
+    false_things={},
+    false_per_frame=0.0,
+    turned_around=0.0,
+    road_half_m=1e6,
+    ahead_half_m=1e6,
+    road_best=1.0,
+    lot_as_road=0.0,
+    driveway_as_road=0.0,
+    false_road=0.0,
+    false_roads=0.0,
+)
 
 
 def true_cars(drive: Path) -> dict[int, list[dict[str, Any]]]:

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.datasets.scenes.motion import ApproachMotion
+from crosscue.replay.columns import Floats
 
 from .ground import TEXELS_PER_M, X_M, Y_M
-from .mesh import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,34 +97,17 @@ def view_at(camera: SceneCamera, approach: ApproachMotion, t_s: float) -> Camera
     nod = -0.0045 * float(after - before) / 0.3
     shake = 0.0011 * min(speed / 8.0, 1.0)
     nod += shake * (np.sin(9.1 * t_s) + 0.7 * np.sin(23.7 * t_s + 1.0))
-    return _view(camera, (x, y, heading), camera.pitch_rad + nod, speed, rate)
-
-
-def _view(
-    camera: SceneCamera,
-    rear_axle: tuple[float, float, float],
-    pitch: float,
-    speed: float,
-    rate: float,
-) -> CameraView:
-    x, y, heading = rear_axle
+    pitch = camera.pitch_rad + nod
     c, s = np.cos(heading), np.sin(heading)
     ahead = np.array([c * np.cos(pitch), s * np.cos(pitch), -np.sin(pitch)])
     right = np.array([s, -c, 0.0])
     down = np.cross(ahead, right)
-    at = np.array([x + camera.x_m * c, y + camera.x_m * s, camera.z_m])
-    return CameraView(camera, np.stack([right, down, ahead]), at, rear_axle, speed, rate)
+    at_m = np.array([x + camera.x_m * c, y + camera.x_m * s, camera.z_m])
+    return CameraView(camera, np.stack([right, down, ahead]), at_m, (x, y, heading), speed, rate)
 
 
 # Vertical component of a ray above which it does not meet the ground.
 SKY_UP = -0.002
-
-
-def road_seen(
-    road: NDArray[np.uint8], depth: NDArray[np.float32], samples: int, view: CameraView
-) -> NDArray[np.bool_]:
-    """Return a mask of road pixels, shape (H, W); ``road`` is ``Ground.road``, 0 or 1."""
-    return np.asarray(ground_seen(road, depth, samples, view) > 0)
 
 
 def ground_seen(
@@ -165,15 +148,15 @@ def ground_seen(
     return seen
 
 
-def _rays(view: CameraView) -> NDArray[np.float64]:
+def _rays(view: CameraView) -> Floats:
     """Return the matrix from a pixel's (column, row, 1) to its ray in the local frame, (3, 3)."""
     f, (cx, cy) = view.camera.focal, view.camera.centre_px
     lens = np.array([[1 / f, 0.0, (0.5 - cx) / f], [0.0, 1 / f, (0.5 - cy) / f], [0.0, 0.0, 1.0]])
-    ray: NDArray[np.float64] = view.eye_axes.T @ lens
+    ray: Floats = view.eye_axes.T @ lens
     return ray
 
 
-def _falls(ray: NDArray[np.float64], wide: int, high: int) -> NDArray[np.bool_]:
+def _falls(ray: Floats, wide: int, high: int) -> NDArray[np.bool_]:
     column, row = np.arange(wide, dtype=np.float32), np.arange(high, dtype=np.float32)[:, None]
     x, y, z = (k[0] * column + k[1] * row + k[2] for k in ray.astype(np.float32))
     falls: NDArray[np.bool_] = (z < 0.0) & (z * z > SKY_UP**2 * (x * x + y * y + z * z))

@@ -11,8 +11,8 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from crosscue.datasets.scenes.layout import NEAR_KERB_M, PARKING_LANE_M, Layout
+from crosscue.replay.columns import Floats, Int64s
 
-from .mesh import Floats
 from .textures import smooth_noise
 
 X_M: Final = (-112.0, 112.0)
@@ -56,7 +56,7 @@ class Ground:
     """
 
     texels: Map
-    levels: NDArray[np.int64]
+    levels: Int64s
     road: NDArray[np.bool_]
 
 

@@ -260,13 +260,7 @@ def _columns(
 
 
 def cover(
-    corners: Float32s,
-    shift: Float32s,
-    eye: Eye,
-    lens: Lens,
-    covered: Bytes,
-    left: int,
-    top: int,
+    corners: Float32s, shift: Float32s, eye: Eye, lens: Lens, covered: Bytes, left: int, top: int
 ) -> int:
     """Mark the samples that triangles cover, ignoring occlusion, and return their number.
 

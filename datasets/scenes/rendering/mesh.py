@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.columns import ColumnSet, Floats
+
 Float32s = NDArray[np.float32]
-Floats = NDArray[np.float64]
 Rgb = tuple[float, float, float]
 
 NOBODY = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mesh:
+class Mesh(ColumnSet):
     """T triangles.
 
     Attributes:
@@ -34,9 +35,6 @@ class Mesh:
     albedo: Float32s
     glow: Float32s
     instance: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        return len(self.texture)
 
     def owned_by(self, instance: int) -> Mesh:
         """Return the triangles with the number of an object."""
@@ -81,14 +79,8 @@ def merge_meshes(parts: Sequence[Mesh]) -> Mesh:
     """Return one mesh with the triangles of all parts."""
     if not parts:
         return nothing()
-    return Mesh(
-        np.concatenate([p.corners for p in parts]),
-        np.concatenate([p.uv for p in parts]),
-        np.concatenate([p.texture for p in parts]),
-        np.concatenate([p.albedo for p in parts]),
-        np.concatenate([p.glow for p in parts]),
-        np.concatenate([p.instance for p in parts]),
-    )
+    names = (column.name for column in fields(Mesh))
+    return Mesh(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def triangles(
@@ -156,12 +148,7 @@ def box(
         ([(x0, y1), (x0, y0)], along_y),
     ]
     parts = [
-        quad(
-            [(*a, z0), (*b, z0), (*b, z1), (*a, z1)],
-            rgb,
-            repeat=(times, high),
-            texture=texture,
-        )
+        quad([(*a, z0), (*b, z0), (*b, z1), (*a, z1)], rgb, repeat=(times, high), texture=texture)
         for (a, b), times in sides
     ]
     parts.append(quad([(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)], rgb))

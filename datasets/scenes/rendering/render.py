@@ -8,13 +8,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.datasets.scenes.rendering.camera import ground_seen, road_seen
+from crosscue.datasets.scenes.rendering.camera import ground_seen
 from crosscue.datasets.scenes.world import SceneObject, World
+from crosscue.replay.columns import Floats
 
 from .camera import CameraView, SceneCamera, view_at
 from .ground import TEXELS_PER_M, X_M, Y_M
 from .kernels import Buffers, Eye, Haze, Lens, Textures, compile_kernels
-from .mesh import Floats, Mesh
+from .mesh import Mesh
 from .textures import smooth_noise
 
 # Max distance from the picture, in picture sizes, at which an object's outline is measured.
@@ -72,7 +73,7 @@ class RenderedFrame:
         view: View of the camera.
         owner: Number of each pixel's object, -1 without object, shape (H, W), int16.
         seen: All labelled objects with at least one pixel.
-        road: Mask of road as in ``road_truth``, shape (H, W), bool; None if not requested.
+        road: Mask of road, shape (H, W), bool; None if not requested.
     """
 
     t_s: float
@@ -126,7 +127,7 @@ class Renderer:
         road = None
         if with_road:
             on_map = self.world.ground.road.view(np.uint8)
-            road = road_seen(on_map, self._buffers.depth, self.settings.samples, view)
+            road = ground_seen(on_map, self._buffers.depth, self.settings.samples, view) > 0
         return RenderedFrame(t_s, rgb, view, owner, self._seen(owner, view, t_s), road)
 
     def owners(

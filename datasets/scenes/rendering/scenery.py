@@ -8,7 +8,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.random import Generator
 
-from .mesh import Floats, Mesh, Rgb, box, disc, merge_meshes, quad, triangles, tube
+from crosscue.replay.columns import Floats
+
+from .mesh import Mesh, Rgb, box, disc, merge_meshes, quad, triangles, tube
 from .textures import FRONT_M, WIDTH_M, Atlas
 
 STEEL: Rgb = (0.52, 0.53, 0.54)

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from crosscue.replay.columns import Floats, Int64s
+
 Rgba = NDArray[np.uint8]
 
 WIDTH_M: Final[Mapping[str, float]] = {
@@ -51,7 +53,7 @@ class Atlas:
 
     number: dict[str, int] = field(default_factory=dict)
     _texels: list[Rgba] = field(default_factory=list)
-    _places: list[NDArray[np.int64]] = field(default_factory=list)
+    _places: list[Int64s] = field(default_factory=list)
     _used: int = 0
 
     def add(self, name: str, rgba: Rgba) -> int:
@@ -72,7 +74,7 @@ class Atlas:
         self._places.append(place)
         return self.number[name]
 
-    def packed(self) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    def packed(self) -> tuple[NDArray[np.uint8], Int64s]:
         """Return all texels (N, 4) and places (K, LEVELS, 3): offset, width, height."""
         return np.concatenate(self._texels), np.stack(self._places)
 
@@ -92,7 +94,7 @@ def make_atlas(rng: Generator) -> Atlas:
     return atlas
 
 
-def smooth_noise(rng: Generator, size: int, cells: int) -> NDArray[np.float64]:
+def smooth_noise(rng: Generator, size: int, cells: int) -> Floats:
     """Return tileable noise in [0, 1], shape (size, size), with about ``cells`` blobs per side."""
     import cv2
 

@@ -10,8 +10,9 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from crosscue.datasets.scenes.motion import Conditions, Light
+from crosscue.replay.columns import Floats
 
-from .mesh import Floats, Mesh, Rgb
+from .mesh import Mesh, Rgb
 from .textures import smooth_noise
 
 SKY_HIGH, SKY_WIDE = 128, 1024

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from crosscue.datasets.scenes.faulty_labels import LABELS, NO_FAULTS, FaultyLabels
+from crosscue.datasets.scenes.faulty_labels import LABELS, FaultyLabels
 from crosscue.datasets.scenes.layout import CURVE_SLOPE, KINDS, mixed_layout
 from crosscue.datasets.scenes.motion import conditions_of, lane_y_m
 from crosscue.datasets.scenes.rendering.camera import SceneCamera, view_at
@@ -19,6 +19,7 @@ from crosscue.detectors.base import Detections, Frame, RoadMask
 from crosscue.detectors.label_images import objects, road
 from crosscue.detectors.ranging.height_to_range import range_of
 from crosscue.replay.vehicle.vehicle import Vehicle, parse
+from support.perfect_boxes import NO_FAULTS
 from support.scenes import SMALL, mirrored, picture_at, renderer, when_at, world
 
 

@@ -1,10 +1,7 @@
 """Annotate PandaSet's sequence 002: truth of an approach from its boxes, its poses and by eye.
 
-    python -m crosscue.datasets.real.annotate_pandaset SEQUENCE [FOLDER]
-
-writes ``truth.json`` and ``ranges.csv`` to the folder of this file, or to FOLDER. SEQUENCE is the
-folder of the sequence with its 3-D boxes in ``annotations/cuboids.parquet``, one row for each box
-in each frame (the data set publishes them as pickles, which are not read here).
+``python benchmarks/annotate_pandaset.py SEQUENCE [FOLDER]`` writes ``truth.json`` and
+``ranges.csv`` to FOLDER, or to the package. SEQUENCE has its 3-D boxes as for ``label_pandaset``.
 
 Annotated from the boxes: moving cars across the ego road, cars parked across it, vehicles past the
 far kerb, and oncoming and outgoing vehicles among them. Visibility is the fraction of the most
@@ -26,15 +23,15 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.datasets.adapters.pandaset import FRONT, PandasetPoses, read_pandaset_poses
-from crosscue.datasets.adapters.published import json_of
+from crosscue.datasets.adapters.pandaset import PandasetPoses, read_pandaset_poses
+from crosscue.datasets.real import recordings
+from crosscue.datasets.real.label_pandaset import corners_m, intrinsics_of, middles_m, read_boxes
 from crosscue.datasets.truth.truth import Approach, CueTruth, Features, Truth, save
 from crosscue.replay.columns import Floats
-from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.vehicle.vehicle import load
 
-FOLDER: Final = Path(__file__).parent / "pandaset_002"
+FOLDER: Final = recordings.FOLDER / "pandaset_002"
 RANGES: Final = "ranges.csv"
 # Distance along the road from the camera in the first frame to the crosswalk's near edge.
 CROSSWALK_M: Final = 59.0
@@ -216,44 +213,6 @@ def _ranges(poses: PandasetPoses, gone_m: Floats, camera_x_m: float) -> str:
     return text.getvalue()
 
 
-def read_boxes(sequence: Path) -> dict[str, Any]:
-    """Read the columns of a sequence's 3-D boxes.
-
-    Raises:
-        LogFormatError: There is no table of boxes.
-    """
-    import pyarrow.parquet as pq
-
-    path = sequence / "annotations" / "cuboids.parquet"
-    if not path.exists():
-        raise LogFormatError(
-            f"{path}: missing; the boxes are published as pickles, which are not read; "
-            "docs/reference/formats.md describes how to convert them to this table"
-        )
-    table = pq.read_table(path)
-    numbers = ("frame", "x_m", "y_m", "z_m", "yaw_rad", "width_m", "length_m", "height_m")
-    texts = {name: np.array(table[name].to_pylist()) for name in ("label", "motion")}
-    return {name: table[name].to_numpy() for name in numbers} | texts
-
-
-def corners_m(boxes: dict[str, Any], poses: PandasetPoses) -> Floats:
-    """Return the corners of N boxes ahead, left and up of the camera, shape (N, 8, 3)."""
-    frame = boxes["frame"]
-    forward, left = poses.forward[frame], poses.left[frame]
-    axes = np.stack([forward, left, np.cross(forward, left)], axis=1)
-    unit = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    own = unit * np.stack([boxes[f"{of}_m"] for of in ("width", "length", "height")], 1)[:, None]
-    cos, sin = np.cos(boxes["yaw_rad"])[:, None], np.sin(boxes["yaw_rad"])[:, None]
-    turned = [own[..., 0] * cos - own[..., 1] * sin, own[..., 0] * sin + own[..., 1] * cos]
-    corners = np.stack([*turned, own[..., 2]], axis=2) + _middles_m(boxes, poses)[:, None]
-    return np.asarray(corners @ np.swapaxes(axes, 1, 2))
-
-
-def _middles_m(boxes: dict[str, Any], poses: PandasetPoses) -> Floats:
-    middles = np.stack([boxes["x_m"], boxes["y_m"], boxes["z_m"]], 1)
-    return np.asarray(middles - poses.xyz_m[boxes["frame"]])
-
-
 def _projected(
     boxes: dict[str, Any], poses: PandasetPoses, intrinsics: tuple[float, float, float, float]
 ) -> tuple[Floats, Floats]:
@@ -264,7 +223,7 @@ def _projected(
     x, y = center_x - focal * leftwards / depth, center_y - focal * up / depth
     outlines = np.stack([x.min(1), y.min(1), x.max(1), y.max(1)], axis=1)
     forward = poses.forward[boxes["frame"]]
-    return outlines, np.asarray((_middles_m(boxes, poses) * forward).sum(axis=1))
+    return outlines, np.asarray((middles_m(boxes, poses) * forward).sum(axis=1))
 
 
 def _visible(frame: NDArray[np.int64], boxes_px: Floats, depth_m: Floats) -> Floats:
@@ -279,12 +238,6 @@ def _visible(frame: NDArray[np.int64], boxes_px: Floats, depth_m: Floats) -> Flo
             covered |= (x >= near[0]) & (x <= near[2]) & (y >= near[1]) & (y <= near[3])
         found[i] = 1.0 - covered.mean()
     return found
-
-
-def intrinsics_of(sequence: Path) -> tuple[float, float, float, float]:
-    """Return both focal lengths, and column and row of the optical axis."""
-    found = json_of(sequence / "camera" / FRONT / "intrinsics.json")
-    return float(found["fx"]), float(found["fy"]), float(found["cx"]), float(found["cy"])
 
 
 if __name__ == "__main__":
