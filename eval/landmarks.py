@@ -6,6 +6,7 @@ import heapq
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, TypeAlias
@@ -16,7 +17,7 @@ from crosscue.eval.fit.landmarks.database import (
     add_from_log,
     metres,
     near_of,
-    pictures_with,
+    place_at,
     read_poses,
 )
 from crosscue.eval.logs.log import DriveIfGiven, opened
@@ -215,15 +216,14 @@ def add_landmarks(
         known = read_poses(Path(poses), car)
         with opened(log) as drive:
             name = visible(source or drive.logs[0].path.resolve().stem)
-
-            def add(writer: LandmarkWriter) -> tuple[AddCounts, bool]:
-                with pictures_with(known, drive, car) as pictures:
-                    counts = add_from_log(
-                        writer, describing, pictures, settings.every_m, settings.sd_m, name
-                    )
-                return counts, all(ledger.is_whole for ledger in pictures.ledgers)
-
-            return _added(Path(database), describing, add)
+            place = partial(place_at, poses=known, sd_m=settings.sd_m, source=name)
+            return _added(
+                Path(database),
+                describing,
+                lambda writer: add_from_log(
+                    writer, describing, drive, car, place, settings.every_m
+                ),
+            )
     if log is None and poses is None and images is not None and coordinates is not None:
         describing, folder = matcher_for(car), Path(images)
         table, name = Path(coordinates), visible(source or folder.resolve().name)

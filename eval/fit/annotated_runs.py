@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,14 +200,6 @@ def _near(run: RunFolder, t_ns: Int64s, vehicle: Vehicle) -> NDArray[np.bool_]:
     return np.asarray(best <= vehicle.fusion.dissent_within_m)
 
 
-class _Moves(NamedTuple):
-    """Motion since the previous frame, shape (N,) each; zero for the first frame."""
-
-    way_m: NDArray[np.float64]
-    var_m2: NDArray[np.float64]
-    passed_s: NDArray[np.float64]
-
-
 def annotated_drives(
     run: RunFolder,
     truth: DriveTruth,
@@ -235,16 +227,19 @@ def annotated_drives(
     t_ns = np.asarray(run.table("frames", ["t_ns"])["t_ns"], np.int64)
     moves = _moves(run, t_ns)
     counts = _counts_at(tables["cues"], t_ns)
-    ranges = _ranges(tables["range"], t_ns, moves.way_m, vehicle)
+    ranges = _ranges(tables["range"], t_ns, moves[0], vehicle)
     start_m = truth.start_m(t_ns)
     for kept, features, at in _parts(truth.truth, t_ns):
         rows = np.flatnonzero(kept)
         if not len(rows):
             continue
+        since_first = moves[:, rows]
+        since_first[:, 0] = 0.0
+        way_m, var_m2, seconds = since_first
         yield AnnotatedDrive(
-            _from_first(moves.way_m[rows]),
-            _from_first(moves.var_m2[rows]),
-            _from_first(moves.passed_s[rows]),
+            way_m,
+            var_m2,
+            seconds,
             start_m[rows] if features["intersection"] else np.full(len(rows), np.nan),
             {cue: column[rows] for cue, column in counts.items()},
             tuple(ranges[i] for i in rows.tolist()),
@@ -253,16 +248,7 @@ def annotated_drives(
         )
 
 
-def _from_first(column: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a column of differences with 0 for the first row of a part."""
-    out = column.copy()
-    out[0] = 0.0
-    return out
-
-
-def _parts(
-    truth: Truth, t_ns: NDArray[np.int64]
-) -> Iterator[tuple[NDArray[np.bool_], dict[str, bool], int]]:
+def _parts(truth: Truth, t_ns: Int64s) -> Iterator[tuple[NDArray[np.bool_], dict[str, bool], int]]:
     """Yield the frames of each part, its true features, and the id of the approach or ``NONE``."""
     ahead = np.zeros(len(t_ns), np.bool_)
     for one in truth.approaches:
@@ -273,27 +259,23 @@ def _parts(
         }
         yield kept, {"intersection": True, **known}, one.id
     rest = ~ahead & (t_ns >= truth.start_ns) & (t_ns < truth.end_ns)
-    begins = np.flatnonzero(np.diff(rest.astype(np.int8), prepend=0) == 1)
-    for begin in begins.tolist():
-        gaps = np.flatnonzero(~rest[begin:])
-        end = begin + int(gaps[0]) if len(gaps) else len(rest)
+    edges = np.flatnonzero(np.diff(rest.astype(np.int8), prepend=0, append=0))
+    for begin, end in edges.reshape(-1, 2).tolist():
         kept = np.zeros(len(rest), np.bool_)
         kept[begin:end] = True
         yield kept, dict(NOTHING_THERE), NONE
 
 
-def _moves(run: RunFolder, t_ns: NDArray[np.int64]) -> _Moves:
+def _moves(run: RunFolder, t_ns: Int64s) -> Floats:
+    """Return distance, its variance, and time since the previous frame, shape (3, N)."""
     odometer = odometer_of(run)
-    ways = [odometer.until(now) for now in t_ns.tolist()]
-    return _Moves(
-        np.array([way.distance_m for way in ways], np.float64),
-        np.array([way.var_m2 for way in ways], np.float64),
-        np.diff(t_ns, prepend=t_ns[:1]) * 1e-9,
-    )
+    steps = [odometer.until(now) for now in t_ns.tolist()]
+    columns = [step.distance_m for step in steps], [step.var_m2 for step in steps]
+    return np.array([*columns, np.diff(t_ns, prepend=t_ns[:1]) * 1e-9])
 
 
 def _ranges(
-    table: pa.Table, t_ns: NDArray[np.int64], way_m: NDArray[np.float64], vehicle: Vehicle
+    table: pa.Table, t_ns: Int64s, way_m: Floats, vehicle: Vehicle
 ) -> list[tuple[MeasuredRange, ...]]:
     """Return the measured ranges of each frame, in the filter's form."""
     measured: dict[int, dict[Reference, tuple[float, float]]] = {}

@@ -78,17 +78,15 @@ def _started(
 ) -> Vehicle:
     if start is not None and (numbers := _numbers(start)) is not None:
         return _changed(vehicle, numbers)
-    if start is not None:
-        found = _aligned(logs, vehicle, selection, Path(start))
-        if found is None:
-            raise VehicleError(
-                f"{start}: does not show the first pose: expected a track and wheel speeds in the "
-                f"first {READ_S:.0f} s, and a moving vehicle; try another part of the log"
-            )
-        return _changed(vehicle, found)
-    if vehicle.gnss.use not in ("start", "fuse") or vehicle.start.heading_rad is not None:
+    is_known = vehicle.start.heading_rad is not None
+    if start is None and (is_known or vehicle.gnss.use not in ("start", "fuse")):
         return vehicle
-    found = _aligned(logs, vehicle, selection, None)
+    found = _aligned(logs, vehicle, selection, None if start is None else Path(start))
+    if found is None and start is not None:
+        raise VehicleError(
+            f"{start}: does not show the first pose: expected a track and wheel speeds in the "
+            f"first {READ_S:.0f} s, and a moving vehicle; try another part of the log"
+        )
     return vehicle if found is None else _changed(vehicle, found)
 
 

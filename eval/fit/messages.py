@@ -197,13 +197,7 @@ def _side_json(side: Side) -> dict[str, object]:
 
 
 class _SideRate(NamedTuple):
-    """A rate and its intervals.
-
-    Attributes:
-        rate: Mean over places; NaN without places.
-        wilson: Interval from the number of independent observations, rounded to an integer.
-        places: Interval over places; NaN for fewer than six.
-    """
+    """Mean over places, Wilson's interval of independent observations, and that over places."""
 
     rate: float
     wilson: Interval

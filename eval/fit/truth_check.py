@@ -19,6 +19,7 @@ from crosscue.datasets.truth.coco import read_coco
 from crosscue.datasets.truth.truth import Truth
 from crosscue.datasets.truth.tum import read_tum
 from crosscue.eval.scoring import truth as score_truth
+from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.files.whole_file import sha256_of
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
@@ -187,7 +188,7 @@ def _parts(truth: Truth) -> Iterator[tuple[str, int, int]]:
         yield f"cues.{number} ({cue.cue})", begin, end
 
 
-def _check_overlap(what: str, t_ns: np.typing.NDArray[np.int64], truth: Truth, path: Path) -> None:
+def _check_overlap(what: str, t_ns: Int64s, truth: Truth, path: Path) -> None:
     if not ((t_ns >= truth.start_ns - SLACK_NS) & (t_ns < truth.end_ns + SLACK_NS)).any():
         raise SchemaError(
             f"{what} from {t_ns.min()} to {t_ns.max()} ns, but {path} covers {truth.start_ns} "

@@ -163,9 +163,7 @@ def check_output(
 
 
 def write_fit(
-    vehicle: Vehicle | Path | str | None,
-    output: Path | str | None,
-    with_fit: Callable[[str], str],
+    vehicle: Vehicle | Path | str | None, output: Path | str | None, with_fit: Callable[[str], str]
 ) -> Path | None:
     """Write the vehicle file with the fit to ``output``, unless it is None; return its path.
 

@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.columns import Int64s
+from crosscue.replay.columns import Floats, Int64s
 
 from .intervals import MIN_CLUSTERS
 
@@ -43,8 +43,8 @@ class Results:
         places: Shape (G,): number of each drive's place.
     """
 
-    values: NDArray[np.float64]
-    weights: NDArray[np.float64]
+    values: Floats
+    weights: Floats
     places: Int64s
 
 
@@ -132,7 +132,7 @@ def _found_in(
             yield span, ChangePoint(span.first + split + 1, p, math.nan)
 
 
-def _statistics(values: NDArray[np.float64], of: Results) -> NDArray[np.float64] | None:
+def _statistics(values: Floats, of: Results) -> Floats | None:
     """Return the difference at each split in standard deviations, for each shuffle.
 
     Shape (S, V - 1), the first row unshuffled; None if there are too few places, or
@@ -146,24 +146,22 @@ def _statistics(values: NDArray[np.float64], of: Results) -> NDArray[np.float64]
     if not (spread > ROUNDING).any():
         return None
     is_apart = spread > ROUNDING
-    found: NDArray[np.float64] = np.where(is_apart, differences, 0.0) / np.where(
-        is_apart, spread, 1.0
-    )
+    found: Floats = np.where(is_apart, differences, 0.0) / np.where(is_apart, spread, 1.0)
     return found
 
 
-def _differences(values: NDArray[np.float64], of: Results) -> NDArray[np.float64] | None:
+def _differences(values: Floats, of: Results) -> Floats | None:
     """Return the value after minus the value before each split, for each shuffle, (S, V - 1)."""
     is_known = np.isfinite(values)
     weight = _split_weights(is_known, of)
     if weight is None:
         return None
     shuffled = _shuffled(np.where(is_known, values, 0.0), is_known, of.places)
-    found: NDArray[np.float64] = np.tensordot(shuffled, weight, axes=([1, 2], [1, 2]))
+    found: Floats = np.tensordot(shuffled, weight, axes=([1, 2], [1, 2]))
     return found
 
 
-def _split_weights(is_known: NDArray[np.bool_], of: Results) -> NDArray[np.float64] | None:
+def _split_weights(is_known: NDArray[np.bool_], of: Results) -> Floats | None:
     """Return the weight of each value in the difference at each split, shape (V - 1, G, V)."""
     versions, weights = is_known.shape[1], of.weights
     if versions < 2:
@@ -185,9 +183,7 @@ def _split_weights(is_known: NDArray[np.bool_], of: Results) -> NDArray[np.float
     return whole if whole.any() else None
 
 
-def _shuffled(
-    values: NDArray[np.float64], is_known: NDArray[np.bool_], places: Int64s
-) -> NDArray[np.float64]:
+def _shuffled(values: Floats, is_known: NDArray[np.bool_], places: Int64s) -> Floats:
     """Shuffle each drive's values among its versions, shape (S, G, V), the first unshuffled.
 
     All metrics of all drives of a place are shuffled alike, to keep their dependence.
@@ -202,5 +198,5 @@ def _shuffled(
         there = np.flatnonzero(known)
         order[:, drive, there] = there[np.argsort(keys[:, drive, there], axis=1)]
     drives = np.arange(len(values))[None, :, None]
-    found: NDArray[np.float64] = values[drives, order]
+    found: Floats = values[drives, order]
     return found

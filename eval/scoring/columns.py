@@ -9,6 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.columns import Floats, Int64s
+
 # Reason why rows around a set-back of the clock are not scored.
 AMBIGUOUS: Final = "log time comes twice"
 # Value for rows without an approach.
@@ -26,21 +28,21 @@ class CueRows:
         count: Shape (N,), not negative.
     """
 
-    t_ns: NDArray[np.int64]
-    approach: NDArray[np.int64]
+    t_ns: Int64s
+    approach: Int64s
     cue: NDArray[np.str_]
-    count: NDArray[np.int64]
+    count: Int64s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeRows:
     """N rows of the range filter; ``reference`` is ``start`` or ``end``."""
 
-    t_ns: NDArray[np.int64]
-    approach: NDArray[np.int64]
+    t_ns: Int64s
+    approach: Int64s
     reference: NDArray[np.str_]
-    range_m: NDArray[np.float64]
-    var_m2: NDArray[np.float64]
+    range_m: Floats
+    var_m2: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,9 +56,9 @@ class BeliefRows:
         established: Shape (N,): True where the presence of the intersection is established.
     """
 
-    t_ns: NDArray[np.int64]
-    approach: NDArray[np.int64]
-    features: Mapping[str, NDArray[np.float64]]
+    t_ns: Int64s
+    approach: Int64s
+    features: Mapping[str, Floats]
     established: NDArray[np.bool_]
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> BeliefRows:
@@ -78,7 +80,7 @@ class RunTables:
             ``belief``, and of ranges by reference (``start``, ``end``).
     """
 
-    frames_ns: NDArray[np.int64] | None
+    frames_ns: Int64s | None
     cues: CueRows | None
     ranges: RangeRows | None
     belief: BeliefRows | None

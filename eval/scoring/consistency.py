@@ -18,8 +18,8 @@ def quantile(probability: float, dimensions: int) -> float:
     return float(chdtri(dimensions, 1.0 - probability))
 
 
-def mean_band(dimensions: int, samples: int, fraction: float = 0.95) -> tuple[float, float]:
-    """Return the central interval of the mean of independent chi-square samples."""
+def mean_band(dimensions: int, samples: int) -> tuple[float, float]:
+    """Return the central 95 % interval of the mean of independent chi-square samples."""
     total = dimensions * samples
-    tail = 0.5 * (1.0 - fraction)
+    tail = 0.5 * (1.0 - 0.95)
     return quantile(tail, total) / samples, quantile(1.0 - tail, total) / samples

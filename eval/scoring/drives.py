@@ -24,12 +24,8 @@ from crosscue.eval.scoring.scene.cues import (
     score_cues,
 )
 from crosscue.eval.scoring.scene.detection import RULES, Definition
-from crosscue.eval.scoring.scene.ranges import (
-    RangeJudged,
-    RangeScore,
-    judge_range,
-    score_range,
-)
+from crosscue.eval.scoring.scene.ranges import RangeJudged, RangeScore, judge_range, score_range
+from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import SchemaError
 
 from . import intervals
@@ -170,7 +166,7 @@ def score_drive(
     return DriveJudged(coverage, cues, approaches, belief, ranges)
 
 
-def _frames(tables: RunTables) -> np.typing.NDArray[np.int64]:
+def _frames(tables: RunTables) -> Int64s:
     parts = [np.empty(0, np.int64)]
     parts += [] if tables.frames_ns is None else [tables.frames_ns]
     parts += [] if tables.cues is None else [tables.cues.t_ns]
@@ -214,9 +210,7 @@ def _not_scored(tables: RunTables, truth: DriveTruth) -> dict[str, str]:
 
 
 def score(
-    tables: Mapping[str, pa.Table],
-    truth: Truth | DriveTruth,
-    settings: ScoreSettings = DEFAULTS,
+    tables: Mapping[str, pa.Table], truth: Truth | DriveTruth, settings: ScoreSettings = DEFAULTS
 ) -> PooledScores:
     """Score the tables of one drive; no run folder is needed, and nothing is read or written.
 
@@ -228,13 +222,13 @@ def score(
         settings: Settings of the scores.
 
     Raises:
+        UsageError: A table has another name.
         RunError: A column is missing, or has impossible values.
         SchemaError: Their times do not overlap: the truth belongs to another log or clock.
     """
     if not isinstance(truth, DriveTruth):
         truth = DriveTruth(truth.log or "drive", truth, None)
-    found = run_tables(truth.drive, **{f"{name}_table": one for name, one in tables.items()})
-    return pool_scores([score_drive(found, truth, settings)], settings)
+    return pool_scores([score_drive(run_tables(truth.drive, tables), truth, settings)], settings)
 
 
 def pool_scores(drives: Sequence[DriveJudged], settings: ScoreSettings = DEFAULTS) -> PooledScores:

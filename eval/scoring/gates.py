@@ -93,9 +93,7 @@ def load_gates(path: Path) -> tuple[Gate, ...]:
 
 
 def check_gates(
-    gates: Sequence[Gate],
-    values: Mapping[str, MetricValue],
-    not_scored: Mapping[str, str],
+    gates: Sequence[Gate], values: Mapping[str, MetricValue], not_scored: Mapping[str, str]
 ) -> tuple[GateResult, ...]:
     """Check gates against metrics.
 

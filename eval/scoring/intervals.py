@@ -28,7 +28,8 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+
+from crosscue.replay.columns import Floats, Int64s
 
 CONFIDENCE: Final = 0.95
 # Over fewer, coverage depends on a correlation that they hardly show, and no swap of them decides.
@@ -136,7 +137,7 @@ def lower_bound(right: int, of: int, confidence: float) -> float:
     return 0.0 if right == 0 else float(beta.ppf(1.0 - confidence, right, of - right + 1))
 
 
-def fraction(is_right: np.typing.NDArray[np.bool_], clusters: NDArray[np.int64]) -> Proportion:
+def fraction(is_right: np.typing.NDArray[np.bool_], clusters: Int64s) -> Proportion:
     """Return the fraction of true rows, with both intervals.
 
     Args:
@@ -158,7 +159,7 @@ def fraction(is_right: np.typing.NDArray[np.bool_], clusters: NDArray[np.int64])
     )
 
 
-def mean(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> Mean:
+def mean(values: Floats, clusters: Int64s) -> Mean:
     """Return the mean of finite values, with an interval over clusters."""
     kept = np.isfinite(values)
     values, clusters = values[kept], clusters[kept]
@@ -167,35 +168,23 @@ def mean(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> Mean:
     return Mean(value, ends.low, ends.high, len(values), len(np.unique(clusters)))
 
 
-def mean_by_cluster(
-    values: NDArray[np.float64], clusters: NDArray[np.int64], confidence: float = CONFIDENCE
-) -> Interval:
-    """Return the interval of a mean over rows, with clusters as independent units.
-
-    Args:
-        values: Shape (N,).
-        clusters: Shape (N,).
-        confidence: Confidence level.
-    """
+def mean_by_cluster(values: Floats, clusters: Int64s) -> Interval:
+    """Return the interval of a mean over N rows, with clusters as independent units."""
     found = _spread(values, clusters)
     if found is None:
         return UNKNOWN
-    half = found.quantile(confidence) * found.sd
+    half = found.quantile() * found.sd
     return Interval(found.mean - half, found.mean + half)
 
 
-def fraction_by_cluster(
-    is_right: np.typing.NDArray[np.bool_],
-    clusters: NDArray[np.int64],
-    confidence: float = CONFIDENCE,
-) -> Interval:
+def fraction_by_cluster(is_right: np.typing.NDArray[np.bool_], clusters: Int64s) -> Interval:
     """Return the interval of the fraction of true rows, with clusters as independent units.
 
     If all clusters agree, the correlation within clusters is unknown. Each cluster then counts as
     one row.
     """
     found = _spread(is_right.astype(np.float64), clusters)
-    return UNKNOWN if found is None else found.within_0_and_1(len(is_right), confidence)
+    return UNKNOWN if found is None else found.within_0_and_1(len(is_right))
 
 
 class Spread(NamedTuple):
@@ -215,26 +204,26 @@ class Spread(NamedTuple):
     equal_clusters: float
     kurtosis: float = 3.0
 
-    def quantile(self, confidence: float, freedom: float = math.inf) -> float:
+    def quantile(self, freedom: float = math.inf) -> float:
         """Return the two-sided quantile of Student's t, with at most ``freedom`` degrees."""
         from scipy.special import stdtrit
 
         freedom = max(min(freedom, self.equal_clusters - 1.0), 1.0)
-        return float(stdtrit(freedom, 0.5 + 0.5 * confidence))
+        return float(stdtrit(freedom, 0.5 + 0.5 * CONFIDENCE))
 
-    def within_0_and_1(self, rows: float, confidence: float = CONFIDENCE) -> Interval:
+    def within_0_and_1(self, rows: float) -> Interval:
         """Return Wilson's interval for the effective number of rows, at most ``rows``."""
         from scipy.special import ndtri
 
         if self.sd == 0.0:
-            return _wilson(self.mean, self.clusters, float(ndtri(0.5 + 0.5 * confidence)))
+            return _wilson(self.mean, self.clusters, float(ndtri(0.5 + 0.5 * CONFIDENCE)))
         effective = min(self.mean * (1.0 - self.mean) / self.sd**2, rows)
         # The relative variance of a variance of n values is (kurtosis - 1) / n.
         freedom = 2.0 * self.equal_clusters / max(self.kurtosis - 1.0, 1e-9)
-        return _wilson(self.mean, effective, self.quantile(confidence, freedom))
+        return _wilson(self.mean, effective, self.quantile(freedom))
 
 
-def _spread(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> Spread | None:
+def _spread(values: Floats, clusters: Int64s) -> Spread | None:
     """Return the mean and its standard deviation by the jackknife; None for too few clusters."""
     names, which = np.unique(clusters, return_inverse=True)
     n = len(names)
@@ -250,7 +239,7 @@ def _spread(values: NDArray[np.float64], clusters: NDArray[np.int64]) -> Spread 
     return Spread(whole, sd, n, equal, _kurtosis(squares))
 
 
-def _kurtosis(squares: NDArray[np.float64]) -> float:
+def _kurtosis(squares: Floats) -> float:
     """Return the kurtosis of values by their squares, unbiased for normal values (G2 + 3).
 
     Joanes, Gill, *Comparing measures of sample skewness and kurtosis*, The Statistician 47, 1998.

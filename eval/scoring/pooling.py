@@ -10,6 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.columns import Floats
+
 # Edges of the bins of true range.
 BINS_M: Final = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0)
 
@@ -40,9 +42,7 @@ def first_reasons(
     return rows, counts
 
 
-def distance_bins(
-    distance_m: NDArray[np.float64], borders_m: Sequence[float]
-) -> dict[str, NDArray[np.bool_]]:
+def distance_bins(distance_m: Floats, borders_m: Sequence[float]) -> dict[str, NDArray[np.bool_]]:
     """Return the rows of each half-open bin, as masks; every row is in exactly one bin."""
     found = {f"under {borders_m[0]:g}": distance_m < borders_m[0]}
     for low, high in pairwise(borders_m):

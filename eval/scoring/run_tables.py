@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from crosscue.eval.runs.tables.columns import LOG_TIME
 from crosscue.eval.runs.tables.log_time import table_in_log_time
 from crosscue.replay.columns import Floats, Int64s
-from crosscue.replay.errors import UnreadableRunError
+from crosscue.replay.errors import UnreadableRunError, UsageError
 from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.fusion import NOT_FEATURES
 
@@ -21,6 +21,8 @@ from .columns import NONE, BeliefRows, CueRows, RangeRows, RunTables
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+T = TypeVar("T")
 
 
 def in_log_time(where: str, tables: Mapping[str, pa.Table], timeline: Timeline) -> RunTables:
@@ -35,8 +37,9 @@ def in_log_time(where: str, tables: Mapping[str, pa.Table], timeline: Timeline) 
         for name, table in tables.items()
         for what, rows in _rows_by_kind(table, name).items()
     }
-    checked = run_tables(where, **{f"{name}_table": table for name, table in kept.items()})
-    return replace(checked, ambiguous={what: gone for what, gone in counts.items() if gone})
+    return replace(
+        run_tables(where, kept), ambiguous={what: gone for what, gone in counts.items() if gone}
+    )
 
 
 def _rows_by_kind(table: pa.Table, name: str) -> Mapping[str, int]:
@@ -48,35 +51,34 @@ def _rows_by_kind(table: pa.Table, name: str) -> Mapping[str, int]:
     return {name: table.num_rows}
 
 
-def run_tables(
-    where: str,
-    *,
-    frames_table: pa.Table | None = None,
-    cues_table: pa.Table | None = None,
-    range_table: pa.Table | None = None,
-    belief_table: pa.Table | None = None,
-) -> RunTables:
+def run_tables(where: str, tables: Mapping[str, pa.Table]) -> RunTables:
     """Check tables in memory and return their columns.
 
     Args:
         where: Name of the run in errors.
-        frames_table: Columns as in ``frames.parquet``.
-        cues_table: Columns as in ``cues.parquet``.
-        range_table: Columns as in ``range.parquet``.
-        belief_table: Columns as in ``belief.parquet``.
+        tables: Tables ``frames``, ``cues``, ``range`` and ``belief``, as in a run; any may be
+            missing.
 
     Raises:
+        UsageError: Another table is given.
         RunError: A column is missing, or has impossible values.
     """
-    frames = None
-    if frames_table is not None:
-        frames = np.unique(_whole(frames_table, "t_ns", f"{where}: frames"))
+    if others := sorted(tables.keys() - {"frames", "cues", "range", "belief"}):
+        raise UsageError(f"tables: {', '.join(others)}; expected frames, cues, range or belief")
+
+    def read(name: str, of: Callable[[pa.Table, str], T]) -> T | None:
+        return of(tables[name], f"{where}: {name}") if name in tables else None
+
     return RunTables(
-        frames_ns=frames,
-        cues=None if cues_table is None else _cues(cues_table, f"{where}: cues"),
-        ranges=None if range_table is None else _ranges(range_table, f"{where}: range"),
-        belief=None if belief_table is None else _belief(belief_table, f"{where}: belief"),
+        read("frames", _frames),
+        read("cues", _cues),
+        read("range", _ranges),
+        read("belief", _belief),
     )
+
+
+def _frames(table: pa.Table, where: str) -> Int64s:
+    return np.unique(_whole(table, "t_ns", where))
 
 
 def _cues(table: pa.Table, where: str) -> CueRows:

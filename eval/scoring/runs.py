@@ -169,11 +169,7 @@ def _place(run: RunFolder, log: LogRow) -> Path:
 
 
 def judge_run(
-    run: RunFolder,
-    truth_path: Path,
-    settings: ScoreSettings = DEFAULTS,
-    *,
-    any_log: bool = False,
+    run: RunFolder, truth_path: Path, settings: ScoreSettings = DEFAULTS, *, any_log: bool = False
 ) -> RunScored:
     """Compare a run with its truth; write pose tracks to its ``score`` folder.
 
@@ -198,11 +194,7 @@ def judge_run(
 
 
 def judge_scene(
-    run: RunFolder,
-    truth_path: Path,
-    settings: ScoreSettings = DEFAULTS,
-    *,
-    any_log: bool = False,
+    run: RunFolder, truth_path: Path, settings: ScoreSettings = DEFAULTS, *, any_log: bool = False
 ) -> SceneJudged:
     """Compare everything but the pose of a run with its truth; nothing is written.
 
@@ -347,9 +339,7 @@ def scoring_of(one: RunScored) -> dict[str, Line]:
     """Return numbers of scored and unscored frames by cue, and of true poses, by reason."""
     found = {
         f"cue {cue.cue}": line(
-            cue.frames,
-            cue.frames - sum(cue.left_out["object"].values()),
-            cue.left_out["object"],
+            cue.frames, cue.frames - sum(cue.left_out["object"].values()), cue.left_out["object"]
         )
         for cue in one.judged.cues
     }

@@ -9,14 +9,12 @@ section 4.3).
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.eval.scoring.intervals import MIN_CLUSTERS, TOO_FEW, wilson
-
-Floats: TypeAlias = NDArray[np.float64]
+from crosscue.replay.columns import Floats
 
 REPLICATES: Final = 400
 NEWTON_STEPS: Final = 40

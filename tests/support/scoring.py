@@ -153,13 +153,13 @@ def tables(
     ranges: pa.Table | None = None,
     frames: int | None = None,
 ) -> RunTables:
-    return run_tables(
-        "made up",
-        frames_table=None if frames is None else frame_table(frames),
-        cues_table=None if cues is None else cue_table(cues),
-        belief_table=belief,
-        range_table=ranges,
-    )
+    found = {
+        "frames": None if frames is None else frame_table(frames),
+        "cues": None if cues is None else cue_table(cues),
+        "belief": belief,
+        "range": ranges,
+    }
+    return run_tables("made up", {name: one for name, one in found.items() if one is not None})
 
 
 BELIEF: Final[Mapping[str, Mapping[int, float]]] = {

@@ -23,6 +23,7 @@ from crosscue.detectors.catalog.class_scores import ClassScores, Platt
 from crosscue.detectors.training.operating_point import fit_platt
 from crosscue.eval.scoring.boxes.reliability import class_calibration
 from crosscue.eval.scoring.intervals import Interval, lower_bound, wilson
+from crosscue.replay.columns import Floats
 from crosscue.replay.safe_text import counted
 from crosscue.results import HIDDEN, json_key
 
@@ -50,7 +51,7 @@ class ClassDetections:
         unit: What is labelled; of pictures, the best detection counts.
     """
 
-    scores: NDArray[np.float64]
+    scores: Floats
     is_right: NDArray[np.bool_]
     labels: int
     unit: LabelUnit = "boxes"
@@ -203,7 +204,7 @@ def _calibration(judged: ClassDetections, kind: CalibrationKind) -> Platt | None
     return fit_platt(judged.scores, judged.is_right)
 
 
-def _applied(calibration: Platt | None, scores: NDArray[np.float64]) -> NDArray[np.float64]:
+def _applied(calibration: Platt | None, scores: Floats) -> Floats:
     return scores if calibration is None else calibration.probabilities(scores)
 
 
@@ -211,7 +212,8 @@ def _why_none(judged: ClassDetections, precision: float, confidence: float) -> s
     fewest = fewest_detections(precision, confidence)
     if len(judged.scores) < fewest:
         return f"no threshold: {counted(len(judged.scores), 'detection')}, at least {fewest} needed"
-    best = best_bound(judged.scores, judged.is_right, precision, confidence)
+    found = _candidates(judged.scores, judged.is_right, precision, confidence)
+    best = max(one.bound for one in found)
     return f"no threshold reaches {precision:g}: the best lower bound is {best:.3f}"
 
 
@@ -256,16 +258,8 @@ def fewest_detections(precision: float, confidence: float) -> int:
     return math.ceil(math.log(risk) / math.log(precision))
 
 
-def best_bound(
-    scores: NDArray[np.float64], is_right: NDArray[np.bool_], precision: float, confidence: float
-) -> float:
-    """Return the highest bound of any candidate; NaN without candidates."""
-    found = _candidates(scores, is_right, precision, confidence)
-    return max((one.bound for one in found), default=math.nan)
-
-
 def bounded_threshold(
-    scores: NDArray[np.float64], is_right: NDArray[np.bool_], precision: float, confidence: float
+    scores: Floats, is_right: NDArray[np.bool_], precision: float, confidence: float
 ) -> Threshold | None:
     """Return the lowest candidate whose bound is high enough, or None.
 
@@ -281,7 +275,7 @@ def bounded_threshold(
 
 
 def _candidates(
-    scores: NDArray[np.float64], is_right: NDArray[np.bool_], precision: float, confidence: float
+    scores: Floats, is_right: NDArray[np.bool_], precision: float, confidence: float
 ) -> list[Threshold]:
     """Return candidates whose numbers of detections above them increase geometrically."""
     n, fewest = len(scores), fewest_detections(precision, confidence)

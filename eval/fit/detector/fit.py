@@ -12,11 +12,7 @@ from typing import Annotated, ClassVar, Final
 
 import numpy as np
 
-from crosscue.datasets.truth.box_labels import (
-    LabelFormat,
-    Meanings,
-    read_box_labels,
-)
+from crosscue.datasets.truth.box_labels import LabelFormat, Meanings, read_box_labels
 from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.catalog.class_names import class_names_given
 from crosscue.detectors.catalog.places import card_path, names
@@ -36,6 +32,7 @@ from crosscue.eval.report.chart import Chart, precision_and_recall
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
+from crosscue.replay.columns import Floats
 from crosscue.replay.errors import FitError, UsageError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
@@ -73,11 +70,7 @@ class FittedDetector(Fitted):
     is_whole: bool = field(default=True, metadata=HIDDEN)
 
     belongs_in: ClassVar = "model card"
-    also: ClassVar = {
-        "card": "path",
-        "detector": "detector.name",
-        "confidence": "confidence",
-    }
+    also: ClassVar = {"card": "path", "detector": "detector.name", "confidence": "confidence"}
 
     @property
     def has_threshold(self) -> bool:
@@ -398,7 +391,7 @@ class _Pictures:
 
 def _best_of_pictures(
     run: LabelledRun, chosen: np.typing.NDArray[np.bool_], label: int
-) -> tuple[np.typing.NDArray[np.float64], np.typing.NDArray[np.bool_]]:
+) -> tuple[Floats, np.typing.NDArray[np.bool_]]:
     """Best score of a class in each chosen picture, and whether the picture shows such an object.
 
     The score is -inf in a picture without a detection.

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from crosscue.datasets.truth.csv_rows import csv_rows
 from crosscue.datasets.truth.tum import heading_rad
-from crosscue.detectors.images import Encoded, lose
+from crosscue.detectors.images import encoded, lose
 from crosscue.eval.logs.log import Log as Drive
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.pose.score import load_truth, track_mounting
@@ -21,8 +20,7 @@ from crosscue.localization.angles import interpolate_angle
 from crosscue.localization.ellipse import position_cov
 from crosscue.localization.landmarks.database import LandmarkPosition, LandmarkWriter
 from crosscue.localization.landmarks.features import Matcher
-from crosscue.localization.landmarks.images import copy_picture, grey_of, read_encoded
-from crosscue.replay.base import Log, Selection
+from crosscue.localization.landmarks.images import grey_of, read_encoded
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import AnnotationError, LogError, MissingTopicError, UsageError
 from crosscue.replay.ledger import Ledger, warn_of
@@ -73,14 +71,6 @@ class AddCounts:
     blank: int = 0
 
 
-class LogPicture(NamedTuple):
-    """One picture of a log."""
-
-    t_ns: int
-    topic: str
-    picture: Encoded
-
-
 def read_poses(path: Path, vehicle: Vehicle) -> CameraPoses:
     """Read the poses of a run folder, or of a truth file (``truth.json`` or its folder).
 
@@ -125,64 +115,15 @@ def _turned(lever_m: tuple[float, float], heading: Floats) -> Floats:
     return np.column_stack([turned.real, turned.imag])
 
 
-def camera_frames(
-    logs: Sequence[Log], vehicle: Vehicle, selection: Selection, ledgers: Sequence[Ledger]
-) -> Iterator[LogPicture]:
-    """Yield the camera's pictures of a drive, on the clock that a replay would choose.
-
-    Raises:
-        VehicleError: The logs have no camera, or several.
-    """
-    topics = [(i, topic) for i, log in enumerate(logs) for topic in log.topics]
-    camera = chosen_camera(topics, vehicle)
-    if camera is None:
-        raise MissingTopicError("the logs have no camera; use a log with pictures")
-    log, topic = logs[camera[0]], camera[1]
-    ledger = ledgers[camera[0]]
-    for block, pictures in pictures_of(log, camera[0], topic, vehicle, ledger, selection):
-        for row, t_ns in enumerate(block.log_ns.tolist()):
-            yield LogPicture(t_ns, topic.name, copy_picture(pictures, row))
-
-
-class PosedPictures(NamedTuple):
-    """The camera's pictures of a drive with known poses.
-
-    Attributes:
-        frames: Pictures in order of time.
-        poses: Poses of the same drive.
-        ledgers: Ledgers of all logs; pictures that do not decode are dropped in the camera's.
-    """
-
-    frames: Iterator[LogPicture]
-    poses: CameraPoses
-    ledgers: Sequence[Ledger]
-
-
-@contextmanager
-def pictures_with(poses: CameraPoses, drive: Drive, vehicle: Vehicle) -> Iterator[PosedPictures]:
-    """Yield the camera's pictures; warn about missing ones at the end."""
-    ledgers = [Ledger(str(log.path)) for log in drive.logs]
-    frames = camera_frames(drive.logs, vehicle, drive.selection, ledgers)
-    yield PosedPictures(frames, poses, ledgers)
-    for ledger in ledgers:
-        warn_of(ledger)
-
-
-def drop_picture(ledgers: Sequence[Ledger], frame: LogPicture, error: LogError) -> None:
-    """Drop a picture that cannot be used, in the one ledger that has counted its topic."""
-    ledger = next(one for one in ledgers if frame.topic in one.accounts)
-    lose(ledger, frame.topic, frame.t_ns, error)
-
-
 def add_from_log(
     writer: LandmarkWriter,
     matcher: Matcher,
-    pictures: PosedPictures,
+    drive: Drive,
+    vehicle: Vehicle,
+    place_of: Callable[[int], LandmarkPosition | None],
     every_m: float,
-    sd_m: float,
-    source: str,
-) -> AddCounts:
-    """Add a landmark every ``every_m`` along the path.
+) -> tuple[AddCounts, bool]:
+    """Add a landmark every ``every_m`` along the path; return counts, and whether all rows count.
 
     Neighbouring landmarks share the errors of a run's poses, but a later replay assumes that they
     are independent. If the run drifted, make ``every_m`` large, or use a truth.
@@ -190,40 +131,57 @@ def add_from_log(
     Args:
         writer: Writer of the database.
         matcher: Matcher that computes the features.
-        pictures: Pictures of a drive with its poses.
+        drive: The drive; warnings report what is dropped of its camera.
+        vehicle: Names the camera if there are several; its clock is that of a replay.
+        place_of: Place of the camera at a time; None where it is unknown.
         every_m: Straight distance between two landmarks.
-        sd_m: S.d. of the vehicle's distance from the landmark at the best match; added to the
-            covariance of the poses.
-        source: Name of the drive; landmarks are named ``source/time``.
+
+    Raises:
+        VehicleError: The logs have no camera, or several.
     """
-    counts = AddCounts()
-    last: Floats | None = None
-    for frame in pictures.frames:
-        counts.pictures += 1
-        place = place_at(frame.t_ns, pictures.poses, sd_m, source)
-        if place is None:
-            counts.without_pose += 1
-            continue
-        if last is not None and math.dist(place.xy_m, last) < every_m:
-            counts.too_near += 1
-            continue
-        try:
-            features = matcher.describe(grey_of(frame.picture))
-        except LogError as error:
-            counts.undecodable += 1
-            drop_picture(pictures.ledgers, frame, error)
-            continue
-        if len(features) < MIN_POINTS:
-            counts.blank += 1
-            continue
-        writer.add(place, features)
-        counts.added += 1
-        last = place.xy_m
-    return counts
+    topics = [(i, topic) for i, log in enumerate(drive.logs) for topic in log.topics]
+    camera = chosen_camera(topics, vehicle)
+    if camera is None:
+        raise MissingTopicError("the logs have no camera; use a log with pictures")
+    number, topic = camera
+    log, counts = drive.logs[number], AddCounts()
+    ledger, last = Ledger(str(log.path)), None
+    for block, pictures in pictures_of(log, number, topic, vehicle, ledger, drive.selection):
+        for row, t_ns in enumerate(block.log_ns.tolist()):
+            counts.pictures += 1
+            place = place_of(t_ns)
+            if place is None:
+                counts.without_pose += 1
+                continue
+            if last is not None and math.dist(place.xy_m, last) < every_m:
+                counts.too_near += 1
+                continue
+            try:
+                features = matcher.describe(grey_of(encoded(pictures, row)))
+            except LogError as error:
+                counts.undecodable += 1
+                lose(ledger, topic.name, t_ns, error)
+                continue
+            if len(features) < MIN_POINTS:
+                counts.blank += 1
+                continue
+            writer.add(place, features)
+            counts.added += 1
+            last = place.xy_m
+    warn_of(ledger)
+    return counts, ledger.is_whole
 
 
 def place_at(t_ns: int, poses: CameraPoses, sd_m: float, source: str) -> LandmarkPosition | None:
-    """Return the camera's place at a time, named ``source/time``; None if no pose is near."""
+    """Return the camera's place at a time, named ``source/time``; None if no pose is near.
+
+    Args:
+        t_ns: The time.
+        poses: Poses of the drive.
+        sd_m: S.d. of the vehicle's distance from the landmark at the best match; added to the
+            covariance of the poses.
+        source: Name of the drive.
+    """
     after = int(np.searchsorted(poses.t_ns, t_ns))
     if after == len(poses.t_ns) or (after == 0 and poses.t_ns[0] != t_ns):
         return None

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring.intervals import lower_bound, wilson
-from crosscue.replay.columns import ColumnSet
+from crosscue.replay.columns import ColumnSet, Floats, Int64s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,9 +29,9 @@ class ScoredPairs(ColumnSet):
         query: Shape (N,), int64: number of the query picture, whose pairs are all in one half.
     """
 
-    score: NDArray[np.float64]
+    score: Floats
     is_same: NDArray[np.bool_]
-    query: NDArray[np.int64]
+    query: Int64s
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,9 +113,7 @@ def fitted_half(pairs: ScoredPairs, seed: int = 0) -> NDArray[np.bool_]:
     return np.isin(pairs.query, chosen)
 
 
-def _threshold(
-    score: NDArray[np.float64], is_false: NDArray[np.bool_], wanted_rate: float
-) -> float:
+def _threshold(score: Floats, is_false: NDArray[np.bool_], wanted_rate: float) -> float:
     """Threshold half-way between the highest score that must not match and the next higher one."""
     worst_first = np.sort(score[is_false])[::-1]
     allowed = math.floor(wanted_rate * len(worst_first) + 1e-9)

@@ -61,9 +61,7 @@ class FittedRanges(Fitted):
     tested: RangeFit | None
     pairs: RangePairs = field(metadata=HIDDEN)
 
-    also: ClassVar = {
-        "best": "best.curve.family",
-    }
+    also: ClassVar = {"best": "best.curve.family"}
 
     @property
     def best(self) -> RangeFit:

@@ -53,7 +53,6 @@ class LabelledRun:
         truth: Labelled boxes.
         found: Detections.
         t_ns: Shape (P,): times of the labelled frames in the run's tables, increasing.
-        sizes_px: Width and height of each frame.
         names: Name of each frame in the labels.
         rule: Rule by which pictures were matched to frames, as text.
         frames: Number of frames of the run.
@@ -70,7 +69,6 @@ class LabelledRun:
     truth: LabelledBoxes
     found: LabelledBoxes
     t_ns: Int64s
-    sizes_px: tuple[tuple[int, int], ...]
     names: tuple[str, ...]
     rule: str
     frames: int
@@ -160,7 +158,6 @@ def labelled_run(
         _as_boxes(truth, numbers),
         found,
         np.array([frames[t][0] for t in order], np.int64),
-        tuple(sizes),
         tuple(placed[t].name for t in order),
         rule,
         len(frames),

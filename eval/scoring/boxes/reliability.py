@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.eval.scoring.intervals import Interval, wilson
+from crosscue.replay.columns import Floats
 
 from .matching import Bools
 
@@ -63,7 +63,7 @@ class Reliability:
     detections: int
 
 
-def class_calibration(label: str, scores: NDArray[np.float64], is_right: Bools) -> Reliability:
+def class_calibration(label: str, scores: Floats, is_right: Bools) -> Reliability:
     """Return the calibration of one class.
 
     Args:

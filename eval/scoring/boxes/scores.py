@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.eval.scoring.intervals import (
     MIN_CLUSTERS,
@@ -25,6 +24,7 @@ from crosscue.eval.scoring.intervals import (
     Spread,
     fraction_by_cluster,
 )
+from crosscue.replay.columns import Floats, Int64s
 
 from .matching import ALL, OVERLAPS, RANGES, SIZES, BoxSelection, LabelledBoxes, Matched, match
 
@@ -80,7 +80,7 @@ def score_parts(
     found: LabelledBoxes,
     classes: Sequence[str],
     thresholds: Mapping[str, float],
-    blocks: NDArray[np.int64],
+    blocks: Int64s,
     overlap: float = 0.5,
     seed: int = SEED,
 ) -> list[PartScore]:
@@ -128,7 +128,7 @@ def score_parts(
     return scores
 
 
-def drawn(blocks: NDArray[np.int64], seed: int, rounds: int = ROUNDS) -> NDArray[np.float64] | None:
+def drawn(blocks: Int64s, seed: int, rounds: int = ROUNDS) -> Floats | None:
     """Draw how often each picture is in a bootstrap sample, shape (R, P); None for few blocks.
 
     Args:
@@ -144,7 +144,7 @@ def drawn(blocks: NDArray[np.int64], seed: int, rounds: int = ROUNDS) -> NDArray
     return np.asarray(times[:, which], np.float64)
 
 
-def interval_of(value: float, rounds: NDArray[np.float64], blocks: int) -> Interval:
+def interval_of(value: float, rounds: Floats, blocks: int) -> Interval:
     """Return the 95 % interval of a number from 0 to 1, from its values in bootstrap samples."""
     kept = rounds[np.isfinite(rounds)]
     if blocks < MIN_CLUSTERS or not len(kept) or not math.isfinite(value):
@@ -154,9 +154,7 @@ def interval_of(value: float, rounds: NDArray[np.float64], blocks: int) -> Inter
     return Spread(value, sd, blocks, blocks).within_0_and_1(math.inf)
 
 
-def average_precision(
-    matched: Matched, step: int, weights: NDArray[np.float64] | None = None
-) -> NDArray[np.float64]:
+def average_precision(matched: Matched, step: int, weights: Floats | None = None) -> Floats:
     """Return the average precision at one overlap, for all pictures or for R samples of them.
 
     Args:
@@ -192,16 +190,14 @@ class _Row:
     """One class in one part, with the values of all bootstrap samples."""
 
     matched: Matched
-    blocks: NDArray[np.int64]
-    ap: NDArray[np.float64]
-    ap50: NDArray[np.float64]
-    ap_rounds: NDArray[np.float64]
-    ap50_rounds: NDArray[np.float64]
+    blocks: Int64s
+    ap: Floats
+    ap50: Floats
+    ap_rounds: Floats
+    ap50_rounds: Floats
 
     @classmethod
-    def of(
-        cls, matched: Matched, blocks: NDArray[np.int64], weights: NDArray[np.float64] | None
-    ) -> _Row:
+    def of(cls, matched: Matched, blocks: Int64s, weights: Floats | None) -> _Row:
         steps = range(len(OVERLAPS))
         each = np.stack([average_precision(matched, step) for step in steps])
         rounds = (
@@ -255,22 +251,18 @@ def _mean(rows: Sequence[_Row], some: Sequence[PartScore]) -> PartScore:
     )
 
 
-def _measured(
-    value: float, rounds: NDArray[np.float64], blocks: NDArray[np.int64]
-) -> IntervalEstimate:
+def _measured(value: float, rounds: Floats, blocks: Int64s) -> IntervalEstimate:
     return IntervalEstimate(value, *interval_of(value, rounds, len(np.unique(blocks))))
 
 
-def _less(of: NDArray[np.int64], right: NDArray[np.int64]) -> NDArray[np.int64]:
+def _less(of: Int64s, right: Int64s) -> Int64s:
     """Return the pictures of missed labels: those of all labels minus those of found ones."""
     n = int(max(of.max(initial=-1), right.max(initial=-1))) + 1
     left = np.bincount(of, minlength=n) - np.bincount(right, minlength=n)
     return np.repeat(np.arange(n), np.maximum(left, 0))
 
 
-def _fraction_of(
-    right: NDArray[np.int64], wrong: NDArray[np.int64], blocks: NDArray[np.int64]
-) -> IntervalEstimate:
+def _fraction_of(right: Int64s, wrong: Int64s, blocks: Int64s) -> IntervalEstimate:
     """Return the fraction that is right, from the pictures of right and wrong items."""
     is_right = np.repeat([True, False], [len(right), len(wrong)])
     if not len(is_right):

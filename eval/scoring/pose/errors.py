@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from crosscue.datasets.truth.tum import Trajectory, heading_rad
 from crosscue.eval.scoring.consistency import mean_band, quantile
 from crosscue.localization.angles import wrap_all
-from crosscue.replay.columns import Floats
+from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import UsageError
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class PoseErrors:
         rotation_rad: Shape (N,), in [0, pi].
     """
 
-    t_ns: NDArray[np.int64]
+    t_ns: Int64s
     translation_m: Floats
     rotation_rad: Floats
 
@@ -131,10 +131,7 @@ class NeesSummary:
 
 
 def pair_poses(
-    truth: Trajectory,
-    estimate: Trajectory,
-    max_difference_ns: int,
-    cov_xyh: Floats | None = None,
+    truth: Trajectory, estimate: Trajectory, max_difference_ns: int, cov_xyh: Floats | None = None
 ) -> Paired:
     """Interpolate the estimates at the times of the true poses.
 
@@ -162,7 +159,7 @@ def pair_poses(
     coverage = Coverage(len(truth), *counts)
     if not near.any():
         raise UsageError(f"no true pose has an estimate within {max_difference_ns} ns: {coverage}")
-    at = _taken(truth, near)
+    at = truth.take(near)
     found, cov = _between(estimate, before[near], after[near], at.t_ns, cov_xyh)
     return Paired(at, found, cov, coverage)
 
@@ -290,16 +287,8 @@ def summarise_nees(values: Floats, dimensions: int, independent: int = 1) -> Nee
     )
 
 
-def _taken(trajectory: Trajectory, index: Indices | NDArray[np.bool_]) -> Trajectory:
-    return Trajectory(trajectory.t_ns[index], trajectory.xyz_m[index], trajectory.quat_wxyz[index])
-
-
 def _between(
-    estimate: Trajectory,
-    before: Indices,
-    after: Indices,
-    t_ns: NDArray[np.int64],
-    cov_xyh: Floats | None,
+    estimate: Trajectory, before: Indices, after: Indices, t_ns: Int64s, cov_xyh: Floats | None
 ) -> tuple[Trajectory, Floats | None]:
     span_ns = np.maximum(estimate.t_ns[after] - estimate.t_ns[before], 1)
     fraction = np.where(after > before, (t_ns - estimate.t_ns[before]) / span_ns, 0.0)

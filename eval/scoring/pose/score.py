@@ -33,6 +33,7 @@ from .errors import (
     ErrorStatistics,
     NeesSummary,
     Paired,
+    PoseErrors,
     align,
     ape,
     pair_poses,
@@ -191,7 +192,7 @@ def measure_pose(run: RunFolder, truth_path: Path) -> tuple[PoseScore, ScoredPos
     table = table_in_log_time(run.table("pose"), run.drive_manifest().timeline)
     vehicle = run.drive_manifest().settings
     _inside(track, table, truth_path)
-    estimate, cov = _estimate(table, vehicle, truth)
+    estimate, cov = estimated_track(table, vehicle, truth)
     flat = planar(track.t_ns, track.xyz_m[:, 0], track.xyz_m[:, 1], heading_rad(track))
     paired = _paired(flat, estimate, cov, comes_twice(run.drive_manifest().timeline, flat.t_ns))
     why_no_nees = NO_NEES if OWN_FRAME in run.drive_manifest().notices else ""
@@ -226,9 +227,7 @@ def _paired(
     """Return pairs, without true poses at times that occur twice, which are counted."""
     if not twice.any():
         return pair_poses(truth, estimate, MAX_DIFFERENCE_NS, cov)
-    once = ~twice
-    kept = Trajectory(truth.t_ns[once], truth.xyz_m[once], truth.quat_wxyz[once])
-    paired = pair_poses(kept, estimate, MAX_DIFFERENCE_NS, cov)
+    paired = pair_poses(truth.take(~twice), estimate, MAX_DIFFERENCE_NS, cov)
     counts = paired.coverage
     ambiguous = int(twice.sum())
     total = counts.truth_poses + ambiguous
@@ -253,7 +252,7 @@ def _inside(track: Trajectory, table: pa.Table, path: Path) -> NDArray[np.bool_]
     return np.asarray(inside)
 
 
-def _estimate(table: pa.Table, vehicle: Vehicle, truth: Truth) -> tuple[Trajectory, Floats]:
+def estimated_track(table: pa.Table, vehicle: Vehicle, truth: Truth) -> tuple[Trajectory, Floats]:
     """Return the estimated track of the truth's body, with its covariance."""
     xyh = np.column_stack([table[name].to_numpy() for name in ("x_m", "y_m", "heading_rad")])
     cov = np.column_stack([table[f"cov_{name}"].to_numpy() for name in COVARIANCES])
@@ -335,23 +334,22 @@ def map_shift(vehicle: Vehicle, truth: Truth) -> tuple[float, float]:
 
 
 def _ape(paired: Paired, how: Alignment) -> PoseErrorSummary:
-    errors = ape(paired.truth, align(paired.truth, paired.estimate, how))
-    return PoseErrorSummary(
-        statistics(errors.translation_m), statistics(np.rad2deg(errors.rotation_rad))
-    )
+    return _summary(ape(paired.truth, align(paired.truth, paired.estimate, how)))
 
 
 def _rpe(paired: Paired) -> dict[str, PoseErrorSummary]:
-    found: dict[str, PoseErrorSummary] = {}
-    way_m = _length(paired.estimate.xyz_m)
-    for size_m in RPE_M:
-        if size_m >= way_m:
-            continue
-        errors = rpe(paired.truth, paired.estimate, size_m)
-        found[f"{size_m:g} m"] = PoseErrorSummary(
-            statistics(errors.translation_m), statistics(np.rad2deg(errors.rotation_rad))
-        )
-    return found
+    distance_m = _length(paired.estimate.xyz_m)
+    return {
+        f"{size_m:g} m": _summary(rpe(paired.truth, paired.estimate, size_m))
+        for size_m in RPE_M
+        if size_m < distance_m
+    }
+
+
+def _summary(errors: PoseErrors) -> PoseErrorSummary:
+    return PoseErrorSummary(
+        statistics(errors.translation_m), statistics(np.rad2deg(errors.rotation_rad))
+    )
 
 
 def _length(xyz_m: Floats) -> float:

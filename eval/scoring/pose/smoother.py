@@ -30,7 +30,7 @@ from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.signals.kinds import Signal
 
 from .errors import FilterAndSmoother, NeesSummary, pair_poses, squared_errors, summarise_nees
-from .score import COVARIANCES, MAX_DIFFERENCE_NS, at_truths_point, load_truth
+from .score import MAX_DIFFERENCE_NS, at_truths_point, estimated_track, load_truth
 
 TURN_SIGNALS: Final = {"yaw rate": Signal.YAW_RATE, "steering": Signal.STEERING}
 MIN_STEP_NS: Final = 1_000_000_000
@@ -109,16 +109,7 @@ def score_smoother(
     smoothed = at_truths_point(
         found.t_ns, found.xyh, found.cov[:, UPPER[0], UPPER[1]], vehicle, truth
     )
-    table = run.table("pose")
-    names = ("x_m", "y_m", "heading_rad")
-    cov = [table[f"cov_{name}"].to_numpy() for name in COVARIANCES]
-    filtered = at_truths_point(
-        table["t_ns"].to_numpy(),
-        np.column_stack([table[name].to_numpy() for name in names]),
-        np.column_stack(cov),
-        vehicle,
-        truth,
-    )
+    filtered = estimated_track(run.table("pose"), vehicle, truth)
     result = _compared(true, filtered, smoothed, ranges)
     folder = run.file("score")
     folder.mkdir(exist_ok=True)

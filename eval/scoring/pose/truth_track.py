@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
+from crosscue.replay.columns import Floats, Int64s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,6 +17,6 @@ class TruthTrack:
         y_m: Shape (N,).
     """
 
-    t_ns: NDArray[np.int64]
-    x_m: NDArray[np.float64]
-    y_m: NDArray[np.float64]
+    t_ns: Int64s
+    x_m: Floats
+    y_m: Floats

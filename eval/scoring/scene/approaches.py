@@ -17,8 +17,9 @@ split; one without a true approach is extra.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -29,6 +30,7 @@ from crosscue.eval.scoring.columns import NONE, BeliefRows, RunTables
 from crosscue.eval.scoring.intervals import Mean, Proportion, fraction, mean
 from crosscue.eval.scoring.places import group_places
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
+from crosscue.replay.columns import Floats, Int64s
 
 from .detection import CONFIRM_FRAMES, RULES, Definition, Rule, held, is_range_right
 from .trade import Reached, TradePoint, reached, trade_off
@@ -104,9 +106,9 @@ class Curve:
     drive: str
     approach: int
     intersection: str
-    t_ns: NDArray[np.int64]
-    distance_m: NDArray[np.float64]
-    features: Mapping[str, NDArray[np.float64]]
+    t_ns: Int64s
+    distance_m: Floats
+    features: Mapping[str, Floats]
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,13 +224,15 @@ def judge_approaches(
     criteria = _Criteria(threshold, RULES[definition], not_looked_for)
     results, curves = [], []
     for one in truth.truth.approaches:
-        mine = _steps_of(kept, pairs.get(one.id), one)
-        others = [n for n in spans if n not in pairs.values() and overlap_ns(one, spans[n]) > 0]
         number = pairs.get(one.id)
-        result = _result(one, mine, number, len(others), tables, truth, criteria)
-        results.append(result)
+        mine = _steps_of(kept, number, one)
+        others = [n for n in spans if n not in pairs.values() and overlap_ns(one, spans[n]) > 0]
+        results.append(_result(one, mine, number, len(others), tables, truth, criteria))
         if len(mine.t_ns):
-            curves.append(_curve(one, mine, truth))
+            start_m = truth.start_m(mine.t_ns)
+            curves.append(
+                Curve(truth.drive, one.id, one.intersection, mine.t_ns, start_m, mine.features)
+            )
     extra, detected, outside = _extras(kept, spans, pairs, truth, threshold)
     return ApproachesJudged(
         tuple(results), tuple(curves), extra, detected, outside, int((~finite).sum())
@@ -354,7 +358,7 @@ def _result(
 
 
 def _is_range_right(
-    tables: RunTables, truth: DriveTruth, number: int | None, t_ns: NDArray[np.int64]
+    tables: RunTables, truth: DriveTruth, number: int | None, t_ns: Int64s
 ) -> NDArray[np.bool_]:
     """Return ``is_range_right``, or all True if the truth has no ranges."""
     rows = tables.ranges
@@ -364,7 +368,7 @@ def _is_range_right(
     return is_range_right(rows, true_m, number, t_ns)
 
 
-def _first(holds: NDArray[np.bool_], distance_m: NDArray[np.float64]) -> float | None:
+def _first(holds: NDArray[np.bool_], distance_m: Floats) -> float | None:
     places = np.flatnonzero(holds)
     return float(distance_m[places[0]]) if len(places) else None
 
@@ -407,7 +411,7 @@ def _never_changes(steps: BeliefRows, name: str) -> bool:
     return len(values) > 0 and bool((values == values[0]).all())
 
 
-def _has_range(tables: RunTables, number: int | None, t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _has_range(tables: RunTables, number: int | None, t_ns: Int64s) -> NDArray[np.bool_]:
     """Return True from the first range of an approach on, because its filter then keeps one."""
     if tables.ranges is None or number is None:
         return np.zeros(len(t_ns), np.bool_)
@@ -415,12 +419,6 @@ def _has_range(tables: RunTables, number: int | None, t_ns: NDArray[np.int64]) -
     if not mine.any():
         return np.zeros(len(t_ns), np.bool_)
     return np.asarray(t_ns >= tables.ranges.t_ns[mine].min())
-
-
-def _curve(one: Approach, steps: BeliefRows, truth: DriveTruth) -> Curve:
-    return Curve(
-        truth.drive, one.id, one.intersection, steps.t_ns, truth.start_m(steps.t_ns), steps.features
-    )
 
 
 def _extras(
@@ -477,16 +475,8 @@ def score_approaches(judged: Sequence[ApproachesJudged]) -> ApproachScore | None
             "full": _counts([one.why_not_full for one in results]),
         },
         trade=trade_off([Reached(one.full_below, one.greatest) for one in results], at),
-        by_intersection=_groups(
-            {one.intersection for one in results},
-            results,
-            lambda name, one: one.intersection == name,
-        ),
-        by_condition=_groups(
-            {tag for one in results for tag in one.conditions},
-            results,
-            lambda tag, one: tag in one.conditions,
-        ),
+        by_intersection=_groups(results, [(one.intersection,) for one in results]),
+        by_condition=_groups(results, [one.conditions for one in results]),
         results=results,
     )
 
@@ -495,16 +485,16 @@ def _is_unknown(distance_m: float | None) -> bool:
     return distance_m is not None and math.isnan(distance_m)
 
 
-def places_of_results(results: Sequence[ApproachResult]) -> NDArray[np.int64]:
+def places_of_results(results: Sequence[ApproachResult]) -> Int64s:
     """Return the number of each result's place, shape (N,)."""
     return group_places([one.place or f"{one.drive}, approach {one.approach}" for one in results])
 
 
-def _fraction(values: Sequence[bool], at: NDArray[np.int64]) -> Proportion:
+def _fraction(values: Sequence[bool], at: Int64s) -> Proportion:
     return fraction(np.array(values, np.bool_), at)
 
 
-def _mean(values: Sequence[float | None], at: NDArray[np.int64]) -> Mean:
+def _mean(values: Sequence[float | None], at: Int64s) -> Mean:
     return mean(np.array([math.nan if one is None else one for one in values], np.float64), at)
 
 
@@ -513,13 +503,12 @@ def _counts(names: Sequence[str]) -> dict[str, int]:
 
 
 def _groups(
-    names: set[str],
-    results: Sequence[ApproachResult],
-    belongs: Callable[[str, ApproachResult], bool],
+    results: Sequence[ApproachResult], names: Sequence[tuple[str, ...]]
 ) -> dict[str, ApproachGroup]:
+    """Return the groups by name; a result belongs to the groups that its names state."""
     groups: dict[str, ApproachGroup] = {}
-    for name in sorted(names):
-        mine = [one for one in results if belongs(name, one)]
+    for name in sorted(set(chain.from_iterable(names))):
+        mine = [one for one, own in zip(results, names, strict=True) if name in own]
         at = np.arange(len(mine))
         groups[name] = ApproachGroup(
             approaches=len(mine),

@@ -20,6 +20,7 @@ from crosscue.eval.scoring.intervals import Mean, Proportion, fraction, mean
 from crosscue.eval.scoring.places import cluster_numbers
 from crosscue.eval.scoring.pooling import first_reasons, sum_counts
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, has_feature
+from crosscue.replay.columns import Floats, Int64s
 
 # Probabilities are clipped to this and one minus this for the log score.
 CLIP: Final = 1e-6
@@ -44,9 +45,9 @@ class BeliefJudged:
 
     drive: str
     feature: str
-    t_ns: NDArray[np.int64]
-    approach: NDArray[np.int64]
-    probability: NDArray[np.float64]
+    t_ns: Int64s
+    approach: Int64s
+    probability: Floats
     is_there: NDArray[np.bool_]
     left_out: dict[str, int]
     places: Mapping[int, str] = field(default_factory=dict)
@@ -164,7 +165,7 @@ def judge_belief(tables: RunTables, truth: DriveTruth) -> list[BeliefJudged]:
     return judged
 
 
-def _labels(feature: str, at: NDArray[np.int64], truth: DriveTruth) -> NDArray[np.int8]:
+def _labels(feature: str, at: Int64s, truth: DriveTruth) -> NDArray[np.int8]:
     label = np.full(len(at), 0 if feature == "intersection" else NONE, np.int8)
     for one in truth.truth.approaches:
         there = has_feature(one, feature)
@@ -198,34 +199,27 @@ def _score(rows: Sequence[BeliefJudged]) -> BeliefScore:
     )
 
 
-def _pooled(
-    rows: Sequence[BeliefJudged],
-) -> tuple[NDArray[np.float64], NDArray[np.bool_], NDArray[np.int64]]:
+def _pooled(rows: Sequence[BeliefJudged]) -> tuple[Floats, NDArray[np.bool_], Int64s]:
     return (
-        np.concatenate([one.probability for one in rows]),
-        np.concatenate([one.is_there for one in rows]),
+        np.concatenate([np.empty(0), *(one.probability for one in rows)]),
+        np.concatenate([np.empty(0, np.bool_), *(one.is_there for one in rows)]),
         cluster_numbers(rows),
     )
 
 
-def brier(probability: NDArray[np.float64], is_there: NDArray[np.bool_]) -> NDArray[np.float64]:
+def brier(probability: Floats, is_there: NDArray[np.bool_]) -> Floats:
     """Return squared errors, (N,) (G. W. Brier, Monthly Weather Review 78, 1950, for one event)."""
     return np.asarray((probability - is_there) ** 2)
 
 
-def log_score(
-    probability: NDArray[np.float64], is_there: NDArray[np.bool_], clip: float = CLIP
-) -> NDArray[np.float64]:
+def log_score(probability: Floats, is_there: NDArray[np.bool_], clip: float = CLIP) -> Floats:
     """Return minus the logarithm of the clipped probability of the true state, shape (N,)."""
     likelihood = np.where(is_there, probability, 1.0 - probability)
     return np.asarray(-np.log(np.clip(likelihood, clip, 1.0 - clip)))
 
 
 def reliability_bins(
-    probability: NDArray[np.float64],
-    is_there: NDArray[np.bool_],
-    clusters: NDArray[np.int64],
-    bins: int = BINS,
+    probability: Floats, is_there: NDArray[np.bool_], clusters: Int64s, bins: int = BINS
 ) -> tuple[ReliabilityBin, ...]:
     """Return bins of equal width in probability, without empty bins."""
     place = np.minimum((probability * bins).astype(np.int64), bins - 1)
@@ -269,10 +263,8 @@ def _difference(first: Sequence[BeliefJudged], second: Sequence[BeliefJudged]) -
         if other is not None:
             _, mine, theirs = np.intersect1d(one.t_ns, other.t_ns, return_indices=True)
             pairs.append((_taken(one, mine), _taken(other, theirs)))
-    there = np.concatenate([np.empty(0, np.bool_), *(a.is_there for a, _ in pairs)])
-    p = np.concatenate([np.empty(0), *(a.probability for a, _ in pairs)])
-    q = np.concatenate([np.empty(0), *(b.probability for _, b in pairs)])
-    clusters = cluster_numbers([a for a, _ in pairs])
+    p, there, clusters = _pooled([a for a, _ in pairs])
+    q, _, _ = _pooled([b for _, b in pairs])
     log = mean(log_score(q, there) - log_score(p, there), clusters)
     return BeliefDifference(
         steps=len(there),

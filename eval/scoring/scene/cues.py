@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from crosscue.eval.scoring.intervals import Proportion, fraction
 from crosscue.eval.scoring.places import cluster_numbers
 from crosscue.eval.scoring.pooling import BINS_M, distance_bins, first_reasons, sum_counts
 from crosscue.eval.scoring.truth import FEATURES, DriveTruth, cue_at, has_feature
+from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.vehicle.vehicle import CUES, Scoring
 
 Reading = Scoring
@@ -63,14 +64,14 @@ class CueFrames:
 
     drive: str
     cue: str
-    t_ns: NDArray[np.int64]
-    count: NDArray[np.int64]
-    approach: NDArray[np.int64]
-    distance_m: NDArray[np.float64]
+    t_ns: Int64s
+    count: Int64s
+    approach: Int64s
+    distance_m: Floats
     is_object: NDArray[np.int8]
     is_feature: NDArray[np.int8]
-    true_count: NDArray[np.int64]
-    visible: NDArray[np.float64]
+    true_count: Int64s
+    visible: Floats
     frames: int
     moments_unmatched: int
     left_out: Mapping[Reading, Mapping[str, int]]
@@ -192,9 +193,7 @@ def features_not_looked_for(tables: RunTables) -> frozenset[str]:
     return frozenset(FEATURES) - shown
 
 
-def _judge(
-    cue: str, rows: CueRows, frames: NDArray[np.int64], truth: DriveTruth, ambiguous: int
-) -> CueFrames:
+def _judge(cue: str, rows: CueRows, frames: Int64s, truth: DriveTruth, ambiguous: int) -> CueFrames:
     looked, count = _largest(rows, cue)
     spans = [one for one in truth.truth.cues if one.cue == cue]
     is_object = cue in CUES and CUES[cue].scored_as == "object"
@@ -229,7 +228,7 @@ def _judge(
     )
 
 
-def _largest(rows: CueRows, cue: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _largest(rows: CueRows, cue: str) -> tuple[Int64s, Int64s]:
     """Return the distinct times at which a cue was searched, and the largest count of each."""
     mine = rows.cue == cue
     times, which = np.unique(rows.t_ns[mine], return_inverse=True)
@@ -238,7 +237,7 @@ def _largest(rows: CueRows, cue: str) -> tuple[NDArray[np.int64], NDArray[np.int
     return times, count
 
 
-def _feature_at(cue: str, t_ns: NDArray[np.int64], truth: DriveTruth) -> NDArray[np.int8]:
+def _feature_at(cue: str, t_ns: Int64s, truth: DriveTruth) -> NDArray[np.int8]:
     """Return whether the feature of the cue is true at each time; ``NONE`` unknown."""
     found = np.full(len(t_ns), NONE, np.int8)
     if cue not in CUES or not truth.truth.approaches:
@@ -279,15 +278,12 @@ def is_wrong(cue: CueFrames) -> NDArray[np.bool_]:
     return np.asarray((cue.count > 0) & (leading == 0))
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Pooled:
     """Rows of one cue of all drives, with the number of the place of each row."""
 
     rows: Sequence[CueFrames]
-    cluster: NDArray[np.int64] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.cluster = cluster_numbers(self.rows)
+    cluster: Int64s
 
     def tag_masks(self) -> dict[str, NDArray[np.bool_]]:
         """Return masks of the rows by tag of the approach; ``no tag`` for the others."""
@@ -301,11 +297,8 @@ class _Pooled:
         has["no tag"] = [not some for some in tags]
         return {name: np.array(holds, np.bool_) for name, holds in has.items()}
 
-    def ints(self, name: str) -> NDArray[np.int64]:
-        return np.concatenate([getattr(one, name) for one in self.rows]).astype(np.int64)
-
-    def floats(self, name: str) -> NDArray[np.float64]:
-        return np.concatenate([getattr(one, name) for one in self.rows]).astype(np.float64)
+    def column(self, name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(one, name) for one in self.rows])
 
 
 def score_cues(
@@ -324,7 +317,7 @@ def score_cues(
 
 
 def _score(cue: str, rows: Sequence[CueFrames], bins_m: Sequence[float]) -> CueScore:
-    pooled = _Pooled(rows)
+    pooled = _Pooled(rows, cluster_numbers(rows))
     readings: dict[Reading, CueMetrics] = {
         reading: _judgement(pooled, reading, bins_m) for reading in ("object", "feature")
     }
@@ -347,12 +340,12 @@ def _score(cue: str, rows: Sequence[CueFrames], bins_m: Sequence[float]) -> CueS
 
 
 def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float]) -> CueMetrics:
-    truth = pooled.ints("is_object" if reading == "object" else "is_feature")
+    truth = pooled.column("is_object" if reading == "object" else "is_feature")
     left_out = sum_counts(one.left_out[reading] for one in pooled.rows)
     frames = sum(one.frames for one in pooled.rows)
     known = truth != NONE
-    cut = _Cut(truth, pooled.ints("count") > 0, pooled.cluster, reading == "object")
-    visible = pooled.floats("visible")
+    cut = _Cut(truth, pooled.column("count") > 0, pooled.cluster, reading == "object")
+    visible = pooled.column("visible")
     # An object of unknown visibility counts as seen.
     seen = known & ((truth == 0) | np.isnan(visible) | (visible >= SEEN))
     return CueMetrics(
@@ -366,7 +359,7 @@ def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float]) -> Cu
         recall_seen=cut.recall(seen),
         by_distance={
             name: cut.part(known & mask)
-            for name, mask in distance_bins(pooled.floats("distance_m"), bins_m).items()
+            for name, mask in distance_bins(pooled.column("distance_m"), bins_m).items()
             if (known & mask).any()
         },
         by_condition={
@@ -381,9 +374,9 @@ def _judgement(pooled: _Pooled, reading: Reading, bins_m: Sequence[float]) -> Cu
 class _Cut:
     """Precision and recall over any subset of frames."""
 
-    truth: NDArray[np.int64]
+    truth: NDArray[np.int8]
     is_found: NDArray[np.bool_]
-    cluster: NDArray[np.int64]
+    cluster: Int64s
     has_recall: bool
 
     def precision(self, rows: NDArray[np.bool_]) -> Proportion:
@@ -401,7 +394,7 @@ class _Cut:
 
 
 def _things(pooled: _Pooled) -> Things:
-    true, found = pooled.ints("true_count"), pooled.ints("count")
+    true, found = pooled.column("true_count"), pooled.column("count")
     known = true != NONE
     true, found = true[known], found[known]
     return Things(

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.eval.scoring.columns import RangeRows
+from crosscue.replay.columns import Floats, Int64s
 
 Definition = Literal["confirmed", "published"]
 CONFIRM_FRAMES: Final = 3
@@ -54,10 +55,7 @@ def held(holds: Flags, frames: int) -> Flags:
 
 
 def is_range_right(
-    rows: RangeRows,
-    true_m: tuple[NDArray[np.float64], NDArray[np.float64]],
-    number: int,
-    t_ns: NDArray[np.int64],
+    rows: RangeRows, true_m: tuple[Floats, Floats], number: int, t_ns: Int64s
 ) -> Flags:
     """Return whether the latest range at each time is within its 95 % interval of the true range.
 

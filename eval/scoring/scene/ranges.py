@@ -19,6 +19,7 @@ from crosscue.eval.scoring.pooling import BINS_M, distance_bins, first_reasons, 
 from crosscue.eval.scoring.pose.errors import FilterAndSmoother, NeesSummary, summarise_nees
 from crosscue.eval.scoring.truth import DriveTruth
 from crosscue.fusion.intersection_range import RangeBelief, predict, smooth_ranges
+from crosscue.replay.columns import Floats, Int64s
 
 # Squared jump of a range, in units of its variance, above which the filter has restarted.
 RESTART_NIS: Final = 25.0
@@ -43,11 +44,11 @@ class RangeJudged:
 
     drive: str
     reference: str
-    t_ns: NDArray[np.int64]
-    approach: NDArray[np.int64]
-    true_m: NDArray[np.float64]
-    error_m: NDArray[np.float64]
-    var_m2: NDArray[np.float64]
+    t_ns: Int64s
+    approach: Int64s
+    true_m: Floats
+    error_m: Floats
+    var_m2: Floats
     left_out: dict[str, int]
     controls: Mapping[int, str]
     places: Mapping[int, str] = field(default_factory=dict)
@@ -92,7 +93,7 @@ class RangeScore:
     by_control: dict[str, RangeBin]
 
 
-def sds_off(judged: RangeJudged) -> NDArray[np.float64]:
+def sds_off(judged: RangeJudged) -> Floats:
     """Return absolute errors in standard deviations, shape (N,)."""
     return np.asarray(np.abs(judged.error_m) / np.sqrt(judged.var_m2), np.float64)
 
@@ -243,11 +244,11 @@ def _by_control(rows: Sequence[RangeJudged]) -> dict[str, NDArray[np.bool_]]:
     return {name: found == name for name in sorted(set(names) - {""})}
 
 
-def _rms(error: NDArray[np.float64]) -> float:
+def _rms(error: Floats) -> float:
     return float(np.sqrt(np.mean(error**2))) if len(error) else math.nan
 
 
-def _bin(error: NDArray[np.float64], nees: NDArray[np.float64]) -> RangeBin:
+def _bin(error: Floats, nees: Floats) -> RangeBin:
     return RangeBin(
         rows=len(error),
         bias_m=float(error.mean()),

@@ -191,10 +191,7 @@ def _frame_near(one: RunScored) -> FrameDetections | None:
     if manifest.detected is None:
         return None
     frames = stored_frames(one.run, manifest.detected, manifest.settings, with_road_masks=True)
-    for frame in frames:
-        if frame.t_ns == wanted:
-            return frame
-    return None
+    return next((frame for frame in frames if frame.t_ns == wanted), None)
 
 
 def _picture(camera: StoredCamera, frame: FrameDetections, run: RunFolder) -> Bytes | None:

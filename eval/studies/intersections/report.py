@@ -111,7 +111,7 @@ def _tables(
         "intersections": intersection_rows(approaches.results),
         "findings": [asdict(one) for one in found],
         "causes": by_cause(found),
-        "conditions": [asdict(one) for one in condition_costs(approaches.results)],
+        "conditions": condition_costs(approaches.results),
         "quoted": quoted_rows(scored),
         "cues": cue_rows(scored.scores.cues, scored.tracked),
         "attribution": attribution_rows(scored),
@@ -382,41 +382,20 @@ def mean_text(mean: Mean) -> str:
     return f"{mean.value:.1f} m ({between(mean.low, mean.high, '.1f')})"
 
 
-@dataclass(frozen=True, slots=True)
-class ConditionCost:
-    """Effect of a condition, compared with good conditions at the same intersections.
-
-    Attributes:
-        condition: Tag of the condition.
-        approaches: Number of approaches with it, at intersections with approaches in good
-            conditions.
-        detected_m: Difference in the distance at detection; negative is later.
-        full_m: Difference in the distance at full detection; negative is later.
-        undetected: Number of those approaches that were never detected, unlike good ones.
-        not_full: Number of those approaches that were never fully detected, unlike good ones.
-    """
-
-    condition: str
-    approaches: int
-    detected_m: Mean
-    full_m: Mean
-    undetected: int
-    not_full: int
-
-
-def condition_costs(results: Sequence[ApproachResult]) -> tuple[ConditionCost, ...]:
+def condition_costs(results: Sequence[ApproachResult]) -> list[Row]:
     """Compare every bad condition with good conditions at the same intersection.
 
-    Conditions that always apply at an intersection (its vegetation) have no comparison and are
-    ignored.
+    Differences in distance are negative if detection is later; ``undetected`` and ``not_full``
+    count approaches unlike good ones. Conditions that always apply at an intersection (its
+    vegetation) have no comparison and are ignored.
     """
     always = _always(results)
     tags = sorted({tag for one in results for tag in one.conditions} - GOOD)
-    return tuple(
+    return [
         _cost(tag, results, always)
         for tag in tags
         if any(tag in _changing(one, always) for one in results)
-    )
+    ]
 
 
 def _always(results: Sequence[ApproachResult]) -> dict[str, frozenset[str]]:
@@ -431,29 +410,23 @@ def _changing(one: ApproachResult, always: Mapping[str, frozenset[str]]) -> set[
     return set(one.conditions) - GOOD - always[one.intersection]
 
 
-def _cost(
-    tag: str, results: Sequence[ApproachResult], always: Mapping[str, frozenset[str]]
-) -> ConditionCost:
+def _cost(tag: str, results: Sequence[ApproachResult], always: Mapping[str, frozenset[str]]) -> Row:
     good: dict[str, list[ApproachResult]] = {}
     for one in results:
         if not _changing(one, always):
             good.setdefault(one.intersection, []).append(one)
     bad = [one for one in results if tag in _changing(one, always) and one.intersection in good]
-    pairs = [(one, good[one.intersection]) for one in bad]
-    detected = [_less(one.detected_m, [g.detected_m for g in some]) for one, some in pairs]
-    full = [_less(one.full_m, [g.full_m for g in some]) for one, some in pairs]
     at = places_of_results(bad)
-    return ConditionCost(
-        tag,
-        len(bad),
-        mean(np.array(detected), at),
-        mean(np.array(full), at),
-        sum(
-            one.detected_m is None and any(g.detected_m is not None for g in some)
-            for one, some in pairs
-        ),
-        sum(one.full_m is None and any(g.full_m is not None for g in some) for one, some in pairs),
-    )
+    row: Row = {"condition": tag, "approaches": len(bad)}
+    never: dict[str, int] = {}
+    for name, missed in (("detected_m", "undetected"), ("full_m", "not_full")):
+        pairs = [
+            (getattr(one, name), [getattr(other, name) for other in good[one.intersection]])
+            for one in bad
+        ]
+        row[name] = asdict(mean(np.array([_less(*pair) for pair in pairs]), at))
+        never[missed] = sum(m is None and any(g is not None for g in some) for m, some in pairs)
+    return row | never
 
 
 def _less(value: float | None, others: Sequence[float | None]) -> float:

@@ -93,11 +93,7 @@ def run_intersection_study(
         check(choice)
     folder = Path(output)
     done = run_drives(
-        folder,
-        study.scenes(),
-        study.detectors,
-        engine_of(workers, ray),
-        vehicle=study.vehicle,
+        folder, study.scenes(), study.detectors, engine_of(workers, ray), vehicle=study.vehicle
     )
     names = [one.job.name for one in done if one.error is None]
     if not names:
@@ -128,15 +124,13 @@ def score_intersection_study(
     first = [one.judged for one in scored]
     tracked = pool_scores([_again(one, _with_tracks(one)) for one in scored], AS_PUBLISHED).cues
     learned = calibrated_vehicles(scored)
-    if learned is None:
-        return StudyScores(scored, pool_scores(first, AS_PUBLISHED), worth, tracked, None, {})
-    second = [_again(one, vehicle) for one, vehicle in zip(scored, learned, strict=True)]
+    second = [_again(one, vehicle) for one, vehicle in zip(scored, learned or (), strict=False)]
     return StudyScores(
         scored,
         pool_scores(first, AS_PUBLISHED),
         worth,
         tracked,
-        pool_scores(second, AS_PUBLISHED),
+        pool_scores(second, AS_PUBLISHED) if second else None,
         compare_belief(
             [part for one in first for part in one.belief],
             [part for one in second for part in one.belief],

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from crosscue.datasets.scenes.layout import SCORED
-from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
+from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width, scenes_of
 from crosscue.detectors.registry import EMBEDDED
 from crosscue.replay.errors import UsageError
 from crosscue.verb import Option
@@ -58,9 +58,4 @@ class IntersectionStudy:
 
     def scenes(self) -> tuple[SceneSettings, ...]:
         """Return all drives, in the order of processing."""
-        camera = camera_of_width(self.width_px)
-        return tuple(
-            SceneSettings(layout=layout, run=run, seed=self.seed, camera=camera)
-            for run in range(1, self.runs + 1)
-            for layout in self.layouts
-        )
+        return scenes_of(self.layouts, self.runs, self.seed, self.width_px)

@@ -16,11 +16,7 @@ from crosscue.datasets.scenes.faulty_labels import DETECTORS, LABEL_IMAGES
 from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.eval.batch.jobs import JobOutcome, exit_status_of
 from crosscue.eval.batch.ray_jobs import engine_of
-from crosscue.eval.fit.annotated_runs import (
-    annotated_approaches,
-    annotated_drives,
-    graph_of_runs,
-)
+from crosscue.eval.fit.annotated_runs import annotated_approaches, annotated_drives, graph_of_runs
 from crosscue.eval.pipeline.outcome import Outcome
 from crosscue.eval.pipeline.scene.variants import scene_tables
 from crosscue.eval.runs.folder import RunFolder, open_run

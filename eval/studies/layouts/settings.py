@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Final, Literal, get_args
 
 from crosscue.datasets.scenes.layout import KINDS, mixed_layout
-from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
+from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width, scenes_of
 from crosscue.replay.errors import UsageError
 from crosscue.verb import Option
 
@@ -78,9 +78,4 @@ class LayoutStudy:
 
     def scenes(self) -> tuple[SceneSettings, ...]:
         """Return all drives in the order of processing: one of each layout, then the next."""
-        camera = camera_of_width(self.width_px)
-        return tuple(
-            SceneSettings(layout=layout, run=run, seed=self.seed, camera=camera)
-            for run in range(1, self.runs + 1)
-            for layout in self.layouts
-        )
+        return scenes_of(self.layouts, self.runs, self.seed, self.width_px)

@@ -15,12 +15,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.datasets.simulated.drive import FIELD_T, FILES_OF_DRIVE, START_NS
-from crosscue.datasets.simulated.log_files import (
-    BUS,
-    SOURCE,
-    batches,
-    can_frames,
-)
+from crosscue.datasets.simulated.log_files import BUS, SOURCE, batches, can_frames
 from crosscue.datasets.simulated.log_files import MAGNETOMETER as COMPASS
 from crosscue.datasets.truth.truth import Mounting
 from crosscue.datasets.truth.tum import planar, write_track_truth

@@ -132,11 +132,7 @@ def field_study_of(
         minutes: Max duration of a run, in minutes.
     """
     return study_of(
-        FieldStudy,
-        seed=seed,
-        range_runs=range_runs,
-        landmark_runs=landmark_runs,
-        minutes=minutes,
+        FieldStudy, seed=seed, range_runs=range_runs, landmark_runs=landmark_runs, minutes=minutes
     )
 
 
@@ -182,11 +178,7 @@ def run_field_study(
 
 
 def drive_field(
-    study: FieldStudy,
-    folder: Path,
-    workers: int,
-    *,
-    overwrite: bool = False,
+    study: FieldStudy, folder: Path, workers: int, *, overwrite: bool = False
 ) -> Iterator[tuple[float, FieldRun]]:
     """Simulate, replay and score every run; yield the fraction done and the run, in order.
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.eval.studies.intervals import (
     ValueInterval,
@@ -31,6 +30,7 @@ from crosscue.eval.studies.pictures import COLOURS, figure, save_figure
 from crosscue.eval.studies.study import PageTable
 from crosscue.localization.town.drive import DriveOutcome
 from crosscue.localization.town.settings import TownDrive
+from crosscue.replay.columns import Floats
 from crosscue.replay.safe_text import counted
 
 from .settings import LandmarkStudy
@@ -153,9 +153,7 @@ class LandmarkResult:
     comparisons: tuple[StrategyComparison, ...]
 
 
-def summarise_landmarks(
-    study: LandmarkStudy, rows: Sequence[dict[str, NDArray[np.float64]]]
-) -> LandmarkResult:
+def summarise_landmarks(study: LandmarkStudy, rows: Sequence[dict[str, Floats]]) -> LandmarkResult:
     """Return the results from the drives of each case; strategies are compared on the grid."""
     cases = study.cases()
     cells = tuple(_cell(case.settings, part) for case, part in zip(cases, rows, strict=True))
@@ -163,7 +161,7 @@ def summarise_landmarks(
     return LandmarkResult(cells, tuple(_comparisons(cells[:grid], rows[:grid])))
 
 
-def _cell(settings: TownDrive, rows: dict[str, NDArray[np.float64]]) -> Cell:
+def _cell(settings: TownDrive, rows: dict[str, Floats]) -> Cell:
     outcome = rows["outcome"]
     reached = outcome == DriveOutcome.REACHED
     return Cell(
@@ -181,7 +179,7 @@ def _cell(settings: TownDrive, rows: dict[str, NDArray[np.float64]]) -> Cell:
 
 
 def _comparisons(
-    cells: Sequence[Cell], rows: Sequence[dict[str, NDArray[np.float64]]]
+    cells: Sequence[Cell], rows: Sequence[dict[str, Floats]]
 ) -> list[StrategyComparison]:
     places = {(c.strategy, c.landmarks_per_km2, c.detection_rate): i for i, c in enumerate(cells)}
     strategies = [s for s in dict.fromkeys(c.strategy for c in cells) if s != STRAIGHT]
@@ -206,7 +204,7 @@ def _comparison(
     strategy: str,
     pairs: Sequence[tuple[int, int]],
     cells: Sequence[Cell],
-    rows: Sequence[dict[str, NDArray[np.float64]]],
+    rows: Sequence[dict[str, Floats]],
 ) -> StrategyComparison:
     ours, theirs, better = [], [], []
     ways, reached = [], []
@@ -224,7 +222,6 @@ def _comparison(
         if math.isfinite(mine.range_m.value) and math.isfinite(straight.range_m.value)
     )
     way = np.concatenate(ours), np.concatenate(theirs)
-    ratio = ratio_of(*way) if len(way[0]) else ValueInterval(math.nan, math.nan, math.nan)
     driven, there = np.concatenate(ways, axis=1), np.concatenate(reached, axis=1)
     per_km2 = np.repeat([cells[i].landmarks_per_km2 for i, _ in pairs], [len(w[0]) for w in ways])
     area_km2 = np.concatenate([rows[i]["area_km2"] for i, _ in pairs])
@@ -237,7 +234,7 @@ def _comparison(
             CityExtra(low, high, _extra(driven, there * ((area_km2 >= low) & (area_km2 < high))))
             for low, high in pairwise(CITY_BORDERS_KM2)
         ),
-        extra=_less_one(ratio),
+        extra=_less_one(ratio_of(*way)),
         extra_all=_less_one(ratio_of(*driven)),
         published_extra=PUBLISHED_EXTRA.get(strategy, math.nan),
         gains_m=gains,
@@ -247,7 +244,7 @@ def _comparison(
     )
 
 
-def _extra(driven: NDArray[np.float64], there: NDArray[np.float64]) -> ValueInterval:
+def _extra(driven: Floats, there: Floats) -> ValueInterval:
     """Return the extra distance; arrays have shape (2, N): this strategy, straight to goal."""
     return _less_one(ratio_of_means(driven[0], there[0], driven[1], there[1]))
 
@@ -262,7 +259,7 @@ def _published_extra(one: StrategyComparison) -> str:
 
 def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[PageTable, ...]:
     """Return the results as tables, with the published ones."""
-    grid = result.cells[: len(result.cells) - len(study.points)]
+    grid = _grid(study, result)
     by_strategy = [
         PageTable(
             f"Range at 80 % success, km: {strategy}",
@@ -347,10 +344,7 @@ def tables(study: LandmarkStudy, result: LandmarkResult) -> tuple[PageTable, ...
 
 
 def draw_landmark_study(
-    study: LandmarkStudy,
-    result: LandmarkResult,
-    rows: Sequence[dict[str, NDArray[np.float64]]],
-    folder: Path,
+    study: LandmarkStudy, result: LandmarkResult, rows: Sequence[dict[str, Floats]], folder: Path
 ) -> list[Path]:
     """Write ``landmarks_range`` and ``landmarks_success`` as PNG and SVG; return the PNGs."""
     farthest_m = max(float(part["straight_m"].max()) for part in rows)
@@ -432,7 +426,7 @@ def _range_line(axes: Axes, cells: Sequence[Cell], colour: str, top: float, shif
 def _successes(
     study: LandmarkStudy,
     result: LandmarkResult,
-    rows: Sequence[dict[str, NDArray[np.float64]]],
+    rows: Sequence[dict[str, Floats]],
     rate: float,
     folder: Path,
 ) -> Path:
@@ -461,7 +455,7 @@ def _successes(
     return save_figure(made, folder, "landmarks_success")
 
 
-def _success(axes: Axes, part: dict[str, NDArray[np.float64]], colour: str, label: str) -> None:
+def _success(axes: Axes, part: dict[str, Floats], colour: str, label: str) -> None:
     distance_m = part["straight_m"]
     reached = (part["outcome"] == DriveOutcome.REACHED).astype(np.float64)
     a, b = logistic(distance_m, reached, np.ones((1, len(reached))))

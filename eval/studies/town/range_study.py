@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.studies.intervals import (
@@ -29,6 +28,7 @@ from crosscue.eval.studies.pictures import COLOURS, figure, save_figure
 from crosscue.localization.town.drive import DriveOutcome, DriveResult, drive_many
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import TownDrive
+from crosscue.replay.columns import Floats
 
 from .settings import UNTIL_LOST, RangeStudy, changed
 
@@ -72,9 +72,9 @@ class Growth:
     square: float
     crossing_m: ValueInterval
 
-    def axis_m(self, distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    def axis_m(self, distance_m: Floats) -> Floats:
         """Return the major axis at given distances."""
-        axis: NDArray[np.float64] = np.sqrt(
+        axis: Floats = np.sqrt(
             self.start_m2 + self.linear_m * distance_m + self.square * distance_m**2
         )
         return axis
@@ -119,17 +119,13 @@ class CompassResult:
     is_calibrated: bool
 
 
-def summarise_ranges(
-    study: RangeStudy, rows: Sequence[dict[str, NDArray[np.float64]]]
-) -> list[CompassResult]:
+def summarise_ranges(study: RangeStudy, rows: Sequence[dict[str, Floats]]) -> list[CompassResult]:
     """Return the results by compass, in the order of the study's cases."""
     cases = zip(study.cases(), rows, strict=True)
     return [_of_case(case.settings, part) for case, part in cases]
 
 
-def loss_points(
-    rows: dict[str, NDArray[np.float64]],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def loss_points(rows: dict[str, Floats]) -> tuple[Floats, Floats]:
     """Return distance and major axis of each drive at its first goal, or at an earlier loss."""
     reached = ~np.isnan(rows["first_goal_m"])
     distance = np.where(reached, rows["first_goal_m"], rows["travelled_m"])
@@ -186,7 +182,7 @@ def calibrate(drive: TownDrive, workers: int, tolerance: float = 2e-3) -> float:
             interval_m *= mean_m / wanted_m
 
 
-def _of_case(settings: TownDrive, rows: dict[str, NDArray[np.float64]]) -> CompassResult:
+def _of_case(settings: TownDrive, rows: dict[str, Floats]) -> CompassResult:
     sensors = settings.sensors
     n = len(rows["outcome"])
     is_lost = rows["outcome"] == DriveOutcome.LOST
@@ -213,9 +209,7 @@ def _of_case(settings: TownDrive, rows: dict[str, NDArray[np.float64]]) -> Compa
     )
 
 
-def fit_growth(
-    distance_m: NDArray[np.float64], axis_m: NDArray[np.float64], start_m: float, limit_m: float
-) -> Growth:
+def fit_growth(distance_m: Floats, axis_m: Floats, start_m: float, limit_m: float) -> Growth:
     """Fit the growth by least squares of relative errors of axis^2, with coefficients >= 0.
 
     Args:
@@ -322,7 +316,7 @@ def choice_tree(choice: CompassCase) -> dict[str, object]:
 
 def draw_range_study(
     results: Sequence[CompassResult],
-    rows: Sequence[dict[str, NDArray[np.float64]]],
+    rows: Sequence[dict[str, Floats]],
     limit_m: float,
     folder: Path,
 ) -> Path:
@@ -358,9 +352,7 @@ def compass_name(result: CompassResult) -> str:
     return "no compass" if degrees is None else f"compass ±{degrees:g}° (2 sigma)"
 
 
-def _growth(
-    axes: Axes, result: CompassResult, columns: dict[str, NDArray[np.float64]], colour: str
-) -> None:
+def _growth(axes: Axes, result: CompassResult, columns: dict[str, Floats], colour: str) -> None:
     distance_m, axis_m = loss_points(columns)
     axes.plot(distance_m * KM, axis_m, ".", ms=1.5, alpha=0.35, color=colour, rasterized=True)
     curve_m = np.linspace(0.0, FIRST_GOAL_KM / KM, 400)
@@ -373,9 +365,7 @@ def _growth(
     )
 
 
-def _survival(
-    axes: Axes, result: CompassResult, columns: dict[str, NDArray[np.float64]], colour: str
-) -> None:
+def _survival(axes: Axes, result: CompassResult, columns: dict[str, Floats], colour: str) -> None:
     lost_m = np.sort(columns["travelled_m"][columns["outcome"] == DriveOutcome.LOST])
     left = 1.0 - np.arange(len(lost_m) + 1) / result.drives
     end_m = max(60_000.0, float(lost_m[-1]) if len(lost_m) else 0.0)

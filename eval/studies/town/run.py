@@ -166,11 +166,7 @@ def _finished(
 
 
 def drive_study(
-    study: RangeStudy | LandmarkStudy,
-    folder: Path,
-    workers: int,
-    *,
-    overwrite: bool = False,
+    study: RangeStudy | LandmarkStudy, folder: Path, workers: int, *, overwrite: bool = False
 ) -> Iterator[float]:
     """Simulate all drives of a study, and yield the fraction done.
 
@@ -275,10 +271,7 @@ def choices_table(choices: Sequence[range_study.CompassCase]) -> PageTable:
     def lost_after(compass: float | None) -> tuple[str, Callable[[Any], str]]:
         name = "none" if compass is None else f"{compass:g} degrees"
         published_km = range_study.PUBLISHED_M[compass] / 1e3
-        return (
-            f"{name}, {published_km:.1f} published",
-            lambda one: km(one.lost_after_m[compass]),
-        )
+        return (f"{name}, {published_km:.1f} published", lambda one: km(one.lost_after_m[compass]))
 
     return PageTable.of(
         f"Mean distance at loss with other choices, km ({choices[0].drives} drives each)",

@@ -214,7 +214,7 @@ def test_extra_and_split_approaches_are_counted() -> None:
         belief_table({**BELIEF, "intersection": {70: 0.95}}, 4, range(70, 75)),
     ]
     joined = pa.concat_tables([p.select(["t_ns", "approach", "intersection"]) for p in pieces])
-    judged = judged_of(run_tables("made up", belief_table=joined), truth([], [far]))
+    judged = judged_of(run_tables("made up", {"belief": joined}), truth([], [far]))
     assert (judged.extra, judged.extra_detected, judged.not_judged) == (1, 1, 1)
     assert judged.results[0].splits == 1
 

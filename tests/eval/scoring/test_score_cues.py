@@ -101,9 +101,9 @@ def test_hidden_objects_do_not_count_in_visible_recall() -> None:
 def test_order_of_rows_does_not_matter(frames: dict[int, int]) -> None:
     table = cue_table({"stop_sign": frames, "road_left": frames})
     order = np.random.default_rng(len(frames)).permutation(table.num_rows)
-    shuffled = run_tables("made up", cues_table=table.take(order))
+    shuffled = run_tables("made up", {"cues": table.take(order)})
 
-    first = score_cues(match_cues(run_tables("made up", cues_table=table), good_truth()))
+    first = score_cues(match_cues(run_tables("made up", {"cues": table}), good_truth()))
     second = score_cues(match_cues(shuffled, good_truth()))
     assert repr(first) == repr(second)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
@@ -23,7 +24,7 @@ from crosscue.eval.scoring.drives import ScoreSettings, as_metrics
 from crosscue.eval.scoring.gates import Gate, check_gates
 from crosscue.eval.scoring.metric_values import MetricValue, metric_values
 from crosscue.eval.scoring.truth import read_scored_truth
-from crosscue.replay.errors import SchemaError
+from crosscue.replay.errors import SchemaError, UsageError
 from crosscue.replay.files.tree_text import strict_json
 from support.commands import json_of, output_of
 from support.refusals import refusal
@@ -325,6 +326,11 @@ def test_what_is_missing_is_not_scored(tmp_path: Path) -> None:
         "range": "the run has no range",
     }
     assert scores.settings.threshold == 0.8
+
+
+def test_table_that_is_not_scored_is_refused() -> None:
+    with pytest.raises(UsageError, match="tables: ranges; expected frames, cues, range or belief"):
+        crosscue.score({"ranges": pa.table({})}, good_truth().truth)
 
 
 def test_metrics_of_unpaired_drives_are_not_reported_as_lost() -> None:

@@ -129,5 +129,5 @@ def test_permanent_condition_of_intersection_does_not_exclude_good_runs() -> Non
     ]
     (cost,) = condition_costs(runs)
 
-    assert cost.condition == "dusk"
-    assert cost.detected_m.value == pytest.approx(-10.0)
+    assert cost["condition"] == "dusk"
+    assert cost["detected_m"]["value"] == pytest.approx(-10.0)
