@@ -31,8 +31,8 @@ from crosscue.eval.drives.score_runs import score_runs as score_runs
 from crosscue.eval.failures.browse import browse as browse
 from crosscue.eval.failures.imported_truth import import_truth as import_truth
 from crosscue.eval.failures.labels import export as export
+from crosscue.eval.failures.record import read_failures as read_failures
 from crosscue.eval.failures.search import failures as failures
-from crosscue.eval.failures.search import read_failures as read_failures
 from crosscue.eval.fit.compass import fit_compass as fit_compass
 from crosscue.eval.fit.detector.fit import fit_detector as fit_detector
 from crosscue.eval.fit.gnss_truth import truth_from_gnss as truth_from_gnss

@@ -354,10 +354,6 @@ def _is_vehicle(file: str, tree: Mapping[str, Any]) -> bool:
     return Path(file).suffix == ".toml" or bool(tree.keys() & Vehicle.model_fields.keys())
 
 
-def _check_seal(file: str, together: Together) -> Result:
-    return check_seal(file.removesuffix(SUFFIX))
-
-
 def _check_drive(file: str, together: Together) -> Result:
     """Judge the drive of all logs, in the row of the first; a log with others only by its seal."""
     logs = together.of_kind("log")
@@ -412,7 +408,11 @@ def _check_vehicle(file: str, together: Together) -> Result:
 
 # Kinds of files, in the order in which they are tried.
 KINDS: Final = (
-    Kind("seal", lambda file, tree: file.endswith(SUFFIX), _check_seal),
+    Kind(
+        "seal",
+        lambda file, tree: file.endswith(SUFFIX),
+        lambda file, together: check_seal(file.removesuffix(SUFFIX)),
+    ),
     Kind("run", lambda file, tree: (Path(file) / MANIFEST).is_file(), _check_run),
     Kind("truth", _is_truth, _check_truth),
     Kind("model card", lambda file, tree: "weights" in tree, _check_model),

@@ -288,7 +288,9 @@ class BatchStatus(Result):
                     yield f"          {one.log}"
             elif one.state is DriveState.STALE:
                 where = f" on {one.host}" if one.host else ""
-                yield f"stale     {one.run.name}: its worker{where} is gone, {_heard(one)}"
+                is_known = math.isfinite(one.silent_s)
+                when = f"last update {_duration(one.silent_s)} ago; " if is_known else ""
+                yield f"stale     {one.run.name}: its worker{where} is gone, {when}replay again"
         counted = (f"{count} {state}" for state, count in self.counts.items())
         yield f"drives    {len(self.drives)}: {', '.join(counted)}"
         if math.isfinite(self.pace.per_hour):
@@ -296,12 +298,6 @@ class BatchStatus(Result):
             yield f"rate      {self.pace.per_hour:,.{digits}f} drives per hour"
         if math.isfinite(self.pace.left_s):
             yield f"time left {_duration(self.pace.left_s)}"
-
-
-def _heard(one: DriveStatus) -> str:
-    """Return the time since the last sign of a stale drive's worker, and what to do."""
-    when = f"last update {_duration(one.silent_s)} ago; " if math.isfinite(one.silent_s) else ""
-    return f"{when}replay again"
 
 
 def _duration(seconds: float) -> str:

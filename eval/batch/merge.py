@@ -191,9 +191,7 @@ def _tables_hash(run: RunFolder) -> str:
     return digest.hexdigest()
 
 
-def gathered(
-    folders: Sequence[Path],
-) -> tuple[dict[str, RunFolder], dict[str, str]]:
+def gathered(folders: Sequence[Path]) -> tuple[dict[str, RunFolder], dict[str, str]]:
     """Return all runs of batches, and the reasons why other drives have no run.
 
     A drive that was planned but not done is among the latter, so that no drive is omitted silently.

@@ -6,13 +6,12 @@ counts as a change for the worse.
 
 from __future__ import annotations
 
-import fnmatch
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
 import numpy as np
 
@@ -34,7 +33,7 @@ from crosscue.replay.limits import MIB
 from crosscue.replay.safe_text import counted, visible
 from crosscue.results import HIDDEN, Result
 
-from .paired import FALSE_ALARMS, PairedMetric, Verdict, compare_drives
+from .paired import FALSE_ALARMS, PairedMetric, Tolerance, Verdict, compare_drives
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -55,20 +54,7 @@ MAX_BYTES: Final = 256 * MIB
 MAX_LINES: Final = 20
 
 
-class Tolerance(NamedTuple):
-    """Allowed loss of the metrics that match a pattern, absolute or relative to the first run."""
-
-    pattern: str
-    by: float
-    is_fraction: bool
-
-    def allowed(self, before: float) -> float:
-        """Return the allowed loss in the metric's own unit."""
-        return self.by * abs(before) if self.is_fraction else self.by
-
-
 ORDER: Final[tuple[Verdict, ...]] = ("worse", "better", "undecided", "too few places")
-NONE: Final = Tolerance("*", 0.0, False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,18 +226,12 @@ def compare_runs(
         ]
         why = f"not scored, or by an earlier version: {', '.join(bare)}"
         return Comparison(changes, tuple(tables), (), (), (), same, (0, 0, 0), why, is_whole)
-    judged = compare_drives(before, after, lambda path, value: allowed_by(path, value, tolerances))
+    judged = compare_drives(before, after, tolerances)
     logs = [{one.log for one in part} for part in (before, after)]
     counts = (len(logs[0] & logs[1]), len(logs[0] - logs[1]), len(logs[1] - logs[0]))
     others = _others(scores[0] or {}, scores[1] or {})
     missing = no_longer_scored(before, after)
     return Comparison(changes, tuple(tables), judged, others, missing, same, counts, "", is_whole)
-
-
-def allowed_by(path: str, before: float, tolerances: Sequence[Tolerance]) -> float:
-    """Return the allowed loss of a metric, from the last tolerance whose pattern matches."""
-    fitting = (one for one in reversed(tolerances) if fnmatch.fnmatchcase(path, one.pattern))
-    return next(fitting, NONE).allowed(before)
 
 
 def run_contributions(run: RunFolder) -> list[DriveMetric] | None:
@@ -409,7 +389,11 @@ def _lines(found: Comparison) -> Iterator[str]:
     for path in found.no_longer_scored:
         yield f"WORSE      {visible(path)}: no longer scored"
     for metric in _first_of(found.metrics, "metrics"):
-        yield metric if isinstance(metric, str) else _metric_line(metric)
+        if isinstance(metric, str):
+            yield metric
+        else:
+            change = f"{_value(metric.before)} -> {_value(metric.after)}"
+            yield f"metric     {visible(metric.path)}: {change}"
     same = len(found.judged) - len(differing)
     if found.is_many:
         yield f"equal      {same} judged metrics; different: {len(differing)}"
@@ -552,10 +536,6 @@ def _judged_lines(one: PairedMetric) -> Iterator[str]:
     drives, places = counted(one.drives, "drive"), counted(one.places, "place")
     over = f"over {drives} at {places}{seen}{_more_text(one)}{allowed}"
     yield f"{'':11}{one.after - one.before:+.3g} ({ends}) {over}"
-
-
-def _metric_line(one: Change[float]) -> str:
-    return f"metric     {visible(one.path)}: {_value(one.before)} -> {_value(one.after)}"
 
 
 def _value(value: float) -> str:

@@ -58,8 +58,9 @@ def _expanded(text: str) -> Iterator[Path]:
 
 
 def _in_folder(folder: Path) -> Iterator[Path]:
-    if not folder.is_dir() or _is_run({entry.name for entry in _listed(folder)}):
-        # A damaged run is reported when it is opened.
+    names = {entry.name for entry in _listed(folder)} if folder.is_dir() else {MANIFEST}
+    if MANIFEST in names or is_cut_short(names):
+        # A damaged, interrupted or missing run is reported when it is opened.
         yield folder
         return
     runs = LocalRuns(folder)
@@ -77,11 +78,6 @@ def _listed(folder: Path) -> list[Path]:
         return list(folder.iterdir())
     except OSError as error:
         raise UnreadableRunError(f"{folder}: {error.strerror}; check its owner and mode") from None
-
-
-def _is_run(names: set[str]) -> bool:
-    """Return whether files are those of a run; an interrupted run counts and is reported later."""
-    return MANIFEST in names or is_cut_short(names)
 
 
 def _is_bare(folder: Path, file: str) -> bool:

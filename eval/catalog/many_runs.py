@@ -9,8 +9,8 @@ from typing import NamedTuple, TypeAlias
 from crosscue.eval.scoring.by_drive import DriveMetric, no_longer_scored
 from crosscue.replay.errors import RunError, UnreadableRunError, UsageError
 
-from .compare import Comparison, Tolerance, allowed_by, is_whole_run, open_scored, run_contributions
-from .paired import compare_drives
+from .compare import Comparison, is_whole_run, open_scored, run_contributions
+from .paired import Tolerance, compare_drives
 from .query.catalog import Catalog
 
 # Each drive's contribution to the metrics (None if not scored); True if no rows were dropped.
@@ -79,9 +79,7 @@ def compare_many(
         UnreadableRunError: No run of a side is scored.
     """
     before, after = _side(first, "--against", read), _side(second, "--runs", read)
-    judged = compare_drives(
-        before.parts, after.parts, lambda path, value: allowed_by(path, value, tolerances)
-    )
+    judged = compare_drives(before.parts, after.parts, tolerances)
     both, theirs, ours = before.logs & after.logs, before.logs, after.logs
     return Comparison(
         changes=(),

@@ -24,8 +24,9 @@ jackknife's), and all other metrics are unchanged.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -55,6 +56,21 @@ POWER: Final = 0.8
 # Halvings of the interval in which the difference is searched, and its doublings before.
 HALVINGS: Final = 10
 DOUBLINGS: Final = 8
+
+
+class Tolerance(NamedTuple):
+    """Allowed loss of the metrics that match a pattern, absolute or relative to the first run."""
+
+    pattern: str
+    by: float
+    is_fraction: bool
+
+    def allowed(self, before: float) -> float:
+        """Return the allowed loss in the metric's own unit."""
+        return self.by * abs(before) if self.is_fraction else self.by
+
+
+NONE: Final = Tolerance("*", 0.0, False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,14 +122,15 @@ class _Sums(NamedTuple):
 def compare_drives(
     first: Sequence[DriveMetric],
     second: Sequence[DriveMetric],
-    allowed_of: Callable[[str, float], float] = lambda path, before: 0.0,
+    tolerances: Sequence[Tolerance] = (),
 ) -> tuple[PairedMetric, ...]:
     """Compare every judged metric that both runs have, over the drives that both have.
 
     Args:
         first: Contributions of drives to the metrics of the reference run.
         second: The same for the run to judge.
-        allowed_of: Function from the path and the value before to the allowed loss.
+        tolerances: The last one whose pattern matches a metric applies; if none does, no loss is
+            allowed.
     """
     logs = sorted({one.log for one in first} & {one.log for one in second})
     kinds: dict[str, Kind] = {one.metric: one.kind for one in (*first, *second)}
@@ -137,7 +154,7 @@ def compare_drives(
         for path, one in effects.items()
         if one.residuals.any() and np.count_nonzero(one.weights) >= MIN_CLUSTERS
     }
-    could_see = detectable(enough, swaps, FALSE_ALARMS)
+    could_see = detectable(enough, swaps)
     return tuple(
         _judged(
             path,
@@ -149,7 +166,7 @@ def compare_drives(
                 p_of.get(path, 1.0),
                 could_see.get(path, math.inf),
             ),
-            allowed_of,
+            tolerances,
         )
         for path, one in drives.items()
     )
@@ -250,7 +267,7 @@ def _judged(
     kind: Kind,
     sums: _Sums,
     test: _Test,
-    allowed_of: Callable[[str, float], float],
+    tolerances: Sequence[Tolerance],
 ) -> PairedMetric:
     effects, drives, p, could_see = test
     better = direction(path)
@@ -262,7 +279,8 @@ def _judged(
     if is_enough := places >= MIN_CLUSTERS:
         squares = float((effects.residuals**2).sum())
         half = effects.half * math.sqrt(places / (places - 1) * squares)
-    allowed = allowed_of(path, before)
+    fitting = (one for one in reversed(tolerances) if fnmatchcase(path, one.pattern))
+    allowed = next(fitting, NONE).allowed(before)
     verdict: Verdict = "undecided" if is_enough else "too few places"
     if p <= FALSE_ALARMS and half < abs(difference):
         if effects.sign * difference < 0.0:
@@ -374,13 +392,12 @@ class Effects(NamedTuple):
     half: float
 
 
-def detectable(effects: Mapping[str, Effects], swaps: Floats, alarms: float) -> dict[str, float]:
+def detectable(effects: Mapping[str, Effects], swaps: Floats) -> dict[str, float]:
     """Return the difference of each metric that is found in ``POWER`` of the repetitions.
 
     Args:
         effects: Effects of the same places on each metric.
         swaps: Shape (S, G), as in ``paired``: 1 if a place's results are swapped.
-        alarms: Max corrected p value of a verdict.
 
     Returns:
         Infinite where no difference is found so often.
@@ -405,7 +422,7 @@ def detectable(effects: Mapping[str, Effects], swaps: Floats, alarms: float) -> 
         leader = np.where(is_first, number, leader)
         first = np.where(is_first, scaled, first)
     return {
-        path: _smallest(one, normal, signs, np.where(leader == number, second, first), alarms)
+        path: _smallest(one, normal, signs, np.where(leader == number, second, first))
         for number, (path, one) in enumerate(effects.items())
     }
 
@@ -420,7 +437,7 @@ def _rms(swapped: Floats) -> Floats:
     return np.asarray(np.sqrt((swapped**2).mean(axis=0)))
 
 
-def _smallest(one: Effects, normal: Floats, signs: Floats, others: Floats, alarms: float) -> float:
+def _smallest(one: Effects, normal: Floats, signs: Floats, others: Floats) -> float:
     residuals, n = _repeated(one, normal), np.count_nonzero(one.weights)
     by_chance, by_change = signs @ residuals.T, one.sign * (signs @ one.weights)[:, None]
     chance = residuals.sum(axis=1)
@@ -432,7 +449,7 @@ def _smallest(one: Effects, normal: Floats, signs: Floats, others: Floats, alarm
         found = one.sign * chance + difference
         scaled = swapped / np.maximum(_rms(swapped), ROUNDING)
         p = (np.maximum(scaled, others) >= scaled[0] - ROUNDING).mean(axis=0)
-        return float(((p <= alarms) & (found > half)).mean())
+        return float(((p <= FALSE_ALARMS) & (found > half)).mean())
 
     high = float(np.abs(chance).mean()) or ROUNDING
     for _ in range(DOUBLINGS):

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.pipeline.outcome import MAX_LINES
 from crosscue.eval.pipeline.run import Run
-from crosscue.eval.report.junit import write_junit
+from crosscue.eval.report.junit import junit_text
 from crosscue.eval.report.opening import judged_sentences
 from crosscue.eval.report.summary import (
     gate_lines,
@@ -42,6 +42,7 @@ from crosscue.eval.studies.attribution import (
     estimate_of,
 )
 from crosscue.replay.errors import CrosscueError, UsageError, one_line
+from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.safe_text import visible
@@ -258,7 +259,7 @@ def _scored(runs: Sequence[str | Path | Run], settings: ScoringSettings) -> Scor
     results = check_gates(bounds, metric_values(tree), tree["coverage"]["not_scored"])
     suite = f"{len(paths)} runs" if is_many else str(paths[0])
     place = folder or scored[0].one.run.file(FOLDER)
-    write_junit(place / "junit.xml", results, suite)
+    write_text(place / "junit.xml", junit_text(results, suite))
     return replace(found, gates=results)
 
 

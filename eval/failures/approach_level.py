@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final, NamedTuple
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,10 +79,11 @@ def from_finding(found: Finding, curve: Curve | None, about: About, threshold: f
     """Return the failure of a missed, late or invented feature at its clearest moment."""
     kinds: Mapping[str, Kind] = {"missing": "missed", "late": "late", "invented": "false"}
     kind = kinds[found.failing]
+    # Without any belief the odds are even.
+    whole = _failure(about, kind, found.feature, (found.cause, found.reported), 1.0)
     values = None if curve is None else curve.features.get(found.feature)
     if curve is None or values is None:
-        # Without any belief the odds are even.
-        return _failure(about, kind, found.feature, (found.cause, found.reported), 1.0)
+        return whole
     if kind == "false":
         row = int(values.argmax())
         rows = np.flatnonzero(values > threshold)
@@ -92,14 +94,7 @@ def from_finding(found: Finding, curve: Curve | None, about: About, threshold: f
         row = int(far[-1]) if len(far) else 0
         rows = np.flatnonzero(values <= threshold)
         severity = bits(float(values[row]))
-    return _failure(
-        about,
-        kind,
-        found.feature,
-        (found.cause, found.reported),
-        severity,
-        _Span((int(curve.t_ns[row]), float(curve.distance_m[row])), frames=len(rows)),
-    )
+    return replace(_at(whole, curve, row), severity=severity, frames=len(rows))
 
 
 def flips(
@@ -121,18 +116,11 @@ def flips(
             words = "there" if is_yes else "not there", "not there" if is_yes else "there"
             swing = f"{words[0]} ({values[decided]:.2f}), then {words[1]} ({values[row]:.2f})"
             counts = ", ".join(f"{cue.replace('_', ' ')} in {count}" for cue, count in loud)
-            yield _failure(
-                about,
-                "flipped",
-                name,
-                (AGAINST, f"{swing}; {counts} frames") if loud else (NOTHING, swing),
-                bits(float(later.min())),
-                _Span(
-                    (int(curve.t_ns[row]), float(curve.distance_m[row])),
-                    (int(curve.t_ns[decided]), int(curve.t_ns[row])),
-                    row - decided + 1,
-                ),
-            )
+            why = (AGAINST, f"{swing}; {counts} frames") if loud else (NOTHING, swing)
+            whole = _failure(about, "flipped", name, why, bits(float(later.min())))
+            start_ns, end_ns = int(curve.t_ns[decided]), int(curve.t_ns[row])
+            flip = replace(whole, start_ns=start_ns, end_ns=end_ns, frames=row - decided + 1)
+            yield _at(flip, curve, row)
 
 
 def _crossings(values: NDArray[np.float64], threshold: float) -> Iterator[tuple[int, int, bool]]:
@@ -165,27 +153,15 @@ def _against(
     return sorted(found, key=lambda pair: (-pair[1], pair[0]))
 
 
-class _Span(NamedTuple):
-    """Clearest moment and span of a failure; by default, the end and the whole of its approach."""
-
-    at: tuple[int, float] | None = None
-    span_ns: tuple[int, int] | None = None
-    frames: int = 0
-
-
-WHOLE: Final = _Span()
+def _at(failure: Failure, curve: Curve, row: int) -> Failure:
+    """Return a failure whose clearest moment is a row of the belief."""
+    distance_m = float(curve.distance_m[row])
+    known_m = distance_m if math.isfinite(distance_m) else None
+    return replace(failure, t_ns=int(curve.t_ns[row]), distance_m=known_m)
 
 
-def _failure(
-    about: About,
-    kind: Kind,
-    what: str,
-    why: tuple[str, str],
-    severity: float,
-    span: _Span = WHOLE,
-) -> Failure:
-    t_ns, distance_m = span.at or (about.end_ns, math.nan)
-    start_ns, end_ns = span.span_ns or (about.start_ns, about.end_ns)
+def _failure(about: About, kind: Kind, what: str, why: tuple[str, str], severity: float) -> Failure:
+    """Return a failure of the whole approach, which is clearest at its end."""
     return Failure(
         run=about.run,
         kind=kind,
@@ -193,11 +169,10 @@ def _failure(
         what=what,
         cause=why[0],
         reported=why[1],
-        t_ns=t_ns,
-        start_ns=start_ns,
-        end_ns=end_ns,
-        frames=span.frames,
+        t_ns=about.end_ns,
+        start_ns=about.start_ns,
+        end_ns=about.end_ns,
+        frames=0,
         **about.shared,
-        distance_m=distance_m if math.isfinite(distance_m) else None,
         severity=severity,
     )

@@ -245,10 +245,8 @@ def _rows_json(entries: Sequence[Entry], pictures: frozenset[str]) -> str:
 
 
 def _rows(run: RunFolder) -> ChartTables:
-    def table(name: str) -> pa.Table | None:
-        return run.table(name).sort_by("t_ns") if run.file(f"{name}.parquet").exists() else None
-
-    return ChartTables(table("belief"), table("cues"))
+    tables = (run.filled(name) for name in ("belief", "cues"))
+    return ChartTables(*(None if one is None else one.sort_by("t_ns") for one in tables))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

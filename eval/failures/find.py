@@ -152,14 +152,13 @@ def missed_and_false(
         about: Approaches by id.
         run: Folder of the run.
     """
-    is_missed = (cue.is_object == 1) & (cue.count == 0) & ~(cue.visible < SEEN)
-    for rows in _episodes(cue.t_ns, np.flatnonzero(is_missed), cue.approach):
+    for rows in _episodes(cue, _is_missed(cue)):
         why = _why_missed(cue, rows, labels, min_score, detected)
         # The nearest frame before the intersection, where detection should be easiest.
         ahead = rows[~(cue.distance_m[rows] < NEAR_M)]
         row = int(ahead[-1] if len(ahead) else rows[-1])
         yield _failure("missed", why, cue, rows, row, about, run)
-    for rows in _episodes(cue.t_ns, np.flatnonzero(is_wrong(cue)), cue.approach):
+    for rows in _episodes(cue, is_wrong(cue)):
         sure = [_highest(detected.get(int(cue.t_ns[i]), ()), labels) for i in rows]
         row = int(rows[int(np.argmax(sure))])
         why = _why_false(cue, rows, others, max(sure))
@@ -170,9 +169,12 @@ def failing_times(cues: Sequence[CueFrames]) -> NDArray[np.int64]:
     """Return the times of frames with a missed or false cue, whose detections are needed."""
     wanted = [np.empty(0, np.int64)]
     for cue in cues:
-        is_missed = (cue.is_object == 1) & (cue.count == 0) & ~(cue.visible < SEEN)
-        wanted.append(cue.t_ns[is_missed | is_wrong(cue)])
+        wanted.append(cue.t_ns[_is_missed(cue) | is_wrong(cue)])
     return np.unique(np.concatenate(wanted))
+
+
+def _is_missed(cue: CueFrames) -> NDArray[np.bool_]:
+    return np.asarray((cue.is_object == 1) & (cue.count == 0) & ~(cue.visible < SEEN), np.bool_)
 
 
 def wrong_ranges(
@@ -181,36 +183,31 @@ def wrong_ranges(
     """Yield spans in which the true range is outside the estimate's 95 % interval."""
     for one in judged:
         off = sds_off(one)
-        for rows in _episodes(one.t_ns, np.flatnonzero(off > SDS_95), one.approach):
+        for rows in _episodes(one, off > SDS_95):
             row = int(rows[int(off[rows].argmax())])
             error_m, true_m = float(one.error_m[row]), float(one.true_m[row])
             cause = "too far" if error_m > 0.0 else "too near"
             if abs(error_m) < NARROW * abs(true_m):
                 cause = "interval too narrow"
             text = f"{error_m:+.1f} m at {true_m:.1f} m, s.d. {math.sqrt(one.var_m2[row]):.1f} m"
-            where = about.get(int(one.approach[row]))
             yield Failure(
                 run=run,
                 kind="range",
-                level="frames",
                 what=f"range to {one.reference}",
                 cause=cause,
                 reported=text,
-                t_ns=int(one.t_ns[row]),
-                start_ns=int(one.t_ns[rows[0]]),
-                end_ns=int(one.t_ns[rows[-1]]),
-                frames=len(rows),
-                **({} if where is None else where.shared),
+                **_span(one, rows, row, about),
                 distance_m=true_m,
                 severity=float(off[row]) ** 2 / (2.0 * math.log(2.0)),
             )
 
 
 def _episodes(
-    t_ns: NDArray[np.int64], rows: NDArray[np.intp], approach: NDArray[np.int64]
+    judged: CueFrames | RangeJudged, is_failing: NDArray[np.bool_]
 ) -> list[NDArray[np.intp]]:
-    """Group rows that are close in time and belong to one approach."""
-    breaks = (np.diff(t_ns[rows]) > APART_NS) | (np.diff(approach[rows]) != 0)
+    """Group failing rows that are close in time and belong to one approach."""
+    rows = np.flatnonzero(is_failing)
+    breaks = (np.diff(judged.t_ns[rows]) > APART_NS) | (np.diff(judged.approach[rows]) != 0)
     return [part for part in np.split(rows, np.flatnonzero(breaks) + 1) if len(part)]
 
 
@@ -268,20 +265,29 @@ def _failure(
     about: Mapping[int, About],
     run: str,
 ) -> Failure:
-    where = about.get(int(cue.approach[row]))
     distance_m = float(cue.distance_m[row])
     return Failure(
         run=run,
         kind=kind,
-        level="frames",
         what=cue.cue,
         cause=why[0],
         reported=why[1],
-        t_ns=int(cue.t_ns[row]),
-        start_ns=int(cue.t_ns[rows[0]]),
-        end_ns=int(cue.t_ns[rows[-1]]),
-        frames=len(rows),
-        **({} if where is None else where.shared),
+        **_span(cue, rows, row, about),
         distance_m=distance_m if math.isfinite(distance_m) else None,
         severity=math.log2(1 + len(rows)),
     )
+
+
+def _span(
+    judged: CueFrames | RangeJudged, rows: NDArray[np.intp], row: int, about: Mapping[int, About]
+) -> dict[str, Any]:
+    """Return the attributes of a failure in these rows, to be inspected in one of them."""
+    where = about.get(int(judged.approach[row]))
+    return {
+        "level": "frames",
+        "t_ns": int(judged.t_ns[row]),
+        "start_ns": int(judged.t_ns[rows[0]]),
+        "end_ns": int(judged.t_ns[rows[-1]]),
+        "frames": len(rows),
+        **({} if where is None else where.shared),
+    }

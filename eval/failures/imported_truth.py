@@ -17,7 +17,6 @@ from crosscue.datasets.truth.annotations import (
     Annotations,
     LogPictures,
     Picture,
-    PictureTimes,
     check_boxes,
     cue_truths,
     cues_by_label,
@@ -287,25 +286,22 @@ def _write(
     log_path: Path,
     output: Path,
     *,
-    add: bool = False,
+    add: bool,
 ) -> ImportedTruth:
-    """Write the annotated pictures of one log as its truth and its labelled objects.
-
-    Args:
-        annotations: The annotations.
-        cues: Cue of each label; None for a label that is not a cue.
-        pictures: Times and size of the log's pictures.
-        log_path: The log.
-        output: The truth file; objects are written next to it.
-        add: Keep everything but cues and objects of an existing truth file.
-
-    Raises:
-        SchemaError: The annotations do not fit the log.
-        OutputError: The files cannot be written.
-    """
+    """Write the annotated pictures of one log as its truth, and its labelled objects beside it."""
     check_boxes(annotations)
     placed = match_frames(annotations, pictures)
-    truth = _truth(annotations, placed, cues, pictures, log_path, Path(annotations.where))
+    truth = Truth(
+        version=1,
+        log=log_path.name,
+        log_sha256=sha256_of(log_path),
+        start_ns=int(pictures.t_ns[0]),
+        end_ns=int(pictures.t_ns[-1]) + 1,
+        source=f"annotations in {Path(annotations.where).name}",
+        cues=cue_truths(annotations, placed, cues),
+        own_cues=tuple(sorted({cue for cue in cues.values() if cue} - {*CUES})),
+        objects=OBJECTS_FILE,
+    )
     if add:
         before = truth_file.read_truth(output)
         kept = {
@@ -329,25 +325,4 @@ def _write(
         placed.rule,
         there,
         annotations.ignored,
-    )
-
-
-def _truth(
-    annotations: Annotations,
-    placed: PictureTimes,
-    cues: Mapping[str, str | None],
-    pictures: LogPictures,
-    log_path: Path,
-    source: Path,
-) -> Truth:
-    return Truth(
-        version=1,
-        log=log_path.name,
-        log_sha256=sha256_of(log_path),
-        start_ns=int(pictures.t_ns[0]),
-        end_ns=int(pictures.t_ns[-1]) + 1,
-        source=f"annotations in {source.name}",
-        cues=cue_truths(annotations, placed, cues),
-        own_cues=tuple(sorted({cue for cue in cues.values() if cue} - {*CUES})),
-        objects=OBJECTS_FILE,
     )

@@ -117,9 +117,9 @@ def export(
     """
     if to not in LABEL_FORMATS:
         raise UsageError(f"to: {to}, expected one of {', '.join(LABEL_FORMATS)}")
-    given = isinstance(failures, Path | str)
-    chosen = read_failures(Path(failures)) if isinstance(failures, Path | str) else failures
-    where = str(failures) if given else "failures"
+    where, chosen = "failures", failures
+    if isinstance(chosen, Path | str):
+        where, chosen = str(chosen), read_failures(chosen)
     folder, kind = Path(output), LABEL_FORMATS[to]
     owned.check_place(folder, INDEX, overwrite=overwrite)
     moved = moved_to(logs)

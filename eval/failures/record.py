@@ -152,12 +152,16 @@ def write_failures(failures: Sequence[Failure], path: Path) -> None:
     write_table(path, failure_table(failures))
 
 
-def read_failures(path: Path) -> tuple[Failure, ...]:
-    """Read a table that ``write_failures`` wrote.
+def read_failures(table: Path | str) -> tuple[Failure, ...]:
+    """Read the table that ``failures`` wrote.
+
+    Args:
+        table: ``.parquet`` or ``.json`` file; paths of runs are relative to its folder.
 
     Raises:
         AnnotationError: The table is missing, damaged, or lacks columns.
     """
+    path = Path(table)
     if path.is_dir():
         raise _unreadable(path, "a folder")
     rows = _json_rows(path) if path.suffix == ".json" else _parquet_rows(path)

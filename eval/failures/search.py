@@ -16,7 +16,6 @@ from crosscue.eval.failures.find import (
 )
 from crosscue.eval.failures.order import CauseGroup, cause_groups, diverse, ranked
 from crosscue.eval.failures.record import Failure, failure_table, write_failures
-from crosscue.eval.failures.record import read_failures as read_table
 from crosscue.eval.runs.folder import open_run
 from crosscue.eval.scoring.runs import find_truth, judge_scene, remembered_truth
 from crosscue.replay.errors import CrosscueError, EmptyResultError, OutputError, UsageError
@@ -273,18 +272,6 @@ def search(
         output,
         settings.unlabelled,
     )
-
-
-def read_failures(table: Path | str) -> tuple[Failure, ...]:
-    """Read the table that ``failures`` wrote.
-
-    Args:
-        table: ``.parquet`` or ``.json`` file; paths of runs are relative to its folder.
-
-    Raises:
-        SchemaError: The table is missing, damaged, or of another kind.
-    """
-    return read_table(Path(table))
 
 
 def _checked_output(output: Path | str | None) -> Path | None:

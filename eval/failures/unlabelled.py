@@ -243,11 +243,11 @@ def _unexplained(
 
 def _disputed(run: RunFolder, vehicle: Vehicle) -> Iterator[Failure]:
     """Yield spans in which one detector is sure of an object and another one has no such box."""
-    if not run.file("detections.parquet").exists():
-        return
     names = ["detector", "label", "score", "x0", "y0", "x1", "y1"]
     by_label: dict[str, dict[str, dict[int, list[dict[str, Any]]]]] = {}
     t_ns, table = _in_log_time(run, "detections")
+    if table is None:
+        return
     for when, row in zip(t_ns.tolist(), table.select(names).to_pylist(), strict=True):
         kinds = by_label.setdefault(row["label"], {})
         kinds.setdefault(row["detector"], {}).setdefault(when, []).append(row)
@@ -292,25 +292,25 @@ def _episodes(t_ns: Int64s) -> list[Int64s]:
     return [part for part in parts if len(part)]
 
 
-def _in_log_time(run: RunFolder, name: str) -> tuple[Int64s, pa.Table]:
-    """Return the log times of a table's rows, and the table."""
-    table = run.table(name)
+def _in_log_time(run: RunFolder, name: str) -> tuple[Int64s, pa.Table | None]:
+    """Return the log times of a table's rows, and the table; None without a row."""
+    table = run.filled(name)
+    if table is None:
+        return np.empty(0, np.int64), None
     clock = "log_t_ns" if "log_t_ns" in table.column_names else "t_ns"
     return np.asarray(table[clock].to_numpy(), np.int64), table
 
 
 def _speed(run: RunFolder) -> _Speed | None:
-    if not run.file("pose.parquet").exists():
-        return None
     t_ns, table = _in_log_time(run, "pose")
-    return _Speed(t_ns, table["speed_mps"].to_numpy()) if len(t_ns) else None
+    return None if table is None else _Speed(t_ns, table["speed_mps"].to_numpy())
 
 
 def _vehicles_ahead(run: RunFolder) -> Int64s:
     """Return the times at which the Mobileye reports a vehicle close ahead."""
-    if not run.file("mobileye_obstacles.parquet").exists():
-        return np.empty(0, np.int64)
     t_ns, rows = _in_log_time(run, "mobileye_obstacles")
+    if rows is None:
+        return t_ns
     is_near = (rows["x_m"].to_numpy() < QUEUE_M) & (np.abs(rows["y_m"].to_numpy()) < LANE_M)
     return np.asarray(t_ns[is_near], np.int64)
 

@@ -7,19 +7,15 @@ through as stored. ``save_rrd`` is the only entry point.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from crosscue.detectors.images import Encoded
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.manifest import DriveManifest
 from crosscue.eval.runs.moments import run_between
-from crosscue.eval.runs.stored_images import StoredCamera, read_pictures, run_camera
+from crosscue.eval.runs.stored_images import StoredCamera, run_camera
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges, true_marks
 from crosscue.replay.columns import Floats
@@ -27,6 +23,7 @@ from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import spelled
 from crosscue.replay.files.whole_file import write_whole
 from crosscue.replay.safe_text import counted
+from crosscue.replay.time.dates import is_date
 
 from .part import WHOLE, RecordingSpan
 
@@ -34,6 +31,8 @@ if TYPE_CHECKING:
     import rerun as rr
 
     from .columns import DriveTime
+    from .layout import ViewData
+    from .scene_rows import SceneRows
 
 
 def save_rrd(
@@ -62,14 +61,18 @@ def save_rrd(
     """
     import rerun as rr
 
-    from .columns import time_of
+    from .columns import DriveTime
     from .layout import ViewData, blueprint
     from .marks import log_true_boxes
     from .scene_rows import longest_m, scene_rows
 
     if not part.is_whole:
         run = run_between(run, part.start_ns, part.end_ns)
-    known = _within(part, truth, true_ranges)
+        if truth is not None:
+            rows = part.holds(truth.t_ns)
+            truth = TruthTrack(truth.t_ns[rows], truth.x_m[rows], truth.y_m[rows])
+        if true_ranges is not None:
+            true_ranges = true_ranges.take(part.holds(true_ranges.t_ns))
     pose = _pose(run)
     scene = scene_rows(run)
     camera = run_camera(run) if part.shows("cameras") else None
@@ -79,14 +82,14 @@ def save_rrd(
     layout = blueprint(shown)
     true = {} if labels is None else true_marks(labels, run, scene.frames_ns.tolist())
     first_ns = int(scene.frames_ns[0]) if len(scene.frames_ns) else 0
-    time = time_of(first_ns if pose is None else int(pose["t_ns"][0]))
+    time = DriveTime(is_date(first_ns if pose is None else int(pose["t_ns"][0])))
 
     def write(partial: Path) -> None:
         recording = rr.RecordingStream("crosscue", recording_id=spelled(run.path.resolve().name))
         # By its number, because rerun takes no name that is not UTF-8.
         with os.fdopen(door.opened(partial, os.O_WRONLY), "wb") as file:
             recording.save(f"/dev/fd/{file.fileno()}", default_blueprint=layout)
-            _log_all(recording, time, run, pose, known, camera, part)
+            _log_all(recording, time, run, scene, shown, (truth, true_ranges), camera)
             if part.shows("cameras") and any(one.boxes for one in true.values()):
                 log_true_boxes(recording, time, true)
             recording.flush()
@@ -99,19 +102,18 @@ def _log_all(
     recording: rr.RecordingStream,
     time: DriveTime,
     run: RunFolder,
-    pose: Mapping[str, Floats] | None,
+    scene: SceneRows,
+    shown: ViewData,
     known: tuple[TruthTrack | None, TrueRanges | None],
     stored: StoredCamera | None,
-    part: RecordingSpan,
 ) -> None:
     from . import ahead, camera, plan, series
     from .notes import notes
-    from .scene_rows import scene_rows
 
     truth, true_ranges = known
+    pose, part = shown.pose, shown.part
     manifest = run.drive_manifest()
     vehicle = manifest.settings
-    scene = scene_rows(run)
     more: list[str] = []
     if pose is not None and part.shows("map"):
         plan.log_pose(recording, time, pose)
@@ -133,45 +135,10 @@ def _log_all(
         if part.shows("cameras"):
             _log_marks(recording, time, run, manifest)
     if stored is not None:
-        pictures = partial(_read_part, stored, part)
-        left_out = camera.send_pictures(recording, pictures, time)
+        left_out = camera.send_pictures(recording, time, stored, part)
         if left_out:
             more.append(f"{stored.topic.name}: {counted(left_out, 'picture')} cannot be decoded")
     recording.log("notes", notes(run, more), static=True)
-
-
-def _within(
-    part: RecordingSpan, truth: TruthTrack | None, ranges: TrueRanges | None
-) -> tuple[TruthTrack | None, TrueRanges | None]:
-    """Return the truth in the part's time span."""
-    if part.is_whole:
-        return truth, ranges
-    if truth is not None:
-        rows = (truth.t_ns >= part.start_ns) & (truth.t_ns <= part.end_ns)
-        truth = replace(truth, t_ns=truth.t_ns[rows], x_m=truth.x_m[rows], y_m=truth.y_m[rows])
-    if ranges is not None:
-        rows = (ranges.t_ns >= part.start_ns) & (ranges.t_ns <= part.end_ns)
-        ranges = replace(
-            ranges,
-            t_ns=ranges.t_ns[rows],
-            approach=ranges.approach[rows],
-            start_m=ranges.start_m[rows],
-            end_m=ranges.end_m[rows],
-        )
-    return truth, ranges
-
-
-def _read_part(
-    stored: StoredCamera, part: RecordingSpan, on_picture: Callable[[int, Encoded], None]
-) -> int:
-    """Read every picture in the part's time span; return the number of unusable ones."""
-
-    def inside(t_ns: int, picture: Encoded) -> None:
-        if part.start_ns <= t_ns <= part.end_ns:
-            on_picture(t_ns, picture)
-
-    span_ns = None if part.is_whole else (part.start_ns, part.end_ns)
-    return read_pictures(stored, inside, span_ns)
 
 
 def _log_marks(
@@ -204,10 +171,8 @@ def _log_marks(
 
 def _pose(run: RunFolder) -> dict[str, Floats] | None:
     """Return the columns of the pose, or None if the run has none."""
-    if not run.file("pose.parquet").exists():
-        return None
-    table = run.table("pose")
-    if not table.num_rows:
+    table = run.filled("pose")
+    if table is None:
         return None
     names = [name for name in table.column_names if name != "landmark"]
     return {name: np.asarray(table[name].to_numpy()) for name in names}

@@ -21,7 +21,7 @@ from crosscue.replay.mobileye.geometry import evaluate
 from crosscue.replay.signals.kinds import LANE_COLUMNS, OBSTACLE_COLUMNS
 from crosscue.replay.vehicle.vehicle import Vehicle
 
-from .columns import DriveTime, Shapes, boxes, labelled_strips, point_columns, strips
+from .columns import DriveTime, Shapes, boxes, labelled_strips, points, strips
 from .layout import ASIDE_M, BEHIND_M, FAR_M
 from .scene_rows import SceneRows
 
@@ -128,14 +128,15 @@ def _log_truth(recording: rr.RecordingStream, time: DriveTime, truth: TrueRanges
 def _log_mobileye(
     recording: rr.RecordingStream, time: DriveTime, stored: StoredMobileye, scene: SceneRows
 ) -> None:
-    vehicles = Shapes("ahead/mobileye_objects", point_columns)
+    vehicles = Shapes("ahead/mobileye_objects", points)
     lanes = Shapes("ahead/mobileye_lanes", strips)
     for number, t_ns in enumerate(scene.frames_ns.tolist()):
         state = stored.at(t_ns)
         vehicles.begin(t_ns)
         lanes.begin(t_ns)
-        for place, label in _vehicles(state.obstacles):
-            vehicles.add(place, FOUND, label)
+        for row in [] if state.obstacles is None else state.obstacles:
+            place = np.array([-row[_OBSTACLE["y_m"]], -row[_OBSTACLE["x_m"]]])
+            vehicles.add(place, FOUND, KINDS.get(int(row[_OBSTACLE["type"]]), "object"))
         for line in _lanes(state.lanes):
             lanes.add(line, LANE)
         if number % FRAMES_HELD == FRAMES_HELD - 1:
@@ -147,12 +148,6 @@ def _log_mobileye(
     style = rr.Points2D.from_fields(radii=[1.1], show_labels=False)
     recording.log("ahead/mobileye_objects", style, static=True)
     recording.log("ahead/mobileye_lanes", rr.LineStrips2D.from_fields(radii=[0.15]), static=True)
-
-
-def _vehicles(obstacles: NDArray[np.float64] | None) -> Iterator[tuple[NDArray[np.float64], str]]:
-    for row in [] if obstacles is None else obstacles:
-        kind = KINDS.get(int(row[_OBSTACLE["type"]]), "object")
-        yield np.array([-row[_OBSTACLE["y_m"]], -row[_OBSTACLE["x_m"]]]), kind
 
 
 def _lanes(lanes: NDArray[np.float64] | None) -> Iterator[NDArray[np.float64]]:

@@ -125,9 +125,8 @@ def motion_px(car: CarMotion, camera: Camera, size_px: tuple[int, int]) -> NDArr
 def _ranges_of(run: RunFolder) -> dict[int, list[RangeRow]]:
     """Return the ranges by time of their frame."""
     found: dict[int, list[RangeRow]] = {}
-    if run.file("range.parquet").exists():
-        table = run.table("range").select(["t_ns", "reference", "range_m", "var_m2"])
-        for row in table.to_pylist():
-            one = RangeRow(Reference(row["reference"]), row["range_m"], row["var_m2"], None)
-            found.setdefault(row["t_ns"], []).append(one)
+    table = run.filled("range", ["t_ns", "reference", "range_m", "var_m2"])
+    for row in () if table is None else table.to_pylist():
+        one = RangeRow(Reference(row["reference"]), row["range_m"], row["var_m2"], None)
+        found.setdefault(row["t_ns"], []).append(one)
     return found

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
 import rerun as rr
 
 from crosscue.detectors.images import Encoded, check, decode
+from crosscue.eval.runs.stored_images import StoredCamera, read_pictures
 from crosscue.replay.errors import LogFormatError
 
 from .columns import DriveTime
+from .part import RecordingSpan
 
 # Encodings that the viewer decodes itself.
 PASSED_THROUGH: Final = ("jpeg", "png")
@@ -21,17 +22,16 @@ QUALITY: Final = 90
 
 
 def send_pictures(
-    recording: rr.RecordingStream,
-    read_pictures: Callable[[Callable[[int, Encoded], None]], int],
-    time: DriveTime,
+    recording: rr.RecordingStream, time: DriveTime, camera: StoredCamera, part: RecordingSpan
 ) -> int:
-    """Send all usable pictures; return the number of others.
+    """Send all usable pictures of a part; return the number of others.
 
     Raises:
         LogError: The log cannot be opened.
     """
-    sink = _Sink(recording, time)
-    lost = read_pictures(sink.add)
+    sink = _Sink(recording, time, part)
+    span_ns = None if part.is_whole else (part.start_ns, part.end_ns)
+    lost = read_pictures(camera, sink.add, span_ns)
     sink.send()
     return lost
 
@@ -40,11 +40,14 @@ def send_pictures(
 class _Sink:
     recording: rr.RecordingStream
     time: DriveTime
+    part: RecordingSpan
     held: list[tuple[int, bytes, str]] = field(default_factory=list)
     size_bytes: int = 0
 
     def add(self, t_ns: int, picture: Encoded) -> None:
-        """Send a picture together with others, a few megabytes at a time."""
+        """Send a picture of the part together with others, a few megabytes at a time."""
+        if not self.part.start_ns <= t_ns <= self.part.end_ns:
+            return
         is_stored = picture.coding in PASSED_THROUGH
         if is_stored:
             check(picture)

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from functools import partial
+from typing import Final, TypeAlias
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
 from crosscue.replay.colours import Colour
-from crosscue.replay.time.dates import is_date
+
+Geometry: TypeAlias = list[NDArray[np.float64]]
+Packed: TypeAlias = NDArray[np.uint32]
+# Function from geometry, packed colours and labels to Rerun's columns.
+ToColumns: TypeAlias = Callable[[Geometry, Packed, list[str]], rr.ComponentColumnList]
 
 
 @dataclass(slots=True)
@@ -20,16 +25,13 @@ class Shapes:
 
     Attributes:
         entity: Path of the Rerun entity.
-        to_columns: Function from geometry (a list of arrays), colours and labels to Rerun's
-            columns.
+        to_columns: Function that makes Rerun's columns.
         geometry: One array for each shape.
     """
 
     entity: str
-    to_columns: Callable[
-        [list[NDArray[np.float64]], list[Colour], list[str]], rr.ComponentColumnList
-    ]
-    geometry: list[NDArray[np.float64]] = field(default_factory=list)
+    to_columns: ToColumns
+    geometry: Geometry = field(default_factory=list)
     colours: list[Colour] = field(default_factory=list)
     labels: list[str] = field(default_factory=list)
     times: list[int] = field(default_factory=list)
@@ -51,7 +53,7 @@ class Shapes:
         """Send and discard the collected frames."""
         if not self.times:
             return
-        columns = self.to_columns(self.geometry, self.colours, self.labels)
+        columns = self.to_columns(self.geometry, pack_colours(self.colours), self.labels)
         recording.send_columns(
             self.entity, indexes=time.column(self.times), columns=columns.partition(self.counts)
         )
@@ -59,62 +61,49 @@ class Shapes:
             held.clear()
 
 
-def boxes(
-    geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
-) -> rr.ComponentColumnList:
+def boxes(geometry: Geometry, colours: Packed, labels: list[str]) -> rr.ComponentColumnList:
     """Return the columns of boxes; geometry: x0, y0, x1, y1."""
     corners = np.asarray(geometry, np.float32).reshape(-1, 4)
     return rr.Boxes2D.columns(
         centers=(corners[:, :2] + corners[:, 2:]) / 2,
         half_sizes=(corners[:, 2:] - corners[:, :2]) / 2,
-        colors=pack_colours(colours),
+        colors=colours,
         labels=labels,
     )
 
 
 def strips(
-    geometry: list[NDArray[np.float64]], colours: list[Colour], _labels: list[str]
+    geometry: Geometry,
+    colours: Packed,
+    labels: list[str],
+    *,
+    kind: type[rr.LineStrips2D | rr.LineStrips3D] = rr.LineStrips2D,
+    has_labels: bool = False,
 ) -> rr.ComponentColumnList:
-    """Return the columns of line strips; geometry: shape (N, 2)."""
+    """Return the columns of line strips; geometry: shape (N, 2), or (N, 3) in space."""
     lines = [np.asarray(line, np.float32) for line in geometry]
-    return rr.LineStrips2D.columns(strips=lines, colors=pack_colours(colours))
+    return kind.columns(strips=lines, colors=colours, labels=labels if has_labels else None)
 
 
-def labelled_strips(
-    geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
-) -> rr.ComponentColumnList:
-    """Return the columns of line strips with labels; geometry: shape (N, 2)."""
-    lines = [np.asarray(line, np.float32) for line in geometry]
-    return rr.LineStrips2D.columns(strips=lines, colors=pack_colours(colours), labels=labels)
+labelled_strips: Final[ToColumns] = partial(strips, has_labels=True)
+strips_above: Final[ToColumns] = partial(strips, kind=rr.LineStrips3D)
 
 
-def strips_above(
-    geometry: list[NDArray[np.float64]], colours: list[Colour], _labels: list[str]
-) -> rr.ComponentColumnList:
-    """Return the columns of line strips in space; geometry: shape (N, 3)."""
-    lines = [np.asarray(line, np.float32) for line in geometry]
-    return rr.LineStrips3D.columns(strips=lines, colors=pack_colours(colours))
-
-
-def arrows(
-    geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
-) -> rr.ComponentColumnList:
+def arrows(geometry: Geometry, colours: Packed, labels: list[str]) -> rr.ComponentColumnList:
     """Return the columns of arrows; geometry: x, y of the tail, then of the vector to the tip."""
     both = np.asarray(geometry, np.float32).reshape(-1, 4)
     return rr.Arrows2D.columns(
-        origins=both[:, :2], vectors=both[:, 2:], colors=pack_colours(colours), labels=labels
+        origins=both[:, :2], vectors=both[:, 2:], colors=colours, labels=labels
     )
 
 
-def point_columns(
-    geometry: list[NDArray[np.float64]], colours: list[Colour], labels: list[str]
-) -> rr.ComponentColumnList:
+def points(geometry: Geometry, colours: Packed, labels: list[str]) -> rr.ComponentColumnList:
     """Return the columns of points; geometry: x, y."""
     places = np.asarray(geometry, np.float32).reshape(-1, 2)
-    return rr.Points2D.columns(positions=places, colors=pack_colours(colours), labels=labels)
+    return rr.Points2D.columns(positions=places, colors=colours, labels=labels)
 
 
-def pack_colours(colours: Sequence[Colour]) -> NDArray[np.uint32]:
+def pack_colours(colours: Sequence[Colour]) -> Packed:
     """Return colours as Rerun's packed RGBA, opaque."""
     rgb = np.asarray(colours, np.uint32).reshape(-1, 3)
     return (rgb @ np.array([1 << 24, 1 << 16, 1 << 8], np.uint32) + 0xFF).astype(np.uint32)
@@ -140,8 +129,3 @@ class DriveTime:
         if self.is_date:
             return [rr.TimeColumn(TIMELINE, timestamp=times.astype("datetime64[ns]"))]
         return [rr.TimeColumn(TIMELINE, duration=times.astype("timedelta64[ns]"))]
-
-
-def time_of(first_ns: int) -> DriveTime:
-    """Return the display of times for a drive that starts at ``first_ns``."""
-    return DriveTime(is_date(first_ns))

@@ -14,7 +14,7 @@ from rerun.blueprint.components import AbsoluteTimeRange
 from crosscue.replay.errors import UsageError
 
 from .columns import TIMELINE
-from .part import VIEWS, WHOLE, RecordingSpan
+from .part import VIEWS, RecordingSpan
 from .series import BELIEF, CUES, POSE, RANGE
 
 FAR_M: Final = 110.0
@@ -39,8 +39,8 @@ class ViewData:
     camera: str | None
     pose: Mapping[str, NDArray[np.float64]] | None
     has_scene: bool
-    longest_m: float = FAR_M
-    part: RecordingSpan = WHOLE
+    longest_m: float
+    part: RecordingSpan
 
 
 def blueprint(shown: ViewData) -> rrb.Blueprint:

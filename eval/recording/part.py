@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from crosscue.replay.columns import Int64s
 from crosscue.replay.errors import UsageError
 
 VIEWS: Final = ("cameras", "ahead", "belief", "ranges", "cues", "map", "pose", "notes")
@@ -41,6 +45,10 @@ class RecordingSpan:
     def is_whole(self) -> bool:
         """True if the part covers the complete time of the run."""
         return self.start_ns == 0 and self.end_ns == LAST_NS
+
+    def holds(self, t_ns: Int64s) -> NDArray[np.bool_]:
+        """Return a mask of the times inside the time span, shape (N,)."""
+        return (t_ns >= self.start_ns) & (t_ns <= self.end_ns)
 
     def shows(self, view: str) -> bool:
         """Return whether a view is selected."""

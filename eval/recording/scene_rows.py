@@ -60,7 +60,5 @@ def longest_m(scene: SceneRows) -> float:
 
 
 def _table(run: TableFolder, name: str) -> pa.Table | None:
-    if not run.file(f"{name}.parquet").exists():
-        return None
-    table = run.table(name).sort_by("t_ns")
-    return table if table.num_rows else None
+    table = run.filled(name)
+    return None if table is None else table.sort_by("t_ns")

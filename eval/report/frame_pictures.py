@@ -23,6 +23,7 @@ from crosscue.eval.scoring.truth import true_marks
 from crosscue.replay.columns import Bytes
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.cue_table import CUES
+from crosscue.replay.vehicle.vehicle import Vehicle
 
 WIDTH_PX: Final = 800
 SMALL_PX: Final = 240
@@ -71,7 +72,8 @@ def draw_pictures(
             results = () if frame is None else frame.found
             counts = cues.get(t_ns, {})
             if not has_candidates:
-                results = tuple(_likely(one, _labels(run, counts)) for one in results)
+                counted = _labels(vehicle, counts)
+                results = tuple(_likely(one, counted) for one in results)
             marks = true.get(t_ns, NOTHING_TRUE)
             canvas = draw_frame(picture, results, counts, regions, WIDTH_PX, marks)
             if t_ns in plans:
@@ -84,9 +86,8 @@ def draw_pictures(
     return ""
 
 
-def _labels(run: RunFolder, counts: Mapping[str, int]) -> frozenset[str]:
+def _labels(vehicle: Vehicle, counts: Mapping[str, int]) -> frozenset[str]:
     """Return the labels of the cues that were found."""
-    vehicle = run.drive_manifest().settings
     positive = [CUES[cue] for cue, count in counts.items() if count and cue in CUES]
     return frozenset(label for cue in positive for label in vehicle.labels_of(cue))
 
@@ -109,10 +110,10 @@ def _found(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, FrameDetectio
 def _cues(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, dict[str, int]]:
     """Return the positive cues by time."""
     found: dict[int, dict[str, int]] = {}
-    if run.file("cues.parquet").exists():
-        for row in run.table("cues", ["t_ns", "cue", "count"]).to_pylist():
-            if row["t_ns"] in wanted:
-                found.setdefault(row["t_ns"], {})[row["cue"]] = row["count"]
+    table = run.filled("cues", ["t_ns", "cue", "count"])
+    for row in () if table is None else table.to_pylist():
+        if row["t_ns"] in wanted:
+            found.setdefault(row["t_ns"], {})[row["cue"]] = row["count"]
     return found
 
 

@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Final
 from xml.etree import ElementTree as ET
 
 from crosscue.eval.scoring.gates import GateResult
-from crosscue.replay.files.whole_file import write_text
 
-
-def write_junit(path: Path, results: Sequence[GateResult], suite: str) -> None:
-    """Write one test case for each gate.
-
-    Args:
-        path: The output file.
-        results: Results of the gates, in order.
-        suite: Name of the test suite.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
-    write_text(path, junit_text(results, suite))
+# Tabs and line ends are legal, but in attributes they would be read back as spaces.
+FORBIDDEN: Final = re.compile("[^ -~\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def junit_text(results: Sequence[GateResult], suite: str) -> str:
@@ -50,17 +39,4 @@ def cases_text(cases: Sequence[tuple[str, str]], suite: str, kind: str) -> str:
 
 def fit_for_xml(text: str) -> str:
     """Return ``text`` with characters that XML 1.0 forbids written as escapes."""
-    return "".join(
-        c if _is_allowed(ord(c)) else c.encode("unicode_escape", "surrogatepass").decode("ascii")
-        for c in text
-    )
-
-
-def _is_allowed(code: int) -> bool:
-    # Tabs and line ends are legal, but in attributes they would be read back as spaces.
-    return (
-        0x20 <= code <= 0x7E
-        or 0xA0 <= code <= 0xD7FF
-        or 0xE000 <= code <= 0xFFFD
-        or (0x10000 <= code <= 0x10FFFF)
-    )
+    return FORBIDDEN.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)

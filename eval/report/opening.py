@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -123,34 +123,38 @@ def opening_of(
         for one in mistakes[:MAX_MISTAKES]:
             text = f"{one.kind}: {_words([one.what])}"
             events.append(_Event(logged.get(one.t_ns, one.t_ns), MISTAKE, text))
-    kept = sorted(sorted(events, key=lambda one: (one.rank, one.t_ns))[:MAX_MOMENTS], key=_when)
+    kept = sorted(events, key=lambda one: (one.rank, one.t_ns))[:MAX_MOMENTS]
+    kept.sort(key=lambda one: (one.t_ns, one.rank))
     frames = tables.frames_ns
     if frames is None or not len(frames):
         return Opening(sentences)
     start_ns = span_ns(run)[0]
-    moments = []
-    for at in sorted({_frame(frames, one) for one in kept}):
-        found = _moment(tables, scored, at, [one for one in kept if _frame(frames, one) == at])
-        t_ns = moved.get(at, at)
-        moments.append(replace(found, t_ns=t_ns, at_s=seconds_into(start_ns, t_ns)))
+    by_frame: dict[int, list[_Event]] = {}
+    for event in kept:
+        by_frame.setdefault(_frame(frames, event), []).append(event)
+    shown_ns = {at: moved.get(at, at) for at in by_frame}
     pictures: dict[int, str] = {}
 
     def keep(t_ns: int, picture: bytes, _: bytes) -> None:
         pictures[t_ns] = base64.b64encode(picture).decode()
 
-    missing = (
-        draw_pictures(
-            run,
-            [one.t_ns for one in moments],
-            keep,
-            has_candidates=False,
-            truth=None if scored is None else scored.truth_path,
+    truth, missing = None if scored is None else scored.truth_path, ""
+    if by_frame:
+        times = [*shown_ns.values()]
+        missing = draw_pictures(run, times, keep, has_candidates=False, truth=truth)
+    moments = tuple(
+        Moment(
+            t_ns=(t_ns := shown_ns[at]),
+            at_s=seconds_into(start_ns, t_ns),
+            what=_what(some),
+            is_wrong=any(one.rank == MISTAKE for one in some),
+            distance=_distance(tables, scored, at),
+            belief=_belief_at(tables, at),
+            picture=pictures.get(t_ns, ""),
         )
-        if moments
-        else ""
+        for at, some in by_frame.items()
     )
-    shown = tuple(replace(one, picture=pictures.get(one.t_ns, "")) for one in moments)
-    return Opening(sentences, shown, missing)
+    return Opening(sentences, moments, missing)
 
 
 def curves_of(run: RunFolder) -> tuple[list[Curve], list[CueFrames]]:
@@ -193,10 +197,6 @@ def _unjudged(found: CueRows, name: str) -> CueFrames:
         left_out={},
         conditions={},
     )
-
-
-def _when(event: _Event) -> tuple[int, int]:
-    return event.t_ns, event.rank
 
 
 def _frame(frames: np.typing.NDArray[np.int64], event: _Event) -> int:
@@ -298,11 +298,9 @@ def _told(run: RunFolder, tables: RunTables, threshold: float) -> tuple[str, ...
 
 def _pose_told(run: RunFolder) -> Iterator[str]:
     """Yield a sentence about the pose of a run without a truth."""
-    if not run.file("pose.parquet").exists():
-        return
-    rows = run.table("pose", ["travelled_m", "major_axis_m"]).to_pylist()
-    if rows:
-        path_m, ellipse_m = rows[-1]["travelled_m"], rows[-1]["major_axis_m"]
+    table = run.filled("pose", ["travelled_m", "major_axis_m"])
+    if table is not None:
+        path_m, ellipse_m = (column[-1].as_py() for column in table.columns)
         yield (
             f"The estimated path is {path_m:.0f} m long; the 2-sigma ellipse at its end is "
             f"{ellipse_m:.1f} m long."
@@ -349,47 +347,30 @@ def _words(names: Sequence[str]) -> str:
     return ", ".join(name.replace("_", " ") for name in names)
 
 
-def _moment(
-    tables: RunTables,
-    scored: RunScored | None,
-    t_ns: int,
-    events: Sequence[_Event],
-) -> Moment:
-    """Return a moment at a log time; its seconds are set by the caller."""
+def _what(events: Sequence[_Event]) -> str:
+    """Return what happened in a frame: the features believed in it, then the rest."""
     whats = dict.fromkeys(one.what for one in events)
     believed = [one.removesuffix(" believed") for one in whats if one.endswith(" believed")]
     others = [one for one in whats if not one.endswith(" believed")]
-    text = "; ".join([*([f"{', '.join(believed)} believed"] if believed else []), *others])
-    belief: Mapping[str, float] = {}
-    if tables.belief is not None:
-        rows = np.flatnonzero(tables.belief.t_ns >= t_ns)
-        if len(rows):
-            belief = {k: float(p[rows[0]]) for k, p in tables.belief.features.items()}
-    distance = _range_text(tables, t_ns)
-    true_m = math.nan if scored is None else _true_m(scored, t_ns)
-    if math.isfinite(true_m):
-        distance = _place(true_m)
-    return Moment(
-        t_ns,
-        0.0,
-        text,
-        any(one.rank == MISTAKE for one in events),
-        distance,
-        tuple((name, p) for name, p in belief.items() if math.isfinite(p)),
-    )
+    return "; ".join([*([f"{', '.join(believed)} believed"] if believed else []), *others])
 
 
-def _true_m(scored: RunScored, t_ns: int) -> float:
-    """Return the true distance to the start of the intersection in a frame; NaN if unknown."""
-    for cue in scored.judged.cues:
-        rows = np.flatnonzero(cue.t_ns == t_ns)
-        if len(rows):
-            return float(cue.distance_m[rows[0]])
-    return math.nan
+def _belief_at(tables: RunTables, t_ns: int) -> tuple[tuple[str, float], ...]:
+    """Return the first belief from a log time on; empty after the last one."""
+    if tables.belief is None or not len(rows := np.flatnonzero(tables.belief.t_ns >= t_ns)):
+        return ()
+    belief = {name: float(p[rows[0]]) for name, p in tables.belief.features.items()}
+    return tuple((name, p) for name, p in belief.items() if math.isfinite(p))
 
 
-def _range_text(tables: RunTables, t_ns: int) -> str:
-    """Return the estimated range to the start with its 95 % interval; empty without one."""
+def _distance(tables: RunTables, scored: RunScored | None, t_ns: int) -> str:
+    """Return the range to the start at a log time: true, else estimated with its 95 %."""
+    for cue in () if scored is None else scored.judged.cues:
+        known_m = cue.distance_m[cue.t_ns == t_ns]
+        if len(known_m):
+            if math.isfinite(known_m[0]):
+                return _place(float(known_m[0]))
+            break
     if tables.ranges is None:
         return ""
     rows = np.flatnonzero((tables.ranges.t_ns <= t_ns) & (tables.ranges.reference == "start"))

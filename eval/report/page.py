@@ -249,9 +249,9 @@ def _run(run: RunFolder) -> _Run:
 
 def _pitch(run: RunFolder) -> tuple[list[str], list[str]]:
     """Return the camera's pitch in every ten seconds, and its steps, where pictures show them."""
-    if not run.file("visual_odometry.parquet").exists():
+    table = run.filled("visual_odometry", ["t_ns", "pitch_rad", "is_standing"])
+    if table is None:
         return [], []
-    table = run.table("visual_odometry", ["t_ns", "pitch_rad", "is_standing"])
     # The pitch is filtered, so that only every few rows are another measurement.
     rows = [row for row in table.to_pylist() if not row["is_standing"]][::FILTERED]
     t_ns = np.array([row["t_ns"] for row in rows], np.int64)

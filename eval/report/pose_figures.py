@@ -16,8 +16,8 @@ from crosscue.eval.scoring.pose.score import ScoredPoses
 from crosscue.localization.ellipse import ellipses, position_cov
 from crosscue.replay.columns import Floats, Int64s
 
-from .scene_figures import WIDTH, shade
-from .svg_plot import Panel, SvgChart, equal_scales, thinned, ticks
+from .scene_figures import WIDTH, shade_gaps
+from .svg_plot import Panel, SvgChart, equal_scales, thinned
 
 ELLIPSES: Final = 12
 HEIGHT: Final = 150.0
@@ -103,10 +103,8 @@ def track_figures(run: RunFolder, gaps: Sequence[ClockGap]) -> tuple[Figure, ...
         RunError: The table is damaged.
     """
     names = ["x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "travelled_m", "major_axis_m"]
-    if not run.file("pose.parquet").exists():
-        return ()
-    table = run.table("pose", ["t_ns", *names])
-    if not len(table):
+    table = run.filled("pose", ["t_ns", *names])
+    if table is None:
         return ()
     t_ns = table["t_ns"].to_numpy()
     x, y, xx, xy, yy, travelled_m, axis_m = (table[name].to_numpy() for name in names)
@@ -151,18 +149,17 @@ def draw_ellipse(
     t_ns: Int64s,
     travelled_m: Floats,
     major_axis_m: Floats,
-    gaps: Sequence[ClockGap] = (),
+    gaps: Sequence[ClockGap],
     lost_above_m: float = math.nan,
 ) -> Markup:
     """Draw the length of the 2-sigma ellipse over the distance travelled."""
     highest = max(float(np.nanmax(major_axis_m)), 0.1)
     if lost_above_m < 4.0 * highest:
         highest = max(highest, lost_above_m)
-    panel = Panel(44, 34, WIDTH - 58, HEIGHT, _distances(travelled_m), (0.0, 1.05 * highest))
-    drawing = _chart(panel, "2-sigma ellipse, full major axis (m)")
+    label = "2-sigma ellipse, full major axis (m)"
+    drawing, panel = _chart(label, (0.0, 1.05 * highest), gaps, t_ns, travelled_m)
     rows = thinned(len(t_ns))
     breaks = broken_at(gaps, t_ns[rows])
-    _gaps(drawing, panel, gaps, t_ns, travelled_m)
     x, y = (np.insert(one[rows], breaks, np.nan) for one in (travelled_m, major_axis_m))
     drawing.curve(panel, x, y, "line sigma")
     if lost_above_m <= highest:
@@ -179,9 +176,7 @@ def _over_distance(
     low, high = min(low, float(np.nanmin(values))), max(high, float(np.nanmax(values)))
     margin = 0.05 * (high - low) or 1.0
     ends = (low if low == 0.0 else low - margin, high + margin)
-    panel = Panel(44, 34, WIDTH - 58, HEIGHT, _distances(poses.travelled_m), ends)
-    drawing = _chart(panel, label)
-    _gaps(drawing, panel, poses.gaps, poses.t_ns, poses.travelled_m)
+    drawing, panel = _chart(label, ends, poses.gaps, poses.t_ns, poses.travelled_m)
     rows = thinned(len(values))
     x_m = poses.travelled_m[rows]
     for part in np.split(np.arange(len(rows)), broken_at(poses.gaps, poses.t_ns[rows])):
@@ -191,26 +186,19 @@ def _over_distance(
     return drawing.svg()
 
 
-def _chart(panel: Panel, label: str) -> SvgChart:
-    drawing = SvgChart(
-        WIDTH, panel.bottom + 38, label, f"{label} over the distance travelled, in metres."
-    )
-    decades = ticks(*panel.y_range, 5)
-    drawing.axes(panel, "distance travelled (m)", label, decades)
-    return drawing
-
-
-def _gaps(
-    drawing: SvgChart,
-    panel: Panel,
+def _chart(
+    label: str,
+    ends: tuple[float, float],
     gaps: Sequence[ClockGap],
     t_ns: Int64s,
     travelled_m: Floats,
-) -> None:
-    for gap in gaps:
-        for row in broken_at([gap], t_ns):
-            shade(drawing, panel, travelled_m[row - 1 : row + 1], gap.text)
-
-
-def _distances(travelled_m: Floats) -> tuple[float, float]:
-    return 0.0, max(float(np.nanmax(travelled_m)), 1.0)
+) -> tuple[SvgChart, Panel]:
+    """Begin a chart over the distance travelled, with the gaps of the drive."""
+    way_m = max(float(np.nanmax(travelled_m)), 1.0)
+    panel = Panel(44, 34, WIDTH - 58, HEIGHT, (0.0, way_m), ends)
+    drawing = SvgChart(
+        WIDTH, panel.bottom + 38, label, f"{label} over the distance travelled, in metres."
+    )
+    drawing.axes(panel, "distance travelled (m)", label)
+    shade_gaps(drawing, panel, gaps, t_ns, travelled_m)
+    return drawing, panel

@@ -132,8 +132,7 @@ def draw_belief(
     drawing.axes(panel, label, "", y_ticks=[0.0, 0.25, 0.5, 0.75, 1.0])
     drawing.rule(panel.left, panel.y(threshold), panel.right, panel.y(threshold), "line dash")
     t_ns, distance_m = _way(curve, cues)
-    for gap, row in _between_rows(gaps, t_ns):
-        shade(drawing, panel, np.minimum(distance_m[row - 1 : row + 1], far), gap.text)
+    shade_gaps(drawing, panel, gaps, t_ns, np.minimum(distance_m, far))
     rows = broken_at(gaps, curve.t_ns)
     distance_m = np.insert(curve.distance_m, rows, np.nan)
     for name, values in curve.features.items():
@@ -168,16 +167,19 @@ def _way(curve: Curve, cues: Sequence[CueFrames]) -> tuple[NDArray[np.int64], ND
     return t_ns[known], distance_m[first][known]
 
 
-def _between_rows(gaps: Sequence[ClockGap], t_ns: NDArray[np.int64]) -> list[tuple[ClockGap, int]]:
-    """Return the gaps between two rows, each with the index of the row after it."""
-    return [(one, int(row)) for one in gaps for row in broken_at([one], t_ns)]
-
-
-def shade(drawing: SvgChart, panel: Panel, ends: NDArray[np.float64], text: str) -> None:
-    """Shade a gap between two values of x and label it with its length."""
-    left, right = sorted(panel.x(value) for value in ends.tolist())
-    drawing.rect(left, panel.top, max(right - left, 2.0), panel.height, "gap")
-    drawing.text((left + right) / 2.0, panel.top + 11, text, "halo")
+def shade_gaps(
+    drawing: SvgChart,
+    panel: Panel,
+    gaps: Sequence[ClockGap],
+    t_ns: NDArray[np.int64],
+    x: NDArray[np.float64],
+) -> None:
+    """Shade the gaps between two rows, at their values of x, and label them with their lengths."""
+    for gap in gaps:
+        for row in broken_at([gap], t_ns):
+            left, right = sorted(panel.x(value) for value in x[row - 1 : row + 1].tolist())
+            drawing.rect(left, panel.top, max(right - left, 2.0), panel.height, "gap")
+            drawing.text((left + right) / 2.0, panel.top + 11, gap.text, "halo")
 
 
 def _report_text(name: str, curve: Curve, threshold: float, unit: str) -> str:
@@ -219,7 +221,7 @@ WIDEST_BIN_M: Final = 20.0
 def draw_range(
     judged: Sequence[RangeJudged],
     scores: Mapping[str, RangeScore],
-    gaps: Mapping[str, Sequence[ClockGap]] | None = None,
+    gaps: Mapping[str, Sequence[ClockGap]],
 ) -> Markup:
     """Draw range errors over true distance, and the consistency of the estimated variances.
 
@@ -254,17 +256,16 @@ def draw_range(
     for one in rows:
         style = one.reference
         if few:
-            _traces(drawing, above, one, style, (gaps or {}).get(one.drive, ()))
+            _traces(drawing, above, one, style, gaps.get(one.drive, ()))
         else:
             _bins(drawing, above, scores[one.reference], style)
     drawing.axes(below, "true range (m)", "mean NEES, 1 is consistent")
     drawing.rule(below.left, below.y(1.0), below.right, below.y(1.0), "line dash")
     for name, score in scores.items():
-        style = name
         for bin_, part in score.by_distance.items():
             middle = min(max(_middle(bin_), near), far)
             hint = f"{bin_} m: {part.nees:.2f}"
-            drawing.dot(below.x(middle), below.y(part.nees), 4.0, f"fill {style}", hint)
+            drawing.dot(below.x(middle), below.y(part.nees), 4.0, f"fill {name}", hint)
     drawing.legend(
         10,
         14,
@@ -284,8 +285,7 @@ def _traces(
     for number in np.unique(one.approach).tolist():
         mine = np.flatnonzero(one.approach == number)
         if one.reference == "start":
-            for gap, row in _between_rows(gaps, one.t_ns[mine]):
-                shade(drawing, panel, one.true_m[mine[row - 1 : row + 1]], gap.text)
+            shade_gaps(drawing, panel, gaps, one.t_ns[mine], one.true_m[mine])
         for part in np.split(mine, broken_at(gaps, one.t_ns[mine])):
             two_sd = np.minimum(2.0 * np.sqrt(one.var_m2[part]), high)
             drawing.band(panel, one.true_m[part], -two_sd, two_sd, f"band {style}")

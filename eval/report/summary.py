@@ -49,7 +49,8 @@ def scores_text(scores: PooledScores, why_no_pose: str = "") -> str:
     has_frames = any(one.frames for one in scores.drives)
     missing = scores.not_scored() if has_frames else {}
     missing |= {"pose": why_no_pose} if why_no_pose else {}
-    lines += _coverage(scores) if has_frames else [_line("drives", _without_pictures(scores))]
+    without = f"{len(scores.drives)}, without pictures: no cue, belief or range to score"
+    lines += _coverage(scores) if has_frames else [_line("drives", without)]
     lines += [_line("not scored", f"{k}: {v}") for k, v in missing.items()]
     lines += _left_out(scores.cues)
     return "\n".join(part for line in lines for part in _wrapped(line))
@@ -104,10 +105,6 @@ def _coverage(scores: PooledScores) -> list[str]:
         why = "a clock was set back, and their log time comes twice"
         lines.append(_line("ambiguous", f"{counted(twice, 'frame')} not scored: {why}"))
     return lines
-
-
-def _without_pictures(scores: PooledScores) -> str:
-    return f"{len(scores.drives)}, without pictures: no cue, belief or range to score"
 
 
 def _cues(cues: Mapping[str, CueScore]) -> list[str]:

@@ -270,7 +270,7 @@ def sum_accounts(accounts: Iterable[Account | SummedAccount]) -> SummedAccount:
     for one in accounts:
         whole = whole and one.is_whole
         for stage, name, counts in one.lines():
-            totals[stage, name] = _plus(totals.get((stage, name)), counts)
+            totals[stage, name] = _plus(totals.get((stage, name), _NONE), counts)
 
     by_stage: dict[str, dict[str, SummedLine]] = {stage: {} for stage in _ROWS}
     for (stage, name), total in totals.items():
@@ -280,11 +280,12 @@ def sum_accounts(accounts: Iterable[Account | SummedAccount]) -> SummedAccount:
     return made
 
 
-def _plus(total: SummedLine | None, counts: Counts) -> SummedLine:
-    if total is None:
-        total = SummedLine(
-            entered=0, used=0, skipped={}, dropped={}, runs=0, runs_with_unknown_drops=0
-        )
+_NONE: Final = SummedLine(
+    entered=0, used=0, skipped={}, dropped={}, runs=0, runs_with_unknown_drops=0
+)
+
+
+def _plus(total: SummedLine, counts: Counts) -> SummedLine:
     return SummedLine(
         entered=total.entered + counts.entered,
         used=total.used + counts.used,

@@ -29,10 +29,10 @@ def span_ns(run: TableFolder) -> tuple[int, int]:
     import pyarrow.compute as pc
 
     for name in TABLES:
-        if run.file(f"{name}.parquet").exists():
-            times = run.table(name, ["t_ns"])["t_ns"]
-            if len(times):
-                return int(pc.min(times).as_py()), int(pc.max(times).as_py())
+        table = run.filled(name, ["t_ns"])
+        if table is not None:
+            ends = pc.min_max(table["t_ns"]).as_py()
+            return int(ends["min"]), int(ends["max"])
     raise UnreadableRunError(f"{run.path}: neither a frame nor a pose in it; replay again")
 
 
@@ -82,12 +82,13 @@ def approach_spans(run: TableFolder) -> dict[int, tuple[int, int]]:
     Raises:
         RunError: The table is damaged.
     """
-    if not run.file("belief.parquet").exists():
+    import pyarrow.compute as pc
+
+    table = run.filled("belief", ["t_ns", "approach"])
+    if table is None:
         return {}
-    table = run.table("belief", ["t_ns", "approach"])
-    grouped = table.group_by("approach").aggregate([("t_ns", "min"), ("t_ns", "max")])
-    rows = [row for row in grouped.to_pylist() if row["approach"] is not None]
-    rows.sort(key=lambda row: row["approach"])
+    known = table.filter(pc.is_valid(table["approach"])).group_by("approach")
+    rows = known.aggregate([("t_ns", "min"), ("t_ns", "max")]).sort_by("approach").to_pylist()
     return {row["approach"]: (row["t_ns_min"], row["t_ns_max"]) for row in rows}
 
 

@@ -7,9 +7,10 @@ partition column with one value per file, so the files of other runs are not ope
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -192,7 +193,7 @@ class Catalog:
         return {*INDEXED, *QUERIED, *table_names(files)}
 
     def _parts(self, table: str) -> RunsTable:
-        file = file_of(table)
+        file = FILES.get(table, f"{table}.parquet")
         places = {
             run: self._places.place(run, file)
             for run, files in zip(self._listed("run"), self._listed("tables"), strict=True)
@@ -233,11 +234,6 @@ def catalog(place: Path | str) -> Catalog:
     return Catalog(places, open_index(places))
 
 
-def file_of(table: str) -> str:
-    """Return the path of a table in a run."""
-    return FILES.get(table, f"{table}.parquet")
-
-
 def table_names(files: Iterable[str]) -> set[str]:
     """Return the names of the tables that these files contain."""
     inside = {name: table for table, name in FILES.items()}
@@ -272,16 +268,30 @@ class RunsTable:
         self._form: Final = ds.ParquetFileFormat(default_fragment_scan_options=scan)
         self._fragments: Final[dict[str, ds.Fragment]] = {}
         schema = arrow_schema(RUN)
-        for run, fragment, found in _opened(runs, filesystem, self._form):
+        fragments = {run: self._fragment(run, path) for run, path in runs.items()}
+        with ThreadPoolExecutor(WORKERS) as pool:
+            read = attrgetter("physical_schema")
+            schemas = [pool.submit(read, fragment) for fragment in fragments.values()]
+        for (run, fragment), found in zip(fragments.items(), schemas, strict=True):
             try:
-                if isinstance(found, Exception):
-                    raise found
-                schema = pa.unify_schemas([schema, found], promote_options="permissive")
+                plain = found.result().remove_metadata()
+                schema = pa.unify_schemas([schema, plain], promote_options="permissive")
             except (OSError, pa.ArrowException) as error:
                 self.left_out[run] = _why(runs[run], error)
                 continue
             self._fragments[run] = fragment
         self._schema: Final = schema if self._fragments else arrow_schema(QUERIED.get(table, RUN))
+
+    def _fragment(self, run: str, path: str) -> ds.Fragment:
+        import pyarrow.dataset as ds
+
+        is_run = ds.field("run") == run
+        try:
+            return self._form.make_fragment(path, self._filesystem, partition_expression=is_run)
+        except UnicodeEncodeError:
+            # Arrow's file systems refuse a name that is not UTF-8. This file stays open.
+            file = door.arrow_file(Path(path))
+            return self._form.make_fragment(file, partition_expression=is_run)
 
     @property
     def dataset(self) -> ds.Dataset:
@@ -306,32 +316,6 @@ class RunsTable:
             del self._fragments[run]
         self.left_out.update(damaged)
         return len(damaged)
-
-
-def _opened(
-    runs: Mapping[str, str], filesystem: pyarrow.fs.FileSystem, form: ds.ParquetFileFormat
-) -> Iterator[tuple[str, ds.Fragment, pa.Schema | Exception]]:
-    import pyarrow as pa
-    import pyarrow.dataset as ds
-
-    def schema_of(fragment: ds.Fragment) -> pa.Schema | Exception:
-        try:
-            return fragment.physical_schema.remove_metadata()
-        except (OSError, pa.ArrowException) as error:
-            return error
-
-    def fragment_of(run: str, path: str) -> ds.Fragment:
-        is_run = ds.field("run") == run
-        try:
-            return form.make_fragment(path, filesystem, partition_expression=is_run)
-        except UnicodeEncodeError:
-            # Arrow's file systems refuse a name that is not UTF-8. This file stays open.
-            file = door.arrow_file(Path(path))
-            return form.make_fragment(file, partition_expression=is_run)
-
-    fragments = [fragment_of(run, path) for run, path in runs.items()]
-    with ThreadPoolExecutor(WORKERS) as pool:
-        yield from zip(runs, fragments, pool.map(schema_of, fragments), strict=True)
 
 
 def _why(path: str, error: Exception) -> str:

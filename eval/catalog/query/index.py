@@ -187,16 +187,6 @@ def _updated(earlier: Any, name: str, stale: set[str], rows: list[RunRows]) -> p
     return pa.concat_tables([earlier.to_table(filter=kept).cast(schema), new]).unify_dictionaries()
 
 
-def _save(path: Path | None, tables: Mapping[str, pa.Table]) -> str:
-    """Save the index; return the reason if it could not be saved, else an empty text."""
-    try:
-        if path is not None:
-            _write_index(path, tables)
-    except OutputError as error:
-        return f"the index was not saved, so the runs are read again next time: {error}"
-    return ""
-
-
 def _index(tables: Mapping[str, Any], left_out: Mapping[str, str], notice: str) -> Index:
     import pyarrow as pa
 
@@ -205,9 +195,12 @@ def _index(tables: Mapping[str, Any], left_out: Mapping[str, str], notice: str) 
     return Index({**tables, "left_out": listed}, left_out, notice)
 
 
-def _write_index(path: Path, tables: Mapping[str, pa.Table]) -> None:
+def _save(path: Path | None, tables: Mapping[str, pa.Table]) -> str:
+    """Save the index; return the reason if it could not be saved, else an empty text."""
     import pyarrow.parquet as pq
 
+    if path is None:
+        return ""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         archive.writestr(FORMAT, _MARK)
@@ -215,4 +208,8 @@ def _write_index(path: Path, tables: Mapping[str, pa.Table]) -> None:
             member = io.BytesIO()
             pq.write_table(table, member, compression="zstd")
             archive.writestr(name, member.getvalue())
-    write_bytes(path, content.getvalue())
+    try:
+        write_bytes(path, content.getvalue())
+    except OutputError as error:
+        return f"the index was not saved, so the runs are read again next time: {error}"
+    return ""

@@ -60,9 +60,8 @@ class RemoteRuns:
         found: list[str] = []
         for folder in sorted(self._objects, key=lambda name: [*name.split("/")]):
             names = self._objects[folder]
-            is_inside = any(_is_below(folder, run) for run in found[-1:])
             if (
-                is_inside
+                any(run == "." or folder.startswith(f"{run}/") for run in found[-1:])
                 or folder.count("/") >= DEPTH
                 or any(part.startswith(".") and part != "." for part in folder.split("/"))
             ):
@@ -144,10 +143,6 @@ def _by_folder(root: str, listed: Infos) -> dict[str, dict[str, Mapping[str, Any
         folder, _, name = posixpath.relpath(address, root).rpartition("/")
         folders[folder or "."][name] = info
     return folders
-
-
-def _is_below(folder: str, run: str) -> bool:
-    return run == "." or folder.startswith(f"{run}/")
 
 
 def _joined(run: str, folder: str) -> str:

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -38,13 +37,14 @@ TABLES: Final[Mapping[Signal, tuple[str, tuple[str, ...]]]] = {
 }
 
 
-class MobileyeSink:
+class MobileyeSink(ExitStack):
     """Writer of both tables, a window at a time; a context manager."""
 
     def __init__(self, run: TableFolder, timeline: Timeline, clock: LogClock) -> None:
-        self._stack: Final = ExitStack()
+        super().__init__()
         self._sinks: Final = {
-            signal: LabelledSink(run, name, timeline, clock) for signal, (name, _) in TABLES.items()
+            signal: self.enter_context(LabelledSink(run, name, timeline, clock))
+            for signal, (name, _) in TABLES.items()
         }
 
     def write(self, samples: Mapping[Signal, Samples]) -> None:
@@ -54,19 +54,6 @@ class MobileyeSink:
             if found is not None and len(found.t_ns):
                 columns = dict(zip(TABLES[signal][1], found.values.T, strict=True))
                 self._sinks[signal].write({"t_ns": found.t_ns, **columns})
-
-    def __enter__(self) -> Self:
-        for sink in self._sinks.values():
-            self._stack.enter_context(sink)
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._stack.__exit__(kind, error, trace)
 
 
 class StoredMobileye:

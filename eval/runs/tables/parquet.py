@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
@@ -133,6 +132,13 @@ class TableFolder:
         with self._opened(name) as file:
             return pq.ParquetFile(file, page_checksum_verification=True).read(columns)
 
+    def filled(self, name: str, columns: list[str] | None = None) -> pa.Table | None:
+        """Read ``NAME.parquet`` as ``table`` does; None without the file, or without a row."""
+        if not self.file(f"{name}.parquet").exists():
+            return None
+        found = self.table(name, columns)
+        return found if found.num_rows else None
+
     def schema(self, name: str) -> pa.Schema:
         """Read the schema of ``NAME.parquet``.
 
@@ -217,12 +223,7 @@ class TableSink:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
         if kind is not None:
             # The disk may be full; remove the incomplete file and report the original error.
             with suppress(OSError, ValueError):

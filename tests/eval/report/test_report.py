@@ -5,7 +5,7 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
@@ -321,38 +321,21 @@ def test_moments_of_a_drive_whose_clock_was_set_have_pictures_and_open(tmp_path:
         assert moment_ns(run, f"{one.at_s:.3f}") == pytest.approx(one.t_ns, abs=1e6)
 
 
-class Run:
-    """A run with a table of visual odometry."""
-
-    def __init__(self, folder: Path, step_rad: float) -> None:
-        rng = np.random.default_rng(1)
-        t_s = np.arange(0.0, 40.0, 0.1)
-        pitch = 0.02 + step_rad * (t_s > 20.0) + 5e-4 * rng.normal(size=len(t_s))
-        self._columns = {
-            "t_ns": np.round(t_s * 1e9).astype(np.int64),
-            "pitch_rad": pitch,
-            "is_standing": np.zeros(len(t_s), np.bool_),
-        }
-        self._file = folder / "visual_odometry.parquet"
-        self._file.touch()
-
-    def file(self, name: str) -> Path:
-        """Path of the table."""
-        return self._file
-
-    def table(self, name: str, columns: Any) -> pa.Table:
-        """The table."""
-        return pa.table(self._columns)
-
-
 @pytest.mark.parametrize("step_deg", [0.0, 0.5])
 def test_report_names_a_step_of_the_pitch_and_lists_ten_seconds_each(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step_deg: float
 ) -> None:
     monkeypatch.setattr(page, "span_ns", lambda run: (0, 40_000_000_000))
-    run = cast("RunFolder", Run(tmp_path, np.radians(step_deg)))
+    t_s = np.arange(0.0, 40.0, 0.1)
+    noise = 5e-4 * np.random.default_rng(1).normal(size=len(t_s))
+    columns = {
+        "t_ns": np.round(t_s * 1e9).astype(np.int64),
+        "pitch_rad": 0.02 + np.radians(step_deg) * (t_s > 20.0) + noise,
+        "is_standing": np.zeros(len(t_s), np.bool_),
+    }
+    pq.write_table(pa.table(columns), tmp_path / "visual_odometry.parquet")
 
-    windows, steps = page._pitch(run)
+    windows, steps = page._pitch(RunFolder(tmp_path))
 
     assert [one.partition(":")[0] for one in windows] == [
         "0 to 10 s",
