@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 FORMATS: Final = ("dbc", "kcd", "arxml", "sym")
 # Max reported pairs of overlapping signals in a message.
 _MAX_PAIRS: Final = 100
+# Two messages that are equal in these decode every frame to the same columns.
+_LAYOUT: Final = ("name", "length", "signals")
 _EXTENDED_FLAG: Final = 0x8000_0000
 
 
@@ -48,11 +50,7 @@ class CanDatabase:
     )
 
     @classmethod
-    def load(
-        cls,
-        paths: Sequence[Path | str],
-        limits: Limits = DEFAULT_LIMITS,
-    ) -> CanDatabase:
+    def load(cls, paths: Sequence[Path | str], limits: Limits = DEFAULT_LIMITS) -> CanDatabase:
         """Read the database files that together describe one bus.
 
         Args:
@@ -73,11 +71,7 @@ class CanDatabase:
         return cls.of(found, notices)
 
     @classmethod
-    def of(
-        cls,
-        messages: Iterable[CanMessage],
-        notices: Iterable[str] = (),
-    ) -> CanDatabase:
+    def of(cls, messages: Iterable[CanMessage], notices: Iterable[str] = ()) -> CanDatabase:
         """Build a database from messages, and check for duplicate identifiers and names.
 
         Raises:
@@ -93,7 +87,7 @@ class CanDatabase:
                 f"{spell_id(*kept.key)} is defined as {kept.name} ({kept.source}) and as "
                 f"{message.name} ({message.source})"
             )
-            if kept.same_layout(message):
+            if all(getattr(kept, name) == getattr(message, name) for name in _LAYOUT):
                 said.append(f"{twice}: with the same layout")
             else:
                 harmful.append(twice)

@@ -9,9 +9,9 @@ Both readers produce the same messages.
 
 import re
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
-from .layout import CanMessage, CanSignal
+from .layout import CanMessage, CanSignal, is_integer
 
 _NAME: Final = r"[A-Za-z_]\w*"
 _NUM: Final = r"[-+]?\d+\.?\d*(?:[eE][+-]?\d+)?"
@@ -76,30 +76,14 @@ class _UnusualError(Exception):
     """A construct that is left to cantools."""
 
 
-class _Signal(NamedTuple):
-    """One ``SG_`` line."""
-
-    name: str
-    marker: str
-    start: int
-    length: int
-    is_big_endian: bool
-    is_signed: bool
-    scale: float
-    offset: float
-    minimum: float | None
-    maximum: float | None
-    unit: str
-
-
 @dataclass(slots=True)
 class _Message:
-    """One ``BO_`` line and its signals."""
+    """One ``BO_`` line, and the ``SG_`` lines of its signals."""
 
     stored: int
     name: str
     length: int
-    signals: list[_Signal] = field(default_factory=list)
+    lines: list[re.Match[str]] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -145,14 +129,19 @@ def _statements(text: str) -> _Found:
         if kind is None:
             continue
         if kind == "unit":
-            if message is None:
+            if message is None or match["sg"] in _KEYWORDS or match["size"] == "0":
                 raise _UnusualError
-            message.signals.append(_signal(match))
+            message.lines.append(match)
         elif kind == "bytes":
             message = _new_message(match, found)
         else:
             message = None
-            _ADD[kind](match, found)
+            if kind == "kind":
+                found.kinds[int(match["type_bo"]), match["type"]] = int(match["kind"])
+            elif kind == "default_value":
+                found.defaults[match["default"][1:-1]] = match["default_value"]
+            elif kind != "bu":
+                _ADD[kind](match, found)
     if at != len(text):
         raise _UnusualError
     return found
@@ -164,28 +153,6 @@ def _new_message(match: re.Match[str], found: _Found) -> _Message:
     if found.messages.setdefault(stored, message) is not message:
         raise _UnusualError
     return message
-
-
-def _signal(match: re.Match[str]) -> _Signal:
-    name, marker, start, size, order, sign, scale, offset, low, high, unit = match.group(
-        "sg", "mux", "start", "size", "order", "sign", "scale", "offset", "min", "max", "unit"
-    )
-    if name in _KEYWORDS or size == "0":
-        raise _UnusualError
-    has_range = not low == high == "0"
-    return _Signal(
-        name,
-        marker or "",
-        int(start),
-        int(size),
-        order == "0",
-        sign == "-",
-        _number(scale),
-        _number(offset),
-        _number(low) if has_range else None,
-        _number(high) if has_range else None,
-        unit[1:-1],
-    )
 
 
 def _number(text: str) -> float:
@@ -212,10 +179,6 @@ def _add_choices(match: re.Match[str], found: _Found) -> None:
         found.choices[int(match["val_bo"]), match["val"]] = names
 
 
-def _add_kind(match: re.Match[str], found: _Found) -> None:
-    found.kinds[int(match["type_bo"]), match["type"]] = int(match["kind"])
-
-
 def _add_switch(match: re.Match[str], found: _Found) -> None:
     values = [
         value
@@ -228,10 +191,6 @@ def _add_switch(match: re.Match[str], found: _Found) -> None:
     switches[match["mul"]] = match["switch"], values
 
 
-def _add_default(match: re.Match[str], found: _Found) -> None:
-    found.defaults[match["default"][1:-1]] = match["default_value"]
-
-
 def _add_definition(match: re.Match[str], found: _Found) -> None:
     name = match["attribute"][1:-1]
     if name in found.attributes:
@@ -239,18 +198,11 @@ def _add_definition(match: re.Match[str], found: _Found) -> None:
     found.attributes[name] = match["attribute_type"], match["attribute_values"]
 
 
-def _ignore(match: re.Match[str], found: _Found) -> None:
-    """Ignore a list of nodes."""
-
-
 _ADD: Final = {
     "ba_value": _add_attribute,
     "pairs": _add_choices,
-    "kind": _add_kind,
     "ranges": _add_switch,
-    "default_value": _add_default,
     "attribute_values": _add_definition,
-    "bu": _ignore,
 }
 
 
@@ -259,38 +211,14 @@ def _message(parsed: _Message, found: _Found) -> CanMessage:
     is_extended = bool(stored >> 31)
     if stored >> 32 or (stored & 0x7FFFFFFF) >> (29 if is_extended else 11):
         raise _UnusualError
-    names = {one.name for one in parsed.signals}
-    if parsed.name in _KEYWORDS or len(names) < len(parsed.signals):
+    names = {one["sg"] for one in parsed.lines}
+    if parsed.name in _KEYWORDS or len(names) < len(parsed.lines):
         raise _UnusualError
     switches = found.switches.get(stored, {})
     _refuse_cycles(switches)
-    multiplexers = [one.name for one in parsed.signals if one.marker.endswith("M")]
+    multiplexers = [one["sg"] for one in parsed.lines if (one["mux"] or "").endswith("M")]
     only = multiplexers[0] if len(multiplexers) == 1 else None
-    signals = []
-    for one in parsed.signals:
-        choices = found.choices.pop((stored, one.name), None)
-        is_float = found.kinds.pop((stored, one.name), 0) in _FLOATS
-        scale, offset = _conversion(one, choices, is_float)
-        multiplexer, branches = _branch(one, only, switches)
-        signals.append(
-            CanSignal(
-                one.name,
-                one.start,
-                one.length,
-                one.is_big_endian,
-                one.is_signed,
-                is_float,
-                scale,
-                offset,
-                one.unit,
-                one.minimum,
-                one.maximum,
-                choices or {},
-                one.marker.endswith("M"),
-                multiplexer,
-                branches,
-            )
-        )
+    signals = [_signal(one, stored, found, only) for one in parsed.lines]
     signals.sort(key=lambda signal: signal.first_bit)
     return CanMessage(
         name=parsed.name,
@@ -303,41 +231,42 @@ def _message(parsed: _Message, found: _Found) -> CanMessage:
     )
 
 
-def _conversion(
-    one: _Signal, choices: dict[int, str] | None, is_float: bool
-) -> tuple[float, float]:
-    """Return scale and offset, as ints where cantools returns ints."""
-    scale, offset = one.scale, one.offset
-    if choices is not None:
-        return scale, offset
-    if scale == 1 and offset == 0:
-        return 1, 0
-    if not is_float and _is_integer(scale) and _is_integer(offset):
-        return int(scale), int(offset)
-    return scale, offset
-
-
-def _is_integer(number: float) -> bool:
-    return isinstance(number, int) or number.is_integer()
-
-
-def _branch(
-    one: _Signal, only: str | None, switches: dict[str, tuple[str, list[int]]]
-) -> tuple[str | None, frozenset[int]]:
-    """Return a signal's multiplexer, and the multiplexer values that select the signal.
-
-    Args:
-        one: The signal.
-        only: The message's multiplexer, if it has exactly one.
-        switches: Extended multiplexing of the message's signals.
-    """
-    switch, values = switches.get(one.name, (None, []))
+def _signal(line: re.Match[str], stored: int, found: _Found, only: str | None) -> CanSignal:
+    """Return the signal of a line; ``only`` is its message's multiplexer, if it has exactly one."""
+    name, marker, start, size, order, sign, scale, offset, low, high, unit = line.group(
+        "sg", "mux", "start", "size", "order", "sign", "scale", "offset", "min", "max", "unit"
+    )
+    choices = found.choices.pop((stored, name), None)
+    is_float = found.kinds.pop((stored, name), 0) in _FLOATS
+    has_range, is_multiplexer = not low == high == "0", (marker or "").endswith("M")
+    # Ints where cantools returns ints.
+    by, more = _number(scale), _number(offset)
+    if choices is None and by == 1 and more == 0:
+        by, more = 1, 0
+    elif choices is None and not is_float and is_integer(by) and is_integer(more):
+        by, more = int(by), int(more)
+    switch, values = found.switches.get(stored, {}).get(name, (None, []))
     multiplexer = only or switch
-    ids = set(values) if multiplexer is not None and switch == multiplexer else set()
-    if only is not None and one.marker and not one.marker.endswith("M"):
-        ids.add(int(one.marker[1:]))
-    is_brought = bool(one.marker) and one.name != only
-    return multiplexer if is_brought else None, frozenset(ids)
+    branches = set(values) if multiplexer is not None and switch == multiplexer else set()
+    if only is not None and marker and not is_multiplexer:
+        branches.add(int(marker[1:]))
+    return CanSignal(
+        name,
+        int(start),
+        int(size),
+        order == "0",
+        sign == "-",
+        is_float,
+        by,
+        more,
+        unit[1:-1],
+        _number(low) if has_range else None,
+        _number(high) if has_range else None,
+        choices or {},
+        is_multiplexer,
+        multiplexer if marker and name != only else None,
+        frozenset(branches),
+    )
 
 
 def _refuse_cycles(switches: dict[str, tuple[str, list[int]]]) -> None:

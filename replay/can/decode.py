@@ -47,11 +47,13 @@ class MessageRules:
         message: The message.
         extractor: Extractor of its signals, or None if it is not decoded.
         longest: Max bytes of a classic frame and of an FD frame; -1 where no frame fits.
+        refusal: Reason why it is not decoded, or empty.
     """
 
     message: CanMessage
     extractor: MessageExtractor | None
     longest: tuple[int, int]
+    refusal: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,15 +236,6 @@ Wanted: TypeAlias = Collection[str] | Collection[tuple[str, str]]
 CountKey: TypeAlias = tuple[int, bool, str]
 
 
-@dataclass(frozen=True, slots=True)
-class _Entry:
-    """The decoder's entry for one message of the database."""
-
-    message: CanMessage
-    extractor: MessageExtractor | None
-    refusal: str
-
-
 class BusDecoder:
     """Decoder of the frames of one bus, which processes a block at a time.
 
@@ -285,11 +278,10 @@ class BusDecoder:
         self._elsewhere = frozenset(elsewhere)
         self.counts: dict[CountKey, int] = {}
         chosen = _chosen(database, wanted)
-        entries = [_entry(database, message, chosen) for message in database.messages]
+        rules = [_rules(database, message, chosen, allow_longer) for message in database.messages]
         # The grouping expects decodable messages first.
-        self._entries = tuple(sorted(entries, key=lambda entry: bool(entry.refusal)))
-        self._refused = np.array([False, *(bool(entry.refusal) for entry in self._entries)])
-        self._rules = [_rules(entry, allow_longer) for entry in self._entries]
+        self._rules = sorted(rules, key=lambda rule: bool(rule.refusal))
+        self._refused = np.array([False, *(bool(rule.refusal) for rule in self._rules)])
         self._decoder = GroupedDecoder(self._rules)
 
     def __call__(self, block: Block) -> list[Block]:
@@ -313,13 +305,13 @@ class BusDecoder:
         times = _Times(block, grouped.order)
         decoded = []
         for number in (np.flatnonzero(np.diff(grouped.stops)) + 1).tolist():
-            entry = self._entries[number - 1]
+            rule = self._rules[number - 1]
             columns, strange = self._decoder.columns(number)
-            topic = f"{self._bus}/{entry.message.topic_name}"
-            assert entry.extractor is not None
-            one = times.block(topic, grouped.rows(number), columns, entry.extractor.units)
+            topic = f"{self._bus}/{rule.message.topic_name}"
+            assert rule.extractor is not None
+            one = times.block(topic, grouped.rows(number), columns, rule.extractor.units)
             if strange is not None:
-                key, count = (*entry.message.key, NO_BRANCH), int(strange.sum())
+                key, count = (*rule.message.key, NO_BRANCH), int(strange.sum())
                 if not self._add(key, count):
                     self._report(key, count, one.log_ns, strange)
                 one = one.take(~strange)
@@ -340,9 +332,9 @@ class BusDecoder:
                 mine = is_data & (ids == identifier) & ~frames.is_extended
                 self._report((identifier, False, UNKNOWN_ID), count, log_ns, mine)
         for at in np.flatnonzero(self._refused & (grouped.seen > 0)).tolist():
-            entry, count = self._entries[at - 1], int(grouped.seen[at])
+            rule, count = self._rules[at - 1], int(grouped.seen[at])
             left -= count
-            key = (*entry.message.key, entry.refusal)
+            key = (*rule.message.key, rule.refusal)
             if not self._add(key, count):
                 self._report(key, count, log_ns, is_data & (number == at))
         if left:
@@ -441,23 +433,18 @@ def _chosen(database: CanDatabase, wanted: Wanted | None) -> _Chosen | None:
     return chosen
 
 
-def _entry(database: CanDatabase, message: CanMessage, chosen: _Chosen | None) -> _Entry:
+def _rules(
+    database: CanDatabase, message: CanMessage, chosen: _Chosen | None, allow_longer: bool
+) -> MessageRules:
+    refusal = message.problem
     if chosen is not None and message.key not in chosen:
-        return _Entry(message, None, NOT_ASKED_TOPIC)
-    if message.problem:
-        return _Entry(message, None, message.problem)
+        refusal = NOT_ASKED_TOPIC
+    if refusal:
+        return MessageRules(message, None, (-1, -1), refusal)
     wanted = None if chosen is None else chosen[message.key]
-    return _Entry(message, database.extractor(message, wanted), "")
-
-
-def _rules(entry: _Entry, allow_longer: bool) -> MessageRules:
-    message = entry.message
-    if entry.extractor is None:
-        return MessageRules(message, None, (-1, -1))
     if allow_longer:
         classic = flexible = LENGTH_UNKNOWN
     else:
         classic, flexible = message.longest_frame(False), message.longest_frame(True)
-    return MessageRules(
-        message, entry.extractor, (classic, -1 if message.is_fd is False else flexible)
-    )
+    longest = (classic, -1 if message.is_fd is False else flexible)
+    return MessageRules(message, database.extractor(message, wanted), longest)

@@ -311,7 +311,7 @@ class _Filled:
         self.values: Column = (
             np.zeros(n, dtype=arithmetic.value) if is_integer else np.full(n, np.nan)
         )
-        needs_companion = is_integer and signal.may_be_absent
+        needs_companion = is_integer and signal.multiplexer is not None
         self.present = np.zeros(n, dtype=np.bool_) if needs_companion else None
 
     def put(self, rows: NDArray[np.intp], values: Column) -> None:

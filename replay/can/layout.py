@@ -113,11 +113,6 @@ class CanSignal:
             return Arithmetic.UINT64
         return Arithmetic.BIG
 
-    @property
-    def may_be_absent(self) -> bool:
-        """True if a multiplexer selects it, so that rows may lack it."""
-        return self.multiplexer is not None
-
 
 @dataclass(frozen=True, slots=True)
 class CanMessage:
@@ -168,10 +163,6 @@ class CanMessage:
                 return signal
         there = ", ".join(signal.name for signal in self.signals)
         raise ValueError(f"{self.name} has no signal {name!r}; there are: {there}")
-
-    def same_layout(self, other: CanMessage) -> bool:
-        """Return whether both messages decode every frame to the same columns."""
-        return (self.name, self.length, self.signals) == (other.name, other.length, other.signals)
 
     def longest_frame(self, is_fd: bool) -> int:
         """Return the max payload bytes of a frame that carries it.

@@ -98,14 +98,10 @@ class LayoutEntry:
             folder = self._path.parent
             folder.mkdir(parents=True, exist_ok=True)
             write_bytes(self._path, _HEAD + _checksum(body) + b"\n" + body)
-            _prune(folder)
-
-
-def _prune(folder: Path) -> None:
-    """Remove the oldest files beyond ``_ENTRIES_KEPT``, including those of killed processes."""
-    entries = [(entry.stat().st_mtime, entry) for entry in folder.iterdir()]
-    for _, entry in sorted(entries)[:-_ENTRIES_KEPT]:
-        entry.unlink()
+            # The oldest files go, including those of killed processes.
+            entries = [(entry.stat().st_mtime, entry) for entry in folder.iterdir()]
+            for _, entry in sorted(entries)[:-_ENTRIES_KEPT]:
+                entry.unlink()
 
 
 def _checksum(body: bytes) -> bytes:

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from typing import Final, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.replay.columns import Block, Floats, Int64s, Table
 from crosscue.replay.mobileye.geometry import DevicePosition
@@ -48,12 +47,6 @@ def floats(column: Column) -> Floats:
     return cast("Floats", column)
 
 
-def side_of_lane(table: str, instance: Int64s) -> NDArray[np.int8]:
-    """Return ``LEFT`` or ``RIGHT`` of an instance of a lane message; further lanes alternate."""
-    is_left = instance % 2 == 0 if table == "next_lanes" else instance == 0
-    return np.where(is_left, LEFT, RIGHT).astype(np.int8)
-
-
 def instance_of_lane(table: str, columns: Mapping[str, Column]) -> Int64s:
     """Return the instances of a lane message from the columns of ``lane_places``."""
     is_right: Int64s = (columns["side"] == RIGHT).astype(np.int64)
@@ -65,10 +58,10 @@ def instance_of_lane(table: str, columns: Mapping[str, Column]) -> Int64s:
 
 def lane_places(table: str, instance: Int64s) -> Columns:
     """Return the columns that identify the lane of a row; ``index`` counts outwards from 0."""
-    places: Columns = {"side": side_of_lane(table, instance)}
-    if table == "next_lanes":
-        places["index"] = (instance // 2).astype(np.int8)
-    return places
+    if table != "next_lanes":
+        return {"side": np.where(instance == 0, LEFT, RIGHT).astype(np.int8)}
+    side = np.where(instance % 2 == 0, LEFT, RIGHT).astype(np.int8)
+    return {"side": side, "index": (instance // 2).astype(np.int8)}
 
 
 def to_vehicle(table: str, columns: Columns, mounting: DevicePosition) -> Columns:

@@ -148,19 +148,14 @@ def _raw_from(
             f"expected {low:g} to {high:g} {f.unit} on the wire"
         )
     nearest = np.clip(np.rint(steps), lowest, highest)
-    nearest = _beside_missing(f, nearest)
+    # Values that equal a code for missing are moved to the step before it.
+    for code in f.missing:
+        nearest = np.where(nearest == code, code - 1 if code > 0 else code + 1, nearest)
     return np.where(is_missing | np.isnan(nearest), stand_in, nearest).astype(np.int64)
 
 
 def _inside(steps: NDArray[np.float64], lowest: int, highest: int) -> NDArray[np.bool_]:
     return (steps >= lowest - 0.5 - 1e-6) & (steps <= highest + 0.5 + 1e-6)
-
-
-def _beside_missing(f: BitField, nearest: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Move values that equal a code for missing to the step before it."""
-    for code in f.missing:
-        nearest = np.where(nearest == code, code - 1 if code > 0 else code + 1, nearest)
-    return nearest
 
 
 def _on_wire(f: BitField, column: Column) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

@@ -266,12 +266,9 @@ class Fusion(Section):
                 raise _refused(f"{name}: neither supports nor excludes a feature; name one")
             if len(set(edges)) < len(edges):
                 raise _refused(f"{name}: a feature occurs twice in its edges; keep one")
-            for feature in edges:
-                if feature not in features:
-                    raise _refused(
-                        f"{name}: no feature {feature!r}{_near(feature, features)}; "
-                        f"there are: {', '.join(features)}"
-                    )
+            _check_known(
+                edges, features, f"{name}: no feature", f"; there are: {', '.join(features)}"
+            )
         return cues
 
     @field_validator("calibrated")
@@ -281,11 +278,7 @@ class Fusion(Section):
             return learned
         cues, features = info.data["cues"], info.data["features"]
         for known, names in ((cues, learned.fades), (features, learned.exponents)):
-            for name in names:
-                if name not in known:
-                    raise _refused(
-                        f"no {name!r}{_near(name, known)}; there are: {', '.join(known)}"
-                    )
+            _check_known(names, known, "no", f"; there are: {', '.join(known)}")
         seen: set[tuple[str, str, bool]] = set()
         for one in learned.rates:
             edges = cues[one.cue].supports + cues[one.cue].excludes if one.cue in cues else ()
@@ -308,18 +301,12 @@ class Fusion(Section):
     @model_validator(mode="after")
     def _has_learned_chains(self) -> Self:
         for one in () if self.temporal is None else self.temporal.chains:
-            if one.cue not in self.cues:
-                raise _refused(f"temporal: no cue {one.cue!r}{_near(one.cue, self.cues)}")
-            for name in (*one.there, *one.missing):
-                if name not in self.features:
-                    raise _refused(f"temporal: no feature {name!r}{_near(name, self.features)}")
+            _check_known((one.cue,), self.cues, "temporal: no cue")
+            _check_known((*one.there, *one.missing), self.features, "temporal: no feature")
         sides = () if self.combined is None else (self.combined.positive, self.combined.negative)
         for name, weights in (pair for side in sides for pair in side.items()):
-            if name not in self.features:
-                raise _refused(f"combined: no feature {name!r}{_near(name, self.features)}")
-            for cue in weights:
-                if cue not in self.cues:
-                    raise _refused(f"combined: no cue {cue!r}{_near(cue, self.cues)}")
+            _check_known((name,), self.features, "combined: no feature")
+            _check_known(weights, self.cues, "combined: no cue")
         if self.kind not in ("temporal", "combined"):
             return self
         for name in ("temporal", self.kind):
@@ -357,6 +344,14 @@ def _merged(usual: Mapping[str, Section], given: object) -> object:
 def _near(name: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
     return f" (did you mean {close[0]}?)" if close else ""
+
+
+def _check_known(
+    names: Iterable[str], known: Mapping[str, object], of: str, more: str = ""
+) -> None:
+    for name in names:
+        if name not in known:
+            raise _refused(f"{of} {name!r}{_near(name, known)}{more}")
 
 
 def _refused(why: str) -> PydanticCustomError:

@@ -129,7 +129,10 @@ class Statuses:
         """Return the bursts that start, their rows, and the burst of each frame."""
         at = np.flatnonzero(frames.message == self._number)
         opens = self._opens(frames.words[at], frames.log_ns[at])
-        self._report_repeated(frames.log_ns[at[~opens]])
+        repeated_ns = frames.log_ns[at[~opens]]
+        if len(repeated_ns):
+            count, first_ns = len(repeated_ns), int(repeated_ns[0])
+            self._ledger.skip(self._bus, REPEATED_STATUS, count, "0x738", first_ns)
         at = at[opens]
         burst_at = np.zeros(len(frames), dtype=np.int64)
         burst_at[at] = 1
@@ -150,10 +153,6 @@ class Statuses:
         opens[len(words) - len(is_repeated) :] = ~is_repeated
         self._word, self._log_ns = word[-1:], log[-1:]
         return opens
-
-    def _report_repeated(self, log_ns: Int64s) -> None:
-        if len(log_ns):
-            self._ledger.skip(self._bus, REPEATED_STATUS, len(log_ns), "0x738", int(log_ns[0]))
 
     def _rows(self, frames: Admitted) -> tuple[Status, Block]:
         variant = variant_by_length(self._message, frames.length, self._settings)

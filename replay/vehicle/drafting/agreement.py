@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from .series import WINDOW_S, Grid, GroundTrack, Series
+from .series import STEPS, WINDOW_S, Grid, GroundTrack, Series
 
 DEGREE: Final = math.pi / 180.0
 MAX_SPEED_MPS: Final = 100.0
@@ -134,7 +134,7 @@ def of_course(track: GroundTrack, grid: Grid) -> Turning | None:
     """Return the course over ground as a reference; None if the car was too slow."""
     if track.course is None:
         return None
-    turned = np.diff(track.course.at(grid)[:: grid.steps])
+    turned = np.diff(track.course.at(grid)[::STEPS])
     return Turning(f"the course of {track.course.name}", turned, np.zeros(grid.windows))
 
 

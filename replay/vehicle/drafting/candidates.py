@@ -110,28 +110,28 @@ def _candidate(message: CanMessage, signal: CanSignal) -> Candidate | None:
         return None
     unit = _unit(signal.unit)
     wheel = next((w for w, words in WHEELS.items() if _has_word(of_signal, words)), "")
-    if unit in SPEED_UNITS or unit in _TURNING:
-        if wheel and (unit not in _TURNING or _mentions(both, OF_WHEELS)):
-            stem = "_".join([message.topic_name, *_without(of_signal, WHEELS[wheel])])
-            scale = 1.0 if unit in _TURNING else SPEED_UNITS[unit]
-            return Candidate(
-                message.topic_name, signal.name, SignalKind.WHEEL, signal.unit, scale, wheel, stem
-            )
-        if unit in SPEED_UNITS and _mentions(both, OF_SPEED):
-            kind = SignalKind.GNSS_SPEED if _mentions(both, OF_GNSS) else SignalKind.SPEED
-            return Candidate(message.topic_name, signal.name, kind, signal.unit, SPEED_UNITS[unit])
-    if unit in ANGLE_UNITS:
-        is_rate = unit.endswith(("/s", "/sec", "/second", "persecon"))
-        scale = ANGLE_UNITS[unit]
-        if is_rate and _mentions(of_signal, OF_YAW):
-            return Candidate(
-                message.topic_name, signal.name, SignalKind.YAW_RATE, signal.unit, scale
-            )
-        if not is_rate and _mentions(both, OF_STEERING) and not _mentions(of_signal, OF_YAW):
-            return Candidate(
-                message.topic_name, signal.name, SignalKind.STEERING, signal.unit, scale
-            )
-    return None
+    is_turning, is_speed = unit in _TURNING, unit in SPEED_UNITS
+    is_rate = unit.endswith(("/s", "/sec", "/second", "persecon"))
+    stem = ""
+    if wheel and (is_speed or is_turning) and (not is_turning or _mentions(both, OF_WHEELS)):
+        kind, scale = SignalKind.WHEEL, 1.0 if is_turning else SPEED_UNITS[unit]
+        stem = "_".join([message.topic_name, *_without(of_signal, WHEELS[wheel])])
+    elif is_speed and _mentions(both, OF_SPEED):
+        kind = SignalKind.GNSS_SPEED if _mentions(both, OF_GNSS) else SignalKind.SPEED
+        scale = SPEED_UNITS[unit]
+    elif unit in ANGLE_UNITS and is_rate and _mentions(of_signal, OF_YAW):
+        kind, scale = SignalKind.YAW_RATE, ANGLE_UNITS[unit]
+    elif (
+        unit in ANGLE_UNITS
+        and not is_rate
+        and _mentions(both, OF_STEERING)
+        and not _mentions(of_signal, OF_YAW)
+    ):
+        kind, scale = SignalKind.STEERING, ANGLE_UNITS[unit]
+    else:
+        return None
+    of_wheel = wheel if kind is SignalKind.WHEEL else ""
+    return Candidate(message.topic_name, signal.name, kind, signal.unit, scale, of_wheel, stem)
 
 
 def _unit(text: str) -> str:

@@ -7,17 +7,17 @@ because a GNSS course is too noisy to be differentiated.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-Floats: TypeAlias = NDArray[np.float64]
-Int64s: TypeAlias = NDArray[np.int64]
-
+from crosscue.replay.columns import Floats, Int64s
 
 STEP_S: Final = 0.1
 WINDOW_S: Final = 2.0
+# Number of steps in a window.
+STEPS: Final = round(WINDOW_S / STEP_S)
 # Maximum gap that is interpolated; GNSS fixes may be one second apart.
 MAX_GAP_S: Final = 1.5
 EARTH_RADIUS_M: Final = 6_371_000.0
@@ -75,7 +75,7 @@ class Series:
         rate = self.at(grid)
         if not np.isfinite(rate).any():
             return np.full(grid.windows, np.nan)
-        turned = np.diff(self.integral(grid.edges_ns))
+        turned = np.diff(self.integral(grid.t_ns[::STEPS]))
         return np.where(grid.windows_where(np.isfinite(rate)), turned, np.nan)
 
 
@@ -92,36 +92,23 @@ class Grid:
     @classmethod
     def over(cls, start_ns: int, end_ns: int) -> Grid:
         """Create a grid of as many complete windows as fit between two times."""
-        step_ns, steps = round(STEP_S * 1e9), round(WINDOW_S / STEP_S)
-        windows = max((end_ns - start_ns) // (step_ns * steps), 0)
-        return cls(start_ns + np.arange(windows * steps + 1, dtype=np.int64) * step_ns)
-
-    @property
-    def steps(self) -> int:
-        """Number of steps in a window."""
-        return round(WINDOW_S / STEP_S)
+        step_ns = round(STEP_S * 1e9)
+        windows = max((end_ns - start_ns) // (step_ns * STEPS), 0)
+        return cls(start_ns + np.arange(windows * STEPS + 1, dtype=np.int64) * step_ns)
 
     @property
     def windows(self) -> int:
         """Number of windows."""
-        return (len(self.t_ns) - 1) // self.steps
-
-    @property
-    def edges_ns(self) -> Int64s:
-        """Edges of the windows, shape (windows + 1,)."""
-        return self.t_ns[:: self.steps]
+        return (len(self.t_ns) - 1) // STEPS
 
     def windows_where(self, is_so: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return a mask of the windows in which ``is_so`` is true throughout, edges included."""
-        whole: NDArray[np.bool_] = (
-            is_so[:-1].reshape(self.windows, self.steps).all(axis=1)
-            & is_so[self.steps :: self.steps]
-        )
-        return whole
+        whole = np.asarray(is_so[:-1].reshape(self.windows, STEPS).all(axis=1), np.bool_)
+        return whole & is_so[STEPS::STEPS]
 
     def mean(self, values: Floats) -> Floats:
         """Return the mean of each window."""
-        return np.asarray(values[:-1].reshape(self.windows, self.steps).mean(axis=1), np.float64)
+        return np.asarray(values[:-1].reshape(self.windows, STEPS).mean(axis=1), np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
