@@ -1,4 +1,4 @@
-"""Drives of data sets: cameras, and numeric streams that are kept in memory."""
+"""Drives in folders: cameras, and numeric streams that are kept in memory."""
 
 import heapq
 from collections.abc import Iterator, Sequence
@@ -85,7 +85,7 @@ class Numbers(Protocol):
 
 
 class CameraDrive(Closing):
-    """A drive of a data set as a ``Log``; subclasses add the ``format`` and the intrinsics."""
+    """A drive in a folder as a ``Log``; subclasses add the ``format`` and the intrinsics."""
 
     def __init__(
         self,

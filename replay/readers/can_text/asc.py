@@ -110,7 +110,7 @@ def open_asc(path: Path, limits: Limits) -> Log:
         LogFormatError: The start of the file has neither a header nor a line of this format.
     """
     head = head_of(path)
-    return TextCanLog(path, limits, lambda: Asc(head))
+    return TextCanLog(path, lambda: Asc(head))
 
 
 class Asc(Dialect):
@@ -133,8 +133,7 @@ class Asc(Dialect):
         for raw in head.splitlines():
             line = raw.decode("latin-1").strip().removeprefix("\xef\xbb\xbf")
             if found := _HEADER_BASE.fullmatch(line):
-                self._base = 10 if found[1].lower() == "dec" else 16
-                self._is_relative = (found[2] or "").lower() == "relative"
+                self._base, self._is_relative = _base_of(found)
                 self._has_header = True
             elif _TIMED.fullmatch(line):
                 break
@@ -230,9 +229,7 @@ class Asc(Dialect):
         if _HEADER_EVENTS.fullmatch(text):
             return HeaderLine()
         if found := _HEADER_BASE.fullmatch(text):
-            base = 10 if found[1].lower() == "dec" else 16
-            is_relative = (found[2] or "").lower() == "relative"
-            is_same = (base, is_relative) == (self._base, self._is_relative)
+            is_same = _base_of(found) == (self._base, self._is_relative)
             return HeaderLine(stops="" if is_same else "a different 'base' line inside the file")
         return DamagedLine(NOT_UNDERSTOOD)
 
@@ -310,6 +307,10 @@ class Asc(Dialect):
             return None
         good = all(_TWO_HEX.fullmatch(w) for w in words[:length])
         return bytes(int(w, 16) for w in words[:length]) if good else None
+
+
+def _base_of(found: re.Match[str]) -> tuple[int, bool]:
+    return 10 if found[1].lower() == "dec" else 16, (found[2] or "").lower() == "relative"
 
 
 def _is_code(word: str, base: int) -> bool:

@@ -19,7 +19,7 @@ from crosscue.replay.base import Log
 from crosscue.replay.columns import DATA, ERROR, REMOTE, CanFrames, Int64s
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.limits import Limits
-from crosscue.replay.readers.can_rows import IS_FD_LENGTH
+from crosscue.replay.readers.can_rows import IS_FD_LENGTH, FrameRows
 
 from .dialect import (
     BAD_IDENTIFIER,
@@ -84,7 +84,7 @@ def open_candump(path: Path, limits: Limits) -> Log:
         LogFormatError: The file is candump's screen output without usable times.
     """
     _refuse_without_times(path, head_of(path))
-    return TextCanLog(path, limits, Candump)
+    return TextCanLog(path, Candump)
 
 
 def _refuse_without_times(path: Path, head: bytes) -> None:
@@ -141,8 +141,7 @@ class Candump(Dialect):
             payload,
             shape.is_fd,
         )
-        names = tuple(one.decode("ascii", "replace") for one in spelled)
-        return Fast(picked(ok, shape.line, bus, t_ns, frames), names)
+        return picked(ok, FrameRows(shape.line, bus, t_ns, frames), spelled)
 
     def slow(self, line: bytes) -> Outcome:
         """Parse remote frames, the screen format and other unusual lines."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Final, NamedTuple, TypeAlias
 
@@ -22,7 +22,6 @@ from crosscue.replay.columns import Block, Bytes, CanFrames, Int64s, Topic
 from crosscue.replay.errors import LogFormatError
 from crosscue.replay.files.closing import Closing
 from crosscue.replay.ledger import Ledger
-from crosscue.replay.limits import Limits
 from crosscue.replay.readers.can_rows import (
     NO_ROWS,
     TOO_MANY_BUSES,
@@ -110,27 +109,27 @@ class Fast:
     names: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class ChunkResult:
-    """The parsed lines of a chunk, for formats with counters; lines count from the chunk's first.
+    """The parsed lines of a chunk; lines count from the chunk's first.
 
     Attributes:
-        rows: Frames, by line.
+        first_number: Number of the chunk's first line in the file.
+        done: The line after the chunk's last.
+        rows: Frames, by line; in the end including ``odd``.
         odd: Frames parsed by ``slow``, with their lines and bus numbers.
         others: Lines without a frame.
         damaged: Lines that cannot be parsed, ascending.
         marks: Header lines.
-        first_number: Number of the chunk's first line in the file.
-        done: The line after the chunk's last.
     """
 
-    rows: FrameRows
-    odd: Sequence[tuple[int, int, ParsedFrame]]
-    others: Sequence[tuple[int, Other]]
-    damaged: Sequence[int]
-    marks: Sequence[tuple[int, HeaderLine]]
     first_number: int
     done: int
+    rows: FrameRows = NO_ROWS
+    odd: list[tuple[int, int, ParsedFrame]] = field(default_factory=list)
+    others: list[tuple[int, Other]] = field(default_factory=list)
+    damaged: list[int] = field(default_factory=list)
+    marks: list[tuple[int, HeaderLine]] = field(default_factory=list)
 
 
 class Dialect(ABC):
@@ -196,7 +195,6 @@ class Dialect(ABC):
 
     def unended(self, head: bytes, tail: bytes) -> str:
         """Describe what the first and last bytes lack compared with a complete log, or empty."""
-        del head, tail
         return ""
 
     def finish(self, ledger: Ledger) -> None:
@@ -207,13 +205,12 @@ class Dialect(ABC):
 class TextCanLog(Closing):
     """An open CAN log in text form (``Log``)."""
 
-    def __init__(self, path: Path, limits: Limits, dialect: Callable[[], Dialect]) -> None:
-        """Examine the first chunk.
+    def __init__(self, path: Path, dialect: Callable[[], Dialect]) -> None:
+        """Examine the first chunk; the size of a chunk bounds all memory here.
 
         Raises:
             LogFormatError: The file is empty, or its first chunk contains no line of this format.
         """
-        del limits  # the chunk size bounds all memory here
         self.path: Final = path
         self._dialect = dialect
         self._names: dict[str, int] = {}
@@ -298,41 +295,31 @@ class _ChunkParser:
     def _tail(self, tail: Tail) -> FrameRows:
         if tail.text == _DOS_END:
             return NO_ROWS
-        odd = _SlowLines()
+        chunk = ChunkResult(tail.number, 1)
         outcome = self.dialect.last(tail.text) if len(tail.text) <= LINE_MAX else None
         if outcome is None and tail.text.strip():
             outcome = DamagedLine(MAY_BE_CUT)
         if outcome is None or isinstance(outcome, ParsedFrame):
             detail = f"line {tail.number} has no line end"
             self._ledger.drop("", "file may be cut after its last frame", None, detail)
-        self._add(odd, 0, tail.number, tail.text, outcome)
-        return self._checked(self._timed(NO_ROWS, odd), odd, tail.number, 1)
+        self._add(chunk, 0, tail.text, outcome)
+        return self._finished(chunk)
 
     def _lines(self, lines: Lines) -> FrameRows:
-        fast = self.dialect.fast(lines)
-        rows = self._renamed(fast)
-        odd = _SlowLines()
+        rows = self._renamed(self.dialect.fast(lines))
+        chunk, tainted = ChunkResult(lines.first_number, lines.done, rows), list[int]()
         for i in _left_over(lines, rows):
             line = lines.text(i)
             outcome = self._outcome_of(line)
             if isinstance(outcome, DamagedLine) and outcome.taints and i > 0:
-                odd.tainted.append(i - 1)
+                tainted.append(i - 1)
             if i >= lines.done:
                 break
-            self._add(odd, i, lines.first_number + i, line, outcome)
+            self._add(chunk, i, line, outcome)
             if self.stopped:
-                rows = self._timed(rows.take(rows.place < i), odd)
-                return self._checked(rows, odd, lines.first_number, i)
-        if lines.done < len(lines):
-            rows = rows.take(slice(0, int(np.searchsorted(rows.place, lines.done))))
-        rows = self._checked(self._timed(rows, odd), odd, lines.first_number, lines.done)
-        return self._untainted(rows, odd.tainted, lines)
-
-    def _checked(self, rows: FrameRows, odd: _SlowLines, first_number: int, done: int) -> FrameRows:
-        """Remove the rows that contradict the format's own counters."""
-        chunk = ChunkResult(rows, odd.frames, odd.plain, odd.damaged, odd.marks, first_number, done)
-        refused = self.dialect.check(chunk)
-        return rows.take(~np.isin(rows.place, refused)) if len(refused) else rows
+                chunk.done = i
+                return self._finished(chunk)
+        return self._untainted(self._finished(chunk), tainted, lines)
 
     def _outcome_of(self, line: bytes) -> Outcome:
         if len(line) > LINE_MAX:
@@ -343,27 +330,25 @@ class _ChunkParser:
             return DamagedLine("control characters in a line", taints)
         return outcome
 
-    def _add(self, odd: _SlowLines, i: int, number: int, line: bytes, outcome: Outcome) -> None:
+    def _add(self, chunk: ChunkResult, i: int, line: bytes, outcome: Outcome) -> None:
+        number = chunk.first_number + i
         match outcome:
             case ParsedFrame():
                 code = bus_number(outcome.bus, self._names)
                 if code < 0:
-                    odd.damaged.append(i)
+                    chunk.damaged.append(i)
                     self._drop("", TOO_MANY_BUSES, number, line)
                 else:
-                    odd.frames.append((i, code, outcome))
+                    chunk.odd.append((i, code, outcome))
             case Other():
                 self.is_recognised = True
-                odd.others.setdefault((outcome.bus, outcome.reason), []).append(number)
-                odd.plain.append((i, outcome))
-                if outcome.t_ns is not None:
-                    odd.times.append((i, outcome.t_ns))
+                chunk.others.append((i, outcome))
             case DamagedLine():
-                odd.damaged.append(i)
+                chunk.damaged.append(i)
                 self._drop("", outcome.reason, number, line)
             case HeaderLine():
                 self.is_recognised = True
-                odd.marks.append((i, outcome))
+                chunk.marks.append((i, outcome))
                 if outcome.stops:
                     self.stopped = True
                     self._ledger.drop("", outcome.stops, None, f"from line {number} on")
@@ -386,21 +371,28 @@ class _ChunkParser:
             self._drop(names[rows.bus[k]], reason, lines.first_number + i, lines.text(i))
         return rows.take(~is_bad)
 
-    def _timed(self, rows: FrameRows, odd: _SlowLines) -> FrameRows:
-        """Merge the rows of ``fast`` and ``slow``, with log times."""
-        for (bus, reason), numbers in odd.others.items():
+    def _finished(self, chunk: ChunkResult) -> FrameRows:
+        """Merge the rows of ``fast`` and ``slow``, with log times, and check them."""
+        others: dict[tuple[str, str], list[int]] = {}
+        for i, other in chunk.others:
+            others.setdefault((other.bus, other.reason), []).append(chunk.first_number + i)
+        for (bus, reason), numbers in others.items():
             topic = bus and bus_name(bus)
             self._ledger.find(topic, len(numbers))
             self._ledger.skip(topic, reason, len(numbers), f"from line {numbers[0]} on")
-        rows = merge_rows((rows, odd.rows()))
+        done = int(np.searchsorted(chunk.rows.place, chunk.done))
+        rows = merge_rows((chunk.rows.take(slice(0, done)), _slow_rows(chunk.odd)))
         place, t_ns = rows.place, rows.log_ns
-        if odd.times:
-            at, values = (np.array(column, np.int64) for column in zip(*odd.times, strict=True))
+        times = [(i, other.t_ns) for i, other in chunk.others if other.t_ns is not None]
+        if times:
+            at, values = (np.array(column, np.int64) for column in zip(*times, strict=True))
             place, t_ns = np.concatenate((place, at)), np.concatenate((t_ns, values))
-        order = np.argsort(place, kind="stable") if odd.times else slice(None)
+        order = np.argsort(place, kind="stable") if times else slice(None)
         log_ns = np.empty_like(t_ns)
-        log_ns[order] = self.dialect.clock(place[order], t_ns[order], odd.marks)
-        return replace(rows, log_ns=log_ns[: len(rows)])
+        log_ns[order] = self.dialect.clock(place[order], t_ns[order], chunk.marks)
+        chunk.rows = rows = replace(rows, log_ns=log_ns[: len(rows)])
+        refused = self.dialect.check(chunk)
+        return rows.take(~np.isin(rows.place, refused)) if len(refused) else rows
 
     def _renamed(self, fast: Fast) -> FrameRows:
         rows = fast.rows
@@ -428,37 +420,26 @@ def _left_over(lines: Lines, rows: FrameRows) -> list[int]:
     return left
 
 
-class _SlowLines:
-    """The lines of a chunk that were parsed by ``slow``."""
-
-    def __init__(self) -> None:
-        self.frames: list[tuple[int, int, ParsedFrame]] = []
-        self.times: list[tuple[int, int]] = []
-        self.marks: list[tuple[int, HeaderLine]] = []
-        self.others: dict[tuple[str, str], list[int]] = {}
-        self.plain: list[tuple[int, Other]] = []
-        self.damaged: list[int] = []
-        self.tainted: list[int] = []
-
-    def rows(self) -> FrameRows:
-        if not self.frames:
-            return NO_ROWS
-        place, bus, frames = zip(*self.frames, strict=True)
-        width = 64 if any(f.is_fd or len(f.payload) > 8 for f in frames) else 8
-        payload = b"".join(f.payload.ljust(width, b"\0") for f in frames)
-        return FrameRows(
-            np.array(place, np.int64),
-            np.array(bus, np.int64),
-            np.array([f.t_ns for f in frames], np.int64),
-            CanFrames(
-                np.array([f.arbitration_id for f in frames], np.uint32),
-                np.array([f.is_extended for f in frames], np.bool_),
-                np.array([f.kind for f in frames], np.uint8),
-                np.array([f.length for f in frames], np.uint8),
-                np.frombuffer(payload, np.uint8).reshape(-1, width).copy(),
-                np.array([f.is_fd for f in frames], np.bool_),
-            ),
-        )
+def _slow_rows(odd: Sequence[tuple[int, int, ParsedFrame]]) -> FrameRows:
+    """Return the frames that were parsed by ``slow`` as rows."""
+    if not odd:
+        return NO_ROWS
+    place, bus, frames = zip(*odd, strict=True)
+    width = 64 if any(f.is_fd or len(f.payload) > 8 for f in frames) else 8
+    payload = b"".join(f.payload.ljust(width, b"\0") for f in frames)
+    return FrameRows(
+        np.array(place, np.int64),
+        np.array(bus, np.int64),
+        np.array([f.t_ns for f in frames], np.int64),
+        CanFrames(
+            np.array([f.arbitration_id for f in frames], np.uint32),
+            np.array([f.is_extended for f in frames], np.bool_),
+            np.array([f.kind for f in frames], np.uint8),
+            np.array([f.length for f in frames], np.uint8),
+            np.frombuffer(payload, np.uint8).reshape(-1, width).copy(),
+            np.array([f.is_fd for f in frames], np.bool_),
+        ),
+    )
 
 
 _FRAME_LIKE: Final = re.compile(
@@ -514,7 +495,7 @@ def payloads(
     return payload, ok
 
 
-def picked(keep: Bools, place: Int64s, bus: Int64s, t_ns: Int64s, frames: CanFrames) -> FrameRows:
-    """Return the rows that passed every check of ``fast``."""
-    rows = FrameRows(place, bus, t_ns, frames)
-    return rows if bool(keep.all()) else rows.take(keep)
+def picked(keep: Bools, rows: FrameRows, spelled: Sequence[bytes]) -> Fast:
+    """Return the rows that passed every check of ``fast``, whose buses are spelled so."""
+    names = tuple(one.decode("ascii", "replace") for one in spelled)
+    return Fast(rows if bool(keep.all()) else rows.take(keep), names)

@@ -14,9 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-Bytes: TypeAlias = NDArray[np.uint8]
-Int64s: TypeAlias = NDArray[np.int64]
-
+from crosscue.replay.columns import Bytes, Int64s
 
 Words: TypeAlias = NDArray[np.uint64]
 Bools: TypeAlias = NDArray[np.bool_]

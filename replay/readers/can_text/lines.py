@@ -11,7 +11,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .digits import BACK, FRONT, Bytes, Int64s, Words, byte_words
+from crosscue.replay.columns import Bytes, Int64s
+
+from .digits import BACK, FRONT, Words, byte_words
 
 CHUNK_BYTES: Final = 1 << 20
 NEWLINE: Final = 10

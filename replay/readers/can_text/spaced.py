@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from crosscue.replay.columns import DATA, CanFrames, Int64s
-from crosscue.replay.readers.can_rows import NO_ROWS, merge_rows
+from crosscue.replay.readers.can_rows import NO_ROWS, FrameRows, merge_rows
 
 from .dialect import Fast, payloads, picked
 from .digits import LABEL_MAX, Bools, hexadecimal, labels
@@ -71,8 +71,7 @@ def spaced_frames(lines: Lines, at: Spaced, t_ns: Int64s, ok: Bools) -> Fast:
         payload,
         at.is_fd,
     )
-    names = tuple(one.decode("ascii", "replace") for one in spelled)
-    return Fast(picked(ok, at.line, bus, t_ns, frames), names)
+    return picked(ok, FrameRows(at.line, bus, t_ns, frames), spelled)
 
 
 def payload_stop(at: Spaced) -> Int64s:

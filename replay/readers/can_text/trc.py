@@ -205,7 +205,7 @@ def open_trc(path: Path, limits: Limits) -> Log:
     """
     head = head_of(path)
     version, columns = _layout(head, path)
-    return TextCanLog(path, limits, lambda: Trc(version, columns))
+    return TextCanLog(path, lambda: Trc(version, columns))
 
 
 def _layout(head: bytes, path: Path) -> tuple[str, str]:
@@ -257,9 +257,11 @@ class Trc(Dialect):
         limit = lines.stop[line]
         fields = next_fields(lines, lines.start[line], limit, len(self._columns) - 1)
         by = dict(zip(self._columns, fields, strict=False))
-        t_ns, ok = _offsets_ns(lines, by["O"])
+        time = by["O"]
+        scaled, ok = seconds_ns(lines.buffer, lines.words, time.start, time.stop, marked=False)
         is_fd, type_ok = self._kinds(lines, by.get("T"), len(line))
-        length, length_ok = _lengths(lines, by.get("L"), by.get("l"), is_fd)
+        is_code = "l" not in by
+        length, length_ok = _lengths(lines, by["L" if is_code else "l"], is_code, is_fd)
         identifier = by["I"]
         ok &= type_ok & length_ok & ((identifier.size == 4) | (identifier.size == 8))
         if "d" in by:
@@ -275,7 +277,8 @@ class Trc(Dialect):
         is_extended = identifier.size == 8
         at = Spaced(line, by.get("B"), identifier, is_extended, length, payload, is_fd)
         ok &= skip_gap(lines, np.minimum(payload_stop(at), limit), limit) == limit
-        return spaced_frames(lines, at, t_ns, ok)
+        # Times are in milliseconds; integers may have no decimal mark.
+        return spaced_frames(lines, at, scaled // 1000, ok)
 
     def slow(self, line: bytes) -> Outcome:
         """Parse header lines, remote frames, error frames and status lines."""
@@ -341,16 +344,11 @@ class Trc(Dialect):
         """Return the valid lines of a chunk and their message numbers."""
         odd = [(i, frame.number) for i, _, frame in chunk.odd]
         odd += [(i, other.number) for i, other in chunk.others]
+        slow = np.array([one for one in odd if one[1] is not None], np.int64).reshape(-1, 2)
+        fast = np.setdiff1d(chunk.rows.place, slow[:, 0], assume_unique=True)
         at, values = self._fast_numbers
-        known = {i: number for i, number in odd if number is not None}
-        is_fast = ~np.isin(chunk.rows.place, list(known)) if known else slice(None)
-        fast = chunk.rows.place[is_fast]
-        if not known:
-            return fast, values[np.searchsorted(at, fast)]
-        place = np.concatenate((fast, np.array(list(known), np.int64)))
-        number = np.concatenate(
-            (values[np.searchsorted(at, fast)], np.array(list(known.values()), np.int64))
-        )
+        place = np.concatenate((fast, slow[:, 0]))
+        number = np.concatenate((values[np.searchsorted(at, fast)], slow[:, 1]))
         order = np.argsort(place, kind="stable")
         return place[order], number[order]
 
@@ -424,21 +422,10 @@ def _number(lines: Lines, word: WordRanges, is_old: bool) -> tuple[Int64s, Bools
     return number, ok
 
 
-def _offsets_ns(lines: Lines, time: WordRanges) -> tuple[Int64s, Bools]:
-    """Convert milliseconds to nanoseconds; integers may have no decimal mark."""
-    scaled, ok = seconds_ns(lines.buffer, lines.words, time.start, time.stop, marked=False)
-    return scaled // 1000, ok
-
-
-def _lengths(
-    lines: Lines, code: WordRanges | None, count: WordRanges | None, is_fd: Bools
-) -> tuple[Int64s, Bools]:
-    """Return the number of payload bytes from the length, else from the length code."""
-    word = count or code
-    if word is None:
-        raise ValueError("columns: expected L or l, got neither")
+def _lengths(lines: Lines, word: WordRanges, is_code: bool, is_fd: Bools) -> tuple[Int64s, Bools]:
+    """Return the number of payload bytes from the length, or from the length code."""
     value, ok = decimal(lines.words, word.stop, word.size)
-    if count is None:
+    if is_code:
         ok &= value <= 15
         value = FD_LENGTHS[np.where(ok, value, 0)]
         value = np.where(is_fd, value, np.minimum(value, 8))

@@ -4,52 +4,26 @@
 name of the folder.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from crosscue.replay.base import EVERYTHING, Log, Selection
-from crosscue.replay.columns import Block, Topic
+from crosscue.replay.base import Log
+from crosscue.replay.columns import Topic
 from crosscue.replay.errors import LogFormatError
-from crosscue.replay.files.closing import Closing
 from crosscue.replay.files.time_file_names import find_time_file
-from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import DEFAULT_LIMITS, Limits
+from crosscue.replay.readers.held_rows import CameraDrive
 from crosscue.replay.readers.time_file import read_time_file
 from crosscue.replay.readers.timed_files import pair_with_times
-from crosscue.replay.seal.touched import Touched
 
 from .files import PictureFiles, list_pictures
 
 
-class ImageFolder(Closing):
-    """A folder of images as a ``Log``."""
+class ImageFolder(CameraDrive):
+    """A folder of images as a ``Log``, in natural order of their names."""
 
     format: Final = "images"
-
-    def __init__(self, path: Path, pictures: PictureFiles, limits: Limits) -> None:
-        """Create a log of ``pictures`` in the folder ``path``."""
-        self.path: Final = path
-        self._pictures: Final = pictures
-        self._limits: Final = limits
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """The topic of the camera."""
-        return (self._pictures.topic,)
-
-    def read(self, ledger: Ledger, selection: Selection = EVERYTHING) -> Iterator[Block]:
-        """Yield the images in natural order of their names; see ``Log.read``."""
-        yield from self._pictures.read(ledger, selection, self._limits)
-
-    def report_missing(self, ledger: Ledger) -> None:
-        """Report images without a time and times without an image; see ``KnowsItsEnd``."""
-        self._pictures.report_missing(ledger)
-
-    @property
-    def touched(self) -> Touched:
-        """Record of the files read, for a seal."""
-        return self._pictures.touched
 
 
 def open_images(path: Path, limits: Limits) -> ImageFolder:
@@ -76,7 +50,7 @@ def open_images(path: Path, limits: Limits) -> ImageFolder:
     pictures = PictureFiles(topic, files)
     if time_file.parent == path:
         pictures.touched.add(time_file, 0, time_file.stat().st_size)
-    return ImageFolder(path, pictures, limits)
+    return ImageFolder(path, [pictures], (), limits, pictures.touched)
 
 
 def picture_names(log: Log) -> Mapping[str, int]:

@@ -44,8 +44,9 @@ class BrokenBlockError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class RawBlock:
-    """A block: its links, and the bytes after them."""
+    """A block: its offset, its links, and the bytes after them."""
 
+    at: int
     links: tuple[int, ...]
     body: bytes
 
@@ -236,7 +237,7 @@ class Blocks:
         raw = self._near(at + HEAD_BYTES, length - HEAD_BYTES)
         found_links: tuple[int, ...] = struct.unpack_from(f"<{count}Q", raw)
         self._linked.update(found_links)
-        return RawBlock(found_links, raw[8 * count :])
+        return RawBlock(at, found_links, raw[8 * count :])
 
     def data_groups(self, first: int, unfinished: int) -> Iterator[DataGroup]:
         """Yield all data groups; the channels of empty groups are not read.
@@ -247,8 +248,7 @@ class Blocks:
         for block in self._chain(first, b"##DG", 4, 1):
             may_hold = bool(unfinished) or self._has_data(block.links[2])
             groups = tuple(
-                self._group(one, at, may_hold)
-                for at, one in self._chain_at(block.links[1], b"##CG", 6, 32)
+                self._group(one, may_hold) for one in self._chain(block.links[1], b"##CG", 6, 32)
             )
             yield DataGroup(block.body[0], block.links[2], groups)
 
@@ -297,12 +297,12 @@ class Blocks:
         if kind != b"##DL":
             yield at
             return
-        for place, block in self._chain_at(at, b"##DL", 1, 0):
+        for block in self._chain(at, b"##DL", 1, 0):
             found = [link for link in block.links[1:] if link]
             yield from found
             if not block.links[0] and unfinished & LAST_DATA_LIST:
                 missing = len(block.links) - 1 - len(found)
-                yield from self._unlinked(found[-1] if found else place, missing)
+                yield from self._unlinked(found[-1] if found else block.at, missing)
 
     def _unlinked(self, at: int, count: int) -> Iterator[int]:
         """Yield data blocks after the one at ``at`` that are missing in their list."""
@@ -364,19 +364,13 @@ class Blocks:
         return self._window[start : start + count]
 
     def _chain(self, at: int, kind: bytes, links: int, body: int) -> Iterator[RawBlock]:
-        for _, block in self._chain_at(at, kind, links, body):
-            yield block
-
-    def _chain_at(
-        self, at: int, kind: bytes, links: int, body: int
-    ) -> Iterator[tuple[int, RawBlock]]:
         seen: set[int] = set()
         while at:
             if at in seen or len(seen) > _CHAIN_MAX:
                 raise BrokenBlockError(f"{kind.decode()} blocks form a circle at byte {at}")
             seen.add(at)
             block = self.block(at, kind, links, body)
-            yield at, block
+            yield block
             at = block.links[0]
 
     def _has_data(self, link: int) -> bool:
@@ -389,17 +383,19 @@ class Blocks:
             return True  # reading the data reports the damage
         return kind not in _DATA or length != HEAD_BYTES
 
-    def _group(self, block: RawBlock, at: int, may_hold: bool) -> ChannelGroup:
+    def _group(self, block: RawBlock, may_hold: bool) -> ChannelGroup:
         record_id, records, flags, _, value_bytes, invalid_bytes = struct.unpack_from(
             "<QQHH4xLL", block.body
         )
         if value_bytes + invalid_bytes > self._limits.message_bytes:
-            raise BrokenBlockError(f"##CG at byte {at} declares records of {value_bytes} bytes")
+            raise BrokenBlockError(
+                f"##CG at byte {block.at} declares records of {value_bytes} bytes"
+            )
         name = self._text(block.links[2]) or self._source(block.links[3])
         is_needed = may_hold or records or not value_bytes
         channels = tuple(self._channels(block.links[1], depth=0)) if is_needed else ()
         return ChannelGroup(
-            name, record_id, records, flags, value_bytes, invalid_bytes, channels, at
+            name, record_id, records, flags, value_bytes, invalid_bytes, channels, block.at
         )
 
     def _channels(self, first: int, depth: int) -> Iterator[Mf4Channel]:

@@ -143,34 +143,21 @@ class CanLayout:
         rows = FrameRows(
             records.place, self._values("BusChannel", words, self._bus), log_ns, frames
         )
-        return self._sound(rows, ok, whole, self._marked(words))
-
-    def _sound(
-        self,
-        rows: FrameRows,
-        ok: NDArray[np.bool_],
-        whole: NDArray[np.bool_],
-        marked: NDArray[np.bool_] | None,
-    ) -> FrameBatch:
-        is_valid = ok & whole if marked is None else ok & whole & ~marked
+        marked = self._marked(words)
+        is_valid = ok & whole & ~marked
         if bool(is_valid.all()):
             return FrameBatch(rows, 0, 0, 0)
-        invalid_count = 0 if marked is None else int(np.count_nonzero(marked))
-        if marked is not None:
-            ok, whole = ok | marked, whole | marked
-        unreadable = int(np.count_nonzero(ok & ~whole))
-        return FrameBatch(
-            rows.take(is_valid), int(np.count_nonzero(~ok)), unreadable, invalid_count
-        )
+        masks = ~ok & ~marked, ok & ~whole & ~marked, marked
+        return FrameBatch(rows.take(is_valid), *(int(np.count_nonzero(mask)) for mask in masks))
 
-    def _marked(self, words: Words) -> NDArray[np.bool_] | None:
-        """Return a mask of the records marked as invalid by the logger; None for none."""
-        marked: NDArray[np.bool_] | None = None
+    def _marked(self, words: Words) -> NDArray[np.bool_]:
+        """Return a mask of the records marked as invalid by the logger."""
+        marked = np.zeros(len(words), np.bool_)
         for name in _VALID_PARTS:
             if name in self._parts:
                 one = invalid(self._parts[name], words.records, self._group.value_bytes)
                 if one is not None:
-                    marked = one if marked is None else marked | one
+                    marked |= one
         return marked
 
     def _lengths(self, words: Words) -> tuple[Int64s, NDArray[np.bool_]]:

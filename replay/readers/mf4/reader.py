@@ -5,7 +5,7 @@ Formulas and texts are not evaluated. A topic's rows are yielded group by group,
 Attachments are never opened. Compressed blocks have a checksum, which is verified.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -220,7 +220,7 @@ class Mf4Log(Closing):
                         bus_number(str(channel), self.buses)
 
     def _found(self) -> Iterator[_Stored]:
-        names: dict[str, NDArray[np.generic]] = {}
+        names: set[str] = set()
         try:
             for data in self._blocks.data_groups(self.header.first_group, self.header.unfinished):
                 stream = LinkedData(self._blocks, data.data, self.header.unfinished)
@@ -247,33 +247,23 @@ class Mf4Log(Closing):
         return StoredValues(LinkedData(self._blocks, channel.data, self.header.unfinished))
 
     def _sources_of(
-        self, data: DataGroup, stream: LinkedData, names: dict[str, NDArray[np.generic]]
+        self, data: DataGroup, stream: LinkedData, names: set[str]
     ) -> Iterator[_Source]:
         for k, group in enumerate(data.groups):
+            declared = None if self.header.unfinished & CYCLE_COUNTERS else group.records
+            # A group of mixed data that declares no records may still have some.
             is_empty = stream.size < group.record_bytes + data.id_bytes and not stream.broken
-            if not group.flags & VLSD_GROUP and (self._declared(group) or not is_empty):
-                yield self._source(k, data, group, names)
-
-    def _declared(self, group: ChannelGroup) -> int | None:
-        return None if self.header.unfinished & CYCLE_COUNTERS else group.records
-
-    def _source(
-        self,
-        index: int,
-        data: DataGroup,
-        group: ChannelGroup,
-        names: dict[str, NDArray[np.generic]],
-    ) -> _Source:
-        masters = [c for c in group.channels if c.type in (MASTER, VIRTUAL_MASTER)]
-        master = next((c for c in masters if c.sync == TIME), None)
-        can = can_layout(group)
-        refusal = _refusal(group, master, can)
-        topic = ""
-        # A group of mixed data that declares no records may still have some.
-        if can is None and not refusal:
-            topic = _free(group.name or "group", names)
-            names[topic] = np.zeros(0)
-        return _Source(index, group, master, can, topic, refusal, self._declared(group))
+            if group.flags & VLSD_GROUP or (is_empty and not declared):
+                continue
+            masters = [c for c in group.channels if c.type in (MASTER, VIRTUAL_MASTER)]
+            master = next((c for c in masters if c.sync == TIME), None)
+            can = can_layout(group)
+            refusal = _refusal(group, master, can)
+            topic = ""
+            if can is None and not refusal:
+                topic = _free(group.name or "group", names)
+                names.add(topic)
+            yield _Source(k, group, master, can, topic, refusal, declared)
 
 
 class _Pass:
@@ -560,7 +550,7 @@ def _is_column(channel: Mf4Channel, group: ChannelGroup) -> bool:
     return not channel.is_array and is_numeric(channel, group.value_bytes)
 
 
-def _free(name: str, taken: dict[str, NDArray[np.generic]]) -> str:
+def _free(name: str, taken: Container[str]) -> str:
     """Return ``name``, with a number appended if it is already used."""
     if name not in taken:
         return name

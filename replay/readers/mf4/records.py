@@ -7,6 +7,7 @@ belong to a record of another group.
 
 import struct
 import sys
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -204,19 +205,17 @@ class UnsortedData:
 
     def piece_of(self, group: int, key: int, by_order: bool) -> int:
         """Return the piece that contains a value, by its offset or index; -1 if none does."""
+
+        def before(state: _State) -> int:
+            return int(state.records[group] if by_order else state.value_bytes[group])
+
         while True:
-            low, high = 0, len(self._states)
-            while low < high:
-                middle = (low + high) // 2
-                state = self._states[middle]
-                before = state.records[group] if by_order else state.value_bytes[group]
-                low, high = (middle + 1, high) if before <= key else (low, middle)
-            is_last = low == len(self._states)
-            if not is_last or self._is_complete:
-                return low - 1
-            self.piece(low - 1)
+            k = bisect_right(self._states, key, key=before) - 1
+            if k < len(self._states) - 1 or self._is_complete:
+                return k
+            self.piece(k)
             if self._is_complete:
-                return low - 1
+                return k
 
     def _known(self, k: int) -> Walked:
         piece = self.piece(k)

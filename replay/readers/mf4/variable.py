@@ -1,16 +1,15 @@
 """Variable-length values, which MDF 4 stores separately from the records that refer to them."""
 
 from collections.abc import Iterator
-from typing import Final, Protocol, TypeAlias
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from crosscue.replay.columns import Bytes, Int64s
+
 from .records import UnsortedData
 from .stream import LinkedData
-
-Bytes: TypeAlias = NDArray[np.uint8]
-Int64s: TypeAlias = NDArray[np.int64]
 
 _SPAN: Final = 4 << 20
 # Maximum number of windows of ``_SPAN`` bytes with the values of one block of records.

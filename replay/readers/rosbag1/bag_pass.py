@@ -38,10 +38,10 @@ TWO_RECORDS: Final = "the records of a connection differ"
 
 
 class Roster:
-    """Topics by connection; new connections are added when a chunk declares them."""
+    """Topics of ``contents`` by connection; those that a chunk declares are added."""
 
     def __init__(self, contents: Contents) -> None:
-        self._contents = contents
+        self.contents = contents
         self._topics: dict[str, Topic] = {}
         self._first: dict[str, Connection] = {}
         for number in sorted(contents.connections):
@@ -49,7 +49,7 @@ class Roster:
 
     def add(self, connection: Connection) -> None:
         """Add a connection; the first connection of a topic determines its type."""
-        self._contents.connections[connection.conn] = connection
+        self.contents.connections[connection.conn] = connection
         if connection.topic in self._topics:
             return
         self._first[connection.topic] = connection
@@ -69,24 +69,24 @@ class Roster:
 
     def topic_of(self, conn: int) -> str:
         """Return the topic of a connection; empty if unknown."""
-        connection = self._contents.connections.get(conn)
+        connection = self.contents.connections.get(conn)
         return connection.topic if connection is not None else ""
 
     def fits_topic(self, conn: int) -> bool:
         """Return whether a connection has the type of its topic's first connection."""
-        connection = self._contents.connections[conn]
+        connection = self.contents.connections[conn]
         first = self._first[connection.topic]
         return (connection.type_name, connection.md5sum) == (first.type_name, first.md5sum)
 
     def knows(self, conn: int) -> bool:
         """Return whether a connection has a record."""
-        return conn in self._contents.connections
+        return conn in self.contents.connections
 
     def _declared(self) -> dict[str, int]:
-        if not self._contents.is_complete:
+        if not self.contents.is_complete:
             return {}
         counts: Counter[str] = Counter(dict.fromkeys(self._topics, 0))
-        for info in self._contents.infos.values():
+        for info in self.contents.infos.values():
             for conn, count in info.counts.items():
                 counts[self.topic_of(conn)] += count
         return dict(counts)
@@ -164,22 +164,12 @@ class Pass:
     """The state of one ``read``."""
 
     def __init__(
-        self,
-        file: BagFile,
-        first: int,
-        contents: Contents,
-        roster: Roster,
-        limits: Limits,
-        ledger: Ledger,
-        selection: Selection,
-        chunk_count: int,
+        self, file: BagFile, roster: Roster, limits: Limits, ledger: Ledger, selection: Selection
     ) -> None:
-        self._chunk_count = chunk_count
         self._inside: BagWindow | None = None
         self._doubt = ""
         self._file = file
-        self._first = first
-        self._contents = contents
+        self._contents = roster.contents
         self._roster = roster
         self._limits = limits
         self._ledger = ledger
@@ -189,26 +179,22 @@ class Pass:
         self._owed_by: tuple[int, int] | None = None
         self._checked = _Checked()
 
-    def blocks(self, index_at: int) -> Iterator[Block]:
-        """Yield all blocks in stored order.
-
-        Args:
-            index_at: Offset of the index section in the bag header, or 0.
-        """
+    def blocks(self) -> Iterator[Block]:
+        """Yield all blocks in stored order."""
         for topic in self._roster.topics:
             self._ledger.declare(topic.name, topic.declared)
         for connection in self._contents.connections.values():
             self._say_if_renamed(connection)
         try:
-            window = self._window(index_at)
+            window = self._window()
             if window is None:
-                known = sorted(self._contents.infos)
+                held = self._contents
+                known = sorted(held.infos)
                 yield from self._taken(
-                    units(self._file, self._first, known, self._limits, self._contents.connections),
-                    index_at,
+                    units(self._file, held.first, known, self._limits, held.connections)
                 )
             else:
-                yield from self._windowed(window, index_at)
+                yield from self._windowed(window)
         except OSError as error:
             self._ledger.drop("", "reading the file failed", None, str(error.strerror or error))
         yield from self._flush()
@@ -216,39 +202,35 @@ class Pass:
             self._ledger.settle(name)
         self._ledger.integrity = self._checked.words()
 
-    def _window(self, index_at: int) -> BagWindow | None:
+    def _window(self) -> BagWindow | None:
         """Locate the selection by the index; if it cannot be trusted, report the reason."""
         if self._selection == EVERYTHING:
             return None
-        found = find_bag_window(
-            self._contents, self._first, index_at, self._chunk_count, self._selection
-        )
+        found = find_bag_window(self._contents, self._selection)
         if isinstance(found, BagWindow):
             return found
         self._ledger.notice(f"the requested part was found by reading the complete bag: {found}")
         return None
 
-    def _windowed(self, window: BagWindow, index_at: int) -> Iterator[Block]:
+    def _windowed(self, window: BagWindow) -> Iterator[Block]:
         """Yield blocks of the indexed chunks; if the index is wrong, examine the others too."""
         self._inside = window
         self._file.expect(window.ranges())
         connections = self._contents.connections
-        yield from self._taken(window.units(self._file, self._limits, connections), index_at)
+        yield from self._taken(window.units(self._file, self._limits, connections))
         self._inside = None
         if self._doubt:
             self._ledger.notice(
                 f"the index proved unreliable ({self._doubt}); every chunk was examined"
             )
             others = window.units(self._file, self._limits, connections, is_read=False)
-            yield from self._taken(others, index_at)
+            yield from self._taken(others)
             return
         for info in window.left:
             self._checked.left += 1
             self._pass_over(info)
 
-    def _taken(
-        self, found: Iterator[ChunkUnit | BagRecord | BytesBetween], index_at: int
-    ) -> Iterator[Block]:
+    def _taken(self, found: Iterator[ChunkUnit | BagRecord | BytesBetween]) -> Iterator[Block]:
         for unit in found:
             taken = None
             if not isinstance(unit, BagRecord):
@@ -257,7 +239,7 @@ class Pass:
                 taken = self._chunk(unit)
             elif isinstance(unit, BytesBetween):
                 self._doubt = self._doubt or f"bytes {unit.at} to {unit.stop} are damaged"
-                self._gap(unit, index_at)
+                self._gap(unit)
             else:
                 taken = self._record(unit)
             if taken is not None:
@@ -328,7 +310,7 @@ class Pass:
                 f"as {connection.published}: renamed, or damaged"
             )
 
-    def _gap(self, gap: BytesBetween, index_at: int) -> None:
+    def _gap(self, gap: BytesBetween) -> None:
         where = f"bytes {gap.at} to {gap.stop}"
         within = [info for at, info in self._contents.infos.items() if gap.at <= at < gap.stop]
         if (
@@ -340,7 +322,7 @@ class Pass:
             self._owed_by = gap.at, gap.stop
             for info in within:
                 self._owed.update(info.counts)
-        elif 0 < index_at <= gap.at:
+        elif 0 < self._contents.index_at <= gap.at:
             self._ledger.notice(f"the index section is damaged: {where}")
         else:
             reason = CUT if gap.stop == self._file.size else DAMAGED_RECORD

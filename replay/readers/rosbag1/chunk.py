@@ -10,16 +10,17 @@ from __future__ import annotations
 import bz2
 import struct
 from dataclasses import dataclass, field, replace
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from crosscue.replay.columns import Bytes, Int64s
+
 from .records import (
     CONNECTION,
     MESSAGE,
-    BagRecord,
     Connection,
     Entries,
     connection_of,
@@ -27,11 +28,7 @@ from .records import (
     record_at,
     record_kind,
     tally,
-    time_ns,
 )
-
-Bytes: TypeAlias = NDArray[np.uint8]
-Int64s: TypeAlias = NDArray[np.int64]
 
 DAMAGED_BYTES: Final = "damaged bytes in a chunk"
 DISAGREES: Final = "record and index disagree"
@@ -374,7 +371,7 @@ def _next_confirmed(raw: bytes, at: int, entries: Entries | None) -> int | None:
         return None
     first = int(np.searchsorted(entries.offset, at, side="right"))
     for i in range(first, len(entries)):
-        if _is_confirmed(raw, entries, i) is not None:
+        if _is_confirmed(raw, entries, i):
             return int(entries.offset[i])
     return None
 
@@ -413,14 +410,12 @@ def _is_consecutive(raw: bytes, at: int, known: set[int], near_ns: int | None) -
     return True
 
 
-def _is_confirmed(raw: bytes, entries: Entries, i: int) -> BagRecord | None:
+def _is_confirmed(raw: bytes, entries: Entries, i: int) -> bool:
     record = record_at(memoryview(raw), int(entries.offset[i]))
     if record is None or record.op != MESSAGE or record.end > len(raw):
-        return None
-    same = record.u32(b"conn") == entries.conn[i] and (
-        time_ns(record.fields[b"time"]) == entries.log_ns[i]
-    )
-    return record if same else None
+        return False
+    found = record.u32(b"conn"), record.time_ns(b"time")
+    return found == (entries.conn[i], entries.log_ns[i])
 
 
 def _without_disputed(raw: bytes, rows: ChunkRows, at: Int64s, entries: Entries) -> ChunkRows:
@@ -432,7 +427,7 @@ def _without_disputed(raw: bytes, rows: ChunkRows, at: Int64s, entries: Entries)
     differs = (entries.conn[place] != rows.conn) | (entries.log_ns[place] != rows.log_ns)
     is_bad = is_listed & differs
     for i in np.flatnonzero(~np.isin(entries.offset, at)):
-        if _is_confirmed(raw, entries, int(i)) is not None:
+        if _is_confirmed(raw, entries, int(i)):
             covering = int(np.searchsorted(at, entries.offset[i])) - 1
             if covering >= 0 and entries.offset[i] < rows.stop[covering]:
                 is_bad[covering] = True

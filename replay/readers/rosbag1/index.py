@@ -217,12 +217,18 @@ class Contents:
         infos: Chunk infos by the offset of the chunk.
         is_complete: True if ``infos`` lists every chunk of the file.
         gaps: Ranges without a readable record, found by a walk: start and end in bytes.
+        first: Offset of the first record.
+        index_at: Offset of the index section in the bag header, or 0.
+        chunk_count: Number of chunks in the bag header, or -1.
     """
 
     connections: dict[int, Connection] = field(default_factory=dict)
     infos: dict[int, ChunkInfo] = field(default_factory=dict)
     is_complete: bool = False
     gaps: list[tuple[int, int]] = field(default_factory=list)
+    first: int = 0
+    index_at: int = 0
+    chunk_count: int = -1
 
 
 def read_index(file: BagFile, index_at: int, largest: int) -> Contents | None:

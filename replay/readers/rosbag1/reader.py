@@ -52,8 +52,7 @@ class BagLog(Closing):
         self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC) if file is None else -1
         try:
             self._file = file or BagFile(self._fd, os.fstat(self._fd).st_size, path=path)
-            self._first, header = self._bag_header()
-            self._contents = self._learn(header)
+            self._contents = self._learn(*self._bag_header())
         except BaseException:
             self.close()
             raise
@@ -75,24 +74,15 @@ class BagLog(Closing):
             ledger.notice(sentence)
         for reason, detail in self._losses:
             ledger.drop("", reason, None, detail)
-        one = Pass(
-            self._file,
-            self._first,
-            self._contents,
-            self._roster,
-            self._limits,
-            ledger,
-            selection,
-            self._chunk_count,
-        )
-        yield from one.blocks(self._index_at)
+        one = Pass(self._file, self._roster, self._limits, ledger, selection)
+        yield from one.blocks()
 
     def report_missing(self, ledger: Ledger) -> None:
         """Report losses found by the index or by a walk over the records; see ``KnowsItsEnd``."""
         for reason, detail in self._losses:
             ledger.drop("", reason, None, detail)
         for start, stop in () if self._losses else self._contents.gaps:
-            if not 0 < self._index_at <= start:
+            if not 0 < self._contents.index_at <= start:
                 reason = CUT if stop == self._file.size else DAMAGED_RECORD
                 ledger.drop("", reason, None, f"bytes {start} to {stop}")
 
@@ -106,9 +96,7 @@ class BagLog(Closing):
         """Return why this part needs the complete file; empty if the index locates it."""
         if selection == EVERYTHING:
             return "all of it was requested"
-        found = find_bag_window(
-            self._contents, self._first, self._index_at, self._chunk_count, selection
-        )
+        found = find_bag_window(self._contents, selection)
         return found if isinstance(found, str) else ""
 
     def close(self) -> None:
@@ -137,26 +125,29 @@ class BagLog(Closing):
             )
         return record.end, record
 
-    def _learn(self, header: BagRecord | None) -> Contents:
-        self._chunk_count = header.u32(b"chunk_count") if header is not None else -1
-        self._index_at = header.u64(b"index_pos") if header is not None else 0
-        largest = self._limits.schema_bytes
-        if self._first <= self._index_at <= self._file.size:
-            contents = read_index(self._file, self._index_at, largest)
-            if contents is not None and (contents.connections or self._index_at == self._first):
+    def _learn(self, first: int, header: BagRecord | None) -> Contents:
+        contents = None
+        index_at = header.u64(b"index_pos") if header is not None else 0
+        if header is not None and first <= index_at <= self._file.size:
+            contents = read_index(self._file, index_at, self._limits.schema_bytes)
+            if contents is not None and (contents.connections or index_at == first):
                 self._compare_counts(header, contents)
-                return contents
-        contents = scan_records(self._file, self._first, self._limits)
-        self._say_why_walked(header, contents)
-        if not contents.connections and header is None:
-            raise LogFormatError(
-                f"{self.path}: no readable record in {self._file.size} bytes; expected a ROS 1 bag"
-            )
+            else:
+                contents = None
+        if contents is None:
+            contents = scan_records(self._file, first, self._limits)
+            if header is not None:
+                self._say_why_walked(index_at, contents)
+            elif not contents.connections:
+                size = self._file.size
+                raise LogFormatError(
+                    f"{self.path}: no readable record in {size} bytes; expected a ROS 1 bag"
+                )
+        contents.first, contents.index_at = first, index_at
+        contents.chunk_count = header.u32(b"chunk_count") if header is not None else -1
         return contents
 
-    def _compare_counts(self, header: BagRecord | None, contents: Contents) -> None:
-        if header is None:
-            return
+    def _compare_counts(self, header: BagRecord, contents: Contents) -> None:
         for name, held in (("conn", contents.connections), ("chunk", contents.infos)):
             declared = header.u32(f"{name}_count".encode())
             if declared != len(held):
@@ -165,19 +156,17 @@ class BagLog(Closing):
                     "the index was used"
                 )
 
-    def _say_why_walked(self, header: BagRecord | None, contents: Contents) -> None:
-        if header is None:
-            return
-        if self._index_at == 0:
+    def _say_why_walked(self, index_at: int, contents: Contents) -> None:
+        if index_at == 0:
             self._notices.append(
                 "no index: the recorder did not close the bag; the complete file was read"
             )
-        elif contents.is_complete or self._index_at <= self._file.size:
+        elif contents.is_complete or index_at <= self._file.size:
             self._notices.append(
-                f"the index at byte {self._index_at} is damaged; the complete file was read"
+                f"the index at byte {index_at} is damaged; the complete file was read"
             )
         else:
-            detail = f"index declared at byte {self._index_at}, file ends at {self._file.size}"
+            detail = f"index declared at byte {index_at}, file ends at {self._file.size}"
             self._losses.append(("file is cut", detail))
 
 

@@ -31,6 +31,7 @@ HEADER_BYTES: Final = 1 << 20
 
 _U32 = struct.Struct("<I")
 _U64 = struct.Struct("<Q")
+_TIME = struct.Struct("<II")
 _FIRST_LOOK: Final = 512
 _AHEAD: Final = 1 << 20
 _NEEDED: Final[dict[int, dict[bytes, int | None]]] = {
@@ -76,12 +77,8 @@ class BagRecord:
 
     def time_ns(self, name: bytes) -> int:
         """Return a field of seconds and nanoseconds in nanoseconds."""
-        return time_ns(self.fields[name])
-
-
-def time_ns(raw: bytes) -> int:
-    """Convert a stored pair of u32 seconds and nanoseconds to nanoseconds."""
-    return int(_U32.unpack_from(raw, 0)[0]) * 1_000_000_000 + int(_U32.unpack_from(raw, 4)[0])
+        seconds, nanos = _TIME.unpack(self.fields[name])
+        return int(seconds) * 1_000_000_000 + int(nanos)
 
 
 def parse_fields(header: bytes) -> dict[bytes, bytes] | None:

@@ -62,26 +62,16 @@ class BagWindow:
         return tuple(i for i, r in zip(self.infos, self.is_read, strict=True) if r is is_read)
 
 
-def find_bag_window(
-    contents: Contents, first: int, index_at: int, chunk_count: int, selection: Selection
-) -> BagWindow | str:
-    """Locate the selected time range, or return the reason why the index cannot be used.
-
-    Args:
-        contents: Contents of the index section.
-        first: Offset of the bag's first record.
-        index_at: Offset of the index section.
-        chunk_count: Number of chunks in the bag's header.
-        selection: The selected time range.
-    """
+def find_bag_window(contents: Contents, selection: Selection) -> BagWindow | str:
+    """Locate the selected time range, or return the reason why the index cannot be used."""
     infos = tuple(contents.infos[at] for at in sorted(contents.infos))
     if not contents.is_complete or not infos:
         return "it has no usable index of chunks"
     if not selection.is_timed:
         return "its index of chunks has no checksum"
-    if chunk_count != len(infos):
-        return f"its index lists {len(infos)} chunks, its header states {chunk_count}"
-    if infos[0].at != first or infos[-1].at >= index_at:
+    if contents.chunk_count != len(infos):
+        return f"its index lists {len(infos)} chunks, its header states {contents.chunk_count}"
+    if infos[0].at != contents.first or infos[-1].at >= contents.index_at:
         return "its index does not cover exactly the chunks before it"
     if any(info.start_ns > info.end_ns for info in infos) or any(
         a.start_ns > b.start_ns or a.end_ns > b.end_ns for a, b in pairwise(infos)
@@ -97,4 +87,4 @@ def find_bag_window(
         place = sum(info.end_ns < begins for info in infos)
         asked[min(place, len(infos) - 1)] = True
     around = zip([False, *asked], asked, [*asked[1:], False], strict=False)
-    return BagWindow(infos, tuple(any(three) for three in around), index_at, is_asked)
+    return BagWindow(infos, tuple(any(three) for three in around), contents.index_at, is_asked)
