@@ -68,7 +68,7 @@ def simulated_bus() -> Block:
 
 def peer() -> cantools.database.Database:
     """Return the layout table as a cantools database with one message per instance."""
-    messages = [_db_message(m, k) for m in layout().messages for k in range(len(m.ids))]
+    messages = [_db_message(m, k) for m in layout().values() for k in range(len(m.ids))]
     return cantools.database.Database(messages)
 
 

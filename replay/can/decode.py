@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -302,14 +302,18 @@ class BusDecoder:
         grouped = self._decoder.group(frames)
         if len(grouped.order) < len(frames):
             self._account(frames, grouped, block.log_ns)
-        times = _Times(block, grouped.order)
+        names = ("log_ns", "publish_ns", "header_ns")
+        clocks: dict[str, Any] = {name: getattr(block, name) for name in names}
+        times = {n: one.take(grouped.order) for n, one in clocks.items() if one is not None}
         decoded = []
         for number in (np.flatnonzero(np.diff(grouped.stops)) + 1).tolist():
             rule = self._rules[number - 1]
             columns, strange = self._decoder.columns(number)
             topic = f"{self._bus}/{rule.message.topic_name}"
             assert rule.extractor is not None
-            one = times.block(topic, grouped.rows(number), columns, rule.extractor.units)
+            at = grouped.rows(number)
+            rows = Table(columns, rule.extractor.units)
+            one = Block(topic, rows=rows, **{name: ns[at] for name, ns in times.items()})
             if strange is not None:
                 key, count = (*rule.message.key, NO_BRANCH), int(strange.sum())
                 if not self._add(key, count):
@@ -387,31 +391,6 @@ class BusDecoder:
             key = (*OTHERS, key[2])
         self.counts[key] = self.counts.get(key, 0) + count
         self._ledger.skip(self._bus, key[2], count, detail, int(log_ns[np.argmax(rows)]))
-
-
-class _Times:
-    """The times of a block in another order, from which blocks of single messages are built."""
-
-    def __init__(self, block: Block, order: NDArray[np.intp]) -> None:
-        self._log = block.log_ns.take(order)
-        self._publish = None if block.publish_ns is None else block.publish_ns.take(order)
-        self._header = None if block.header_ns is None else block.header_ns.take(order)
-
-    def block(
-        self,
-        topic: str,
-        rows: slice,
-        columns: Mapping[str, NDArray[np.generic]],
-        units: Mapping[str, str],
-    ) -> Block:
-        """Return the rows of one message with their times."""
-        return Block(
-            topic,
-            self._log[rows],
-            Table(columns, units),
-            None if self._publish is None else self._publish[rows],
-            None if self._header is None else self._header[rows],
-        )
 
 
 _Chosen: TypeAlias = Mapping[tuple[int, bool], set[str]]

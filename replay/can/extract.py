@@ -210,18 +210,12 @@ class _Flat:
 
 
 @dataclass(frozen=True, slots=True)
-class _Branch:
-    values: tuple[int, ...]
-    node: _Node
-
-
-@dataclass(frozen=True, slots=True)
 class _Switch:
-    """A multiplexer with its known values and the signals that they select."""
+    """A multiplexer, its known values, and by values the signals that they select."""
 
     name: str
     known: tuple[int, ...]
-    branches: tuple[_Branch, ...]
+    branches: tuple[tuple[tuple[int, ...], _Node], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,10 +328,10 @@ def _descend(
     for switch in node.switches:
         selector = columns[switch.name]
         strange[rows[~is_one_of(selector, switch.known)]] = True
-        for branch in switch.branches:
-            there = rows[is_one_of(selector, branch.values)]
+        for chosen, below in switch.branches:
+            there = rows[is_one_of(selector, chosen)]
             if len(there):
-                _descend(branch.node, words, there, filled, strange)
+                _descend(below, words, there, filled, strange)
 
 
 def is_one_of(selector: Column, values: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -373,7 +367,7 @@ def _node(message: CanMessage, here: list[CanSignal], needed: list[CanSignal]) -
             if signal.multiplexer == multiplexer.name:
                 below.setdefault(signal.branches, []).append(signal)
         branches = [
-            _Branch(tuple(sorted(values)), _node(message, signals, needed))
+            (tuple(sorted(values)), _node(message, signals, needed))
             for values, signals in below.items()
         ]
         known = tuple(sorted(known_values(message, multiplexer)))

@@ -267,9 +267,8 @@ class Ros1ToCdr:
         zero = np.zeros(count, np.int64)
         cursor = _TwoCursors(slice(None), start, zero, messages.stop - start, zero.copy())
         walker.whole(self.plan, cursor)
-        for refused in found.refused:
-            rows = refused.rows
-            refuse(ledger, block, int(rows[0]), MISFIT, refused.why, len(rows))
+        for rows, why in found.refused:
+            refuse(ledger, block, int(rows[0]), MISFIT, why, len(rows))
         if self.differs:
             ledger.notice(
                 f"{block.topic}: {self.type.name} differs between ROS 1 and ROS 2; the file keeps "

@@ -98,28 +98,6 @@ class Fault(NamedTuple):
     burst: Int64s
 
 
-class Triples(NamedTuple):
-    """Complete obstacles: rows of A, B and C, ordered by burst and slot."""
-
-    a: FrameParts
-    b: FrameParts
-    c: FrameParts
-
-
-class Shortage(NamedTuple):
-    """Frames that status frames announced and that are missing.
-
-    Attributes:
-        number: Number of the burst, shape (K,).
-        log_ns: Log time of its status frame, shape (K,).
-        frames: Number of missing frames, shape (K,).
-    """
-
-    number: Int64s
-    log_ns: Int64s
-    frames: Int64s
-
-
 def sift(
     parts: FrameParts, status: Status, within_ns: int, kept: int = 0, is_closed: bool = False
 ) -> tuple[FrameParts, list[Fault], bool]:
@@ -156,8 +134,12 @@ def sift(
     return parts, faults, is_shut or (is_closed and len(status) == 1)
 
 
-def join_obstacles(parts: FrameParts) -> tuple[Triples, list[Fault]]:
-    """Join the obstacles of finished bursts; ``parts`` are sifted, so that no part is repeated."""
+def join_obstacles(parts: FrameParts) -> tuple[list[FrameParts], list[Fault]]:
+    """Join the obstacles of finished bursts; ``parts`` are sifted, so that no part is repeated.
+
+    Returns:
+        The rows of A, B and C of complete obstacles, ordered by burst and slot; the others.
+    """
     obstacle = parts.burst * SLOTS_AT_MOST + parts.place
     order = np.lexsort((parts.part, obstacle))
     obstacle = obstacle[order]
@@ -166,19 +148,21 @@ def join_obstacles(parts: FrameParts) -> tuple[Triples, list[Fault]]:
     whole = parts.take(order[is_whole])
     cut = parts.take(np.sort(order[~is_whole]))
     faults = [Fault(CUT, cut.log_ns, cut.burst)] if len(cut) else []
-    return Triples(
-        whole.take(np.s_[0::3]), whole.take(np.s_[1::3]), whole.take(np.s_[2::3])
-    ), faults
+    return [whole.take(np.s_[k::3]) for k in range(3)], faults
 
 
-def shortage(parts: FrameParts, status: Status, slots: int) -> Shortage:
-    """Return missing frames of finished bursts: three per announced obstacle, minus those found."""
+def shortage(parts: FrameParts, status: Status, slots: int) -> tuple[Int64s, Int64s, Int64s]:
+    """Find missing frames of finished bursts: three per announced obstacle, minus those found.
+
+    Returns:
+        Shape (K,) each: number of the burst, log time of its status frame, and missing frames.
+    """
     wanted = 3 * np.minimum(status.count, slots)
     at = status.at(parts.burst) if len(parts) else parts.burst
     came = np.bincount(at, minlength=len(status))
     lacking = wanted - came
     short = lacking > 0
-    return Shortage(status.number[short], status.log_ns[short], lacking[short])
+    return status.number[short], status.log_ns[short], lacking[short]
 
 
 def pair_lanes(

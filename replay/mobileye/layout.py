@@ -153,29 +153,6 @@ class Message:
         return max(named or self.lengths)
 
 
-@dataclass(frozen=True, slots=True)
-class MobileyeLayout:
-    """All messages, and the tables of their columns."""
-
-    messages: tuple[Message, ...]
-
-    def __getitem__(self, name: str) -> Message:
-        return self._by_name[name]
-
-    @property
-    def _by_name(self) -> Mapping[str, Message]:
-        return {m.name: m for m in self.messages}
-
-    def of_table(self, table: str) -> tuple[Message, ...]:
-        """Return the messages of a table, in the order of the file."""
-        return tuple(m for m in self.messages if m.table == table)
-
-    @property
-    def tables(self) -> tuple[str, ...]:
-        """Names of all tables."""
-        return tuple(dict.fromkeys(m.table for m in self.messages))
-
-
 class LayoutRow(NamedTuple):
     """One row of the printed table: a field in all instances of its message."""
 
@@ -192,8 +169,8 @@ class LayoutRow(NamedTuple):
 
 
 @cache
-def layout() -> MobileyeLayout:
-    """Return the layout, which is read once.
+def layout() -> Mapping[str, Message]:
+    """Return all messages by name, in the order of the file, which is read once.
 
     Raises:
         SchemaError: The installed file is damaged.
@@ -205,7 +182,7 @@ def layout() -> MobileyeLayout:
         raise SchemaError(f"layout.toml: {error}; install crosscue again") from None
 
 
-def parse_layout(text: str) -> MobileyeLayout:
+def parse_layout(text: str) -> Mapping[str, Message]:
     """Parse a layout from TOML text.
 
     Raises:
@@ -220,7 +197,7 @@ def parse_layout(text: str) -> MobileyeLayout:
     claimed = [i for m in messages.values() for i in m.ids]
     if len(set(claimed)) != len(claimed):
         raise SchemaError("layout.toml: two messages have the same identifier")
-    return MobileyeLayout(tuple(messages.values()))
+    return MappingProxyType(messages)
 
 
 def _message(entry: dict[str, Any], earlier: Mapping[str, Message]) -> Message:
@@ -247,7 +224,7 @@ def _field(entry: Mapping[str, Any]) -> BitField:
 
 def describe() -> Iterator[LayoutRow]:
     """Yield the layout for display, one row for each field."""
-    for message in layout().messages:
+    for message in layout().values():
         ids = ", ".join(f"0x{i:03X}" for i in message.ids[:3]) + (
             f", ... 0x{message.ids[-1]:03X}" if len(message.ids) > 3 else ""
         )

@@ -38,7 +38,8 @@ def table_block(
     bus: str, name: str, log_ns: Int64s, columns: Columns, image_ns: Int64s | None = None
 ) -> Block:
     """Return the rows of one table as a block with topic ``BUS/mobileye/NAME``."""
-    units = {f.name: unit_of(f) for m in layout().of_table(name) for f in m.fields if unit_of(f)}
+    fields = (f for m in layout().values() if m.table == name for f in m.fields)
+    units = {f.name: unit_of(f) for f in fields if unit_of(f)}
     return Block(f"{bus}/mobileye/{name}", log_ns, Table(columns, units), header_ns=image_ns)
 
 

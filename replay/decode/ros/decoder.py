@@ -62,8 +62,8 @@ class RosDecoder:
             if len(index) != len(messages):
                 these = messages.take(index), heads[index]
             found = locate_fields(self.plan, *these, little=little)
-            for refused in found.refused:
-                _refuse(ledger, block, index[refused.rows], MISFIT, refused.why)
+            for refused, why in found.refused:
+                _refuse(ledger, block, index[refused], MISFIT, why)
             fits = np.flatnonzero(found.ok) if found.refused else np.arange(len(index))
             parts.append(MessageBatch(found, fits))
             rows.append(index[fits] if found.refused else index)

@@ -37,19 +37,6 @@ CDR_PADDING: Final = 3
 
 
 @dataclass(slots=True, eq=False)
-class Refused:
-    """Messages that do not fit, all for one reason.
-
-    Attributes:
-        rows: Indices of the messages.
-        why: Name of the field and the fault.
-    """
-
-    rows: Rows
-    why: str
-
-
-@dataclass(slots=True, eq=False)
 class FieldPositions:
     """Positions of all fields in N messages of one byte order, counted from the origins.
 
@@ -59,7 +46,7 @@ class FieldPositions:
         little: True if numbers are little endian.
         ok: Shape (N,): True if the message fits; positions of the others are meaningless.
         heads: Shape (N, K): the first bytes of each message.
-        refused: Reasons of the others.
+        refused: Indices of others, and the field and fault for which they do not fit.
         places: By path of a value: start of its run, alignment of that start, and offset of the
             value by alignment (8,).
         texts: By path of a string: its first byte and length without terminator.
@@ -71,7 +58,7 @@ class FieldPositions:
     little: bool
     ok: Bools
     heads: Bytes
-    refused: list[Refused] = field(default_factory=list)
+    refused: list[tuple[Rows, str]] = field(default_factory=list)
     places: dict[str, tuple[Place, Place, Int64s]] = field(default_factory=dict)
     texts: dict[str, tuple[Place, Place]] = field(default_factory=dict)
     sequences: dict[str, tuple[Place, Place]] = field(default_factory=dict)
@@ -196,7 +183,7 @@ class Walker:
         fresh = np.unique(rows[ok[rows]])
         if len(fresh):
             ok[fresh] = False
-            self.found.refused.append(Refused(fresh, why))
+            self.found.refused.append((fresh, why))
         self.damaged = True
         # A refused message stays at its end, so that nothing is read past it.
         cursor.at = np.where(bad, cursor.stop, cursor.at)

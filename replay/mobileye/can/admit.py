@@ -38,7 +38,7 @@ class Admitted(ColumnSet):
     """Frames of the Mobileye, in the order of the log.
 
     Attributes:
-        message: Index of each frame's message in ``layout().messages``, shape (N,), int64.
+        message: Index of each frame's message in ``layout()``, shape (N,), int64.
         instance: Slot, side or position of the message, shape (N,), int64.
         length: Payload lengths, shape (N,), uint8.
         log_ns: Log times, shape (N,).
@@ -59,7 +59,7 @@ class Admission:
         self._bus = bus
         self._ledger = ledger
         self._is_shared_bus = settings.is_shared_bus
-        messages = layout().messages
+        messages = layout().values()
         self._message = np.full(_STANDARD_IDS + 1, -1, dtype=np.int64)
         self._instance = np.zeros(_STANDARD_IDS + 1, dtype=np.int64)
         self._fits = np.zeros((len(messages), _LENGTHS), dtype=np.bool_)
@@ -119,7 +119,7 @@ def ids_of(message: Message, settings: MobileyeSettings) -> tuple[int, ...]:
 
 def all_ids(settings: MobileyeSettings) -> frozenset[int]:
     """Return all identifiers of this device."""
-    return frozenset(i for message in layout().messages for i in ids_of(message, settings))
+    return frozenset(i for message in layout().values() for i in ids_of(message, settings))
 
 
 def lengths_of(message: Message, settings: MobileyeSettings) -> tuple[int, ...]:

@@ -119,7 +119,7 @@ class Statuses:
         self._settings = settings
         self._clock = clock
         self._message = layout()["status"]
-        self._number = layout().messages.index(self._message)
+        self._number = [*layout()].index("status")
         self._fields: dict[str, BitField] = {f.name: f for f in self._message.fields}
         self._opened = 0
         self._word = np.zeros(0, dtype=np.uint64)
@@ -245,7 +245,7 @@ class MobileyeDecoder:
         given += self._obstacles(frames, burst_at, known)
         for table in LANE_PARTS:
             given += self._lane_rows(table, frames, burst_at)
-        for number, message in enumerate(layout().messages):
+        for number, message in enumerate(layout().values()):
             if message.table in ("status", "obstacles", *LANE_PARTS):
                 continue
             rows = np.flatnonzero(frames.message == number)
@@ -293,15 +293,16 @@ class MobileyeDecoder:
                 )
             else:
                 self._ledger.drop(self._bus, NOT_COME, count, f"burst {number}", log_ns)
-        if not len(triples.a):
+        first = triples[0]
+        if not len(first):
             return []
-        at = status.at(triples.a.burst)
+        at = status.at(first.burst)
         image_ns, log_ns_of_row = status.image_ns[at], status.log_ns[at]
         columns: Columns = {
             "t_ns": image_ns,
             "status_log_ns": log_ns_of_row,
-            "burst": triples.a.burst,
-            "slot": triples.a.place.astype(np.int8),
+            "burst": first.burst,
+            "slot": first.place.astype(np.int8),
         }
         for name, part in zip(OBSTACLE_PARTS, triples, strict=True):
             columns |= _columns(layout()[name], part.words, _unknown(len(part)))
@@ -362,10 +363,9 @@ class MobileyeDecoder:
 
 
 def _parts_of(frames: Admitted, burst_at: Int64s, names: Sequence[str]) -> FrameParts:
-    messages = layout().messages
-    numbers = np.array([next(k for k, m in enumerate(messages) if m.name == n) for n in names])
+    messages = [*layout()]
     part = np.full(len(messages), -1, dtype=np.int64)
-    part[numbers] = np.arange(len(names))
+    part[[messages.index(name) for name in names]] = np.arange(len(names))
     of_frame = part[frames.message]
     rows = np.flatnonzero(of_frame >= 0)
     return FrameParts(

@@ -66,7 +66,8 @@ def encode_tables(
         ValueError: A value cannot be encoded.
     """
     named = [(block.topic.rpartition("/")[2], block) for block in tables]
-    order = {name: place for place, name in enumerate(layout().tables)}
+    # The messages of a table are consecutive.
+    order = {message.table: place for place, message in enumerate(layout().values())}
     sent: list[_Sent] = []
     # At equal times the status is sent first, because it starts the burst of the other frames.
     for name, block in sorted(named, key=lambda one: order[one[0]]):
@@ -133,34 +134,20 @@ def _sent(name: str, block: Block, settings: MobileyeSettings) -> list[_Sent]:
     rows = block.rows
     assert isinstance(rows, Table)
     columns = to_device(name, dict(rows.columns), settings.mounting or AT_REAR_AXLE)
+    instance, log_ns = np.zeros(len(rows), dtype=np.int64), block.log_ns
     if name == "obstacles":
-        return _obstacles(block, columns)
-    instance = np.zeros(len(rows), dtype=np.int64)
-    if name in LANE_PARTS:
+        instance = columns["slot"].astype(np.int64)
+        log_ns = log_ns + (1 + len(OBSTACLE_PARTS) * instance) * FRAME_NS
+        if "angle_rad" not in columns:
+            columns["angle_rad"] = np.arctan2(floats(columns["y_m"]), floats(columns["x_m"]))
+    elif name in LANE_PARTS:
         instance = instance_of_lane(name, columns)
     elif name == "signs":
         instance = columns["sign"].astype(np.int64) - 1
-    messages = layout().of_table(name)
+    messages = (message for message in layout().values() if message.table == name)
     return [
-        _message(message, columns, instance, block.log_ns + k * FRAME_NS, settings, block.topic)
+        _message(message, columns, instance, log_ns + k * FRAME_NS, settings, block.topic)
         for k, message in enumerate(messages)
-    ]
-
-
-def _obstacles(block: Block, columns: Columns) -> list[_Sent]:
-    slot = columns["slot"].astype(np.int64)
-    if "angle_rad" not in columns:
-        columns["angle_rad"] = np.arctan2(floats(columns["y_m"]), floats(columns["x_m"]))
-    return [
-        _message(
-            layout()[name],
-            columns,
-            slot,
-            block.log_ns + (1 + 3 * slot + k) * FRAME_NS,
-            DEFAULTS,
-            block.topic,
-        )
-        for k, name in enumerate(OBSTACLE_PARTS)
     ]
 
 

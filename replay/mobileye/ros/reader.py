@@ -143,7 +143,7 @@ class RosMobileye:
             return []
         if not isinstance(block.rows, Table):
             return self._skip(block, NOT_COLUMNS, type(block.rows).__name__)
-        messages = [m for m in layout().messages if m.ros_type == name]
+        messages = [m for m in layout().values() if m.ros_type == name]
         messages = [m for m in messages if not m.name.startswith("next_lane_")]
         if not messages:
             return self._skip(block, NO_COUNTERPART, name)

@@ -82,8 +82,8 @@ def sorted_records(
             yield _damaged(done, f"{group.name}: {LAST_CUT}", 1)
             break
         # The next record that starts after the stretch is the first complete one.
-        following = -(-hole.stop // size)
-        yield _damaged(done, hole.damage, following - done)
+        following = -(-hole[0] // size)
+        yield _damaged(done, hole[1], following - done)
         done = following
     if stream.broken and stop is None:
         yield _damaged(done, stream.broken, 0)
@@ -264,7 +264,7 @@ class UnsortedData:
             return f"unknown record identifier {unknown} at {where}", -1
         hole = self.stream.hole(at, self.stream.size)
         if hole is not None:
-            return f"{hole.damage}; unsorted records after it cannot be found", -1
+            return f"{hole[1]}; unsorted records after it cannot be found", -1
         if not rest:
             return self.stream.broken, -1
         return self.stream.broken or LAST_CUT, self._finder.group_of(rest)

@@ -1,7 +1,6 @@
 """Random access to the data of an MDF 4 data link as one stream of bytes."""
 
 from bisect import bisect_right
-from dataclasses import dataclass
 from typing import Final, cast
 
 import numpy as np
@@ -12,14 +11,6 @@ from .blocks import Blocks, BrokenBlockError, StoredPart
 _DAMAGED: Final = cast("type[Exception]", isal_zlib.error)
 # Number of decompressed blocks kept, because a record may extend over two blocks.
 _KEPT: Final = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Hole:
-    """An unreadable part of a stream."""
-
-    stop: int
-    damage: str
 
 
 class LinkedData:
@@ -70,14 +61,14 @@ class LinkedData:
             k += 1
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
-    def hole(self, start: int, stop: int) -> Hole | None:
-        """Return the first known unreadable part in these bytes."""
+    def hole(self, start: int, stop: int) -> tuple[int, str] | None:
+        """Return the end and the damage of the first known unreadable part in these bytes."""
         for k in range(max(bisect_right(self._starts, start) - 1, 0), len(self._stretches)):
             one = self._stretches[k]
             if one.start >= stop:
                 break
             if k in self._damage and one.start + one.size > start:
-                return Hole(one.start + one.size, self._damage[k])
+                return one.start + one.size, self._damage[k]
         return None
 
     def _part(self, k: int, start: int, end: int) -> bytes:

@@ -56,7 +56,7 @@ class StoredValues:
             hole = self._stream.hole(begin + len(content), end)
             if hole is None:
                 return
-            begin = hole.stop
+            begin = hole[0]
 
 
 class GroupValues:

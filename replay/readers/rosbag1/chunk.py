@@ -186,22 +186,15 @@ def _layout_of(head: bytes) -> _Layout | None:
     return _Layout(np.frombuffer(head, dtype=np.uint8, count=_HEAD), is_fixed, conn, time)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Heads:
-    """Columns of the message headers at given offsets; ``fits`` marks the valid headers."""
-
-    fits: NDArray[np.bool_]
-    conn: Int64s
-    log_ns: Int64s
-    stop: Int64s
-
-
-def _heads(buffer: Bytes, at: Int64s, layout: _Layout) -> _Heads:
+def _heads(
+    buffer: Bytes, at: Int64s, layout: _Layout
+) -> tuple[NDArray[np.bool_], Int64s, Int64s, Int64s]:
+    """Return which message headers are valid, their connections, log times and payload ends."""
     heads = sliding_window_view(buffer, _HEAD)[at]
     fits = (heads[:, layout.is_fixed] == layout.head[layout.is_fixed]).all(axis=1)
     conn = _u32(heads, layout.conn)
     log_ns = _u32(heads, layout.time) * 1_000_000_000 + _u32(heads, layout.time + 4)
-    return _Heads(fits, conn, log_ns, at + _HEAD + _u32(heads, _HEAD - 4))
+    return fits, conn, log_ns, at + _HEAD + _u32(heads, _HEAD - 4)
 
 
 def _u32(heads: Bytes, at: int) -> Int64s:
@@ -235,11 +228,10 @@ def _by_index(raw: bytes, entries: Entries, largest: int) -> ChunkRows | None:
     layout = _layout_of(raw[at[0] : at[0] + _HEAD])
     if layout is None:
         return None
-    heads = _heads(buffer, at, layout)
-    agrees = heads.fits & (heads.conn == entries.conn) & (heads.log_ns == entries.log_ns)
-    if not agrees.all():
+    fits, conn, log_ns, stop = _heads(buffer, at, layout)
+    if not (fits & (conn == entries.conn) & (log_ns == entries.log_ns)).all():
         return None
-    ends = np.concatenate(([0], heads.stop))
+    ends = np.concatenate(([0], stop))
     starts = np.concatenate((at, [len(raw)]))
     connections: list[Connection] = []
     for gap in np.flatnonzero(ends != starts):
@@ -247,7 +239,7 @@ def _by_index(raw: bytes, entries: Entries, largest: int) -> ChunkRows | None:
         if found is None:
             return None
         connections += found
-    return ChunkRows(heads.conn, heads.log_ns, at + _HEAD, heads.stop, tuple(connections))
+    return ChunkRows(conn, log_ns, at + _HEAD, stop, tuple(connections))
 
 
 def _connections_between(raw: bytes, at: int, stop: int, largest: int) -> list[Connection] | None:
@@ -340,11 +332,11 @@ def _run_of_messages(raw: bytes, at: int, steps: _Steps, max_count: int) -> tupl
     if not places:
         return 0, at
     offsets = np.array(places, dtype=np.int64)
-    heads = _heads(np.frombuffer(raw, dtype=np.uint8), offsets, layout)
-    good = len(places) if heads.fits.all() else int(np.argmin(heads.fits))
-    columns = (offsets, heads.conn, heads.log_ns, offsets + _HEAD, heads.stop)
+    fits, conn, log_ns, stop = _heads(np.frombuffer(raw, dtype=np.uint8), offsets, layout)
+    good = len(places) if fits.all() else int(np.argmin(fits))
+    columns = (offsets, conn, log_ns, offsets + _HEAD, stop)
     steps.parts.append(tuple(column[:good] for column in columns))
-    return good, int(heads.stop[good - 1])
+    return good, int(stop[good - 1])
 
 
 def _one_record(raw: bytes, at: int, steps: _Steps, largest: int) -> int | None:

@@ -53,7 +53,7 @@ class Bus:
         from crosscue.replay.mobileye.layout import layout
 
         found = []
-        for message in layout().messages:
+        for message in layout().values():
             fits = {*message.lengths, LENGTH_UNKNOWN}
             seen = [self.ids.get((one, False)) for one in message.ids]
             if any(lengths is not None and lengths <= fits for lengths in seen):

@@ -198,7 +198,7 @@ def test_published_frames_decode_to_published_values(
 
 def test_describe_lists_every_field_once() -> None:
     rows = list(describe())
-    assert len(rows) == sum(len(m.fields) for m in layout().messages)
+    assert len(rows) == sum(len(m.fields) for m in layout().values())
     assert rows[0].ids == "0x738"
 
 

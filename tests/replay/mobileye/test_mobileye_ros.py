@@ -66,7 +66,7 @@ def standalone_messages() -> list[tuple[Message, str]]:
     joined = ("status", "obstacles", "lanes", "next_lanes")
     return [
         (message, variant)
-        for message in layout().messages
+        for message in layout().values()
         if message.table not in joined
         for variant in sorted(
             {f.only for f in message.fields if f.only} | set(message.variants.values())
