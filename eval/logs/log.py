@@ -613,11 +613,9 @@ def _views(messages: Messages) -> pa.Array:
     views = np.zeros((len(messages), 4), np.int32)
     views[:, 0] = length
     views[:, 3] = np.where(length > 12, messages.start, 0)
-    inline = views.view(np.uint8)[:, 4:]
-    short = np.flatnonzero(length <= 12)
-    for k in range(12):
-        has = np.flatnonzero(length > k) if k < 4 else short[length[short] > k]
-        inline[has, k] = messages.buffer[messages.start[has] + k]
+    inline, k = views.view(np.uint8)[:, 4:], np.arange(12)
+    has = (k < length[:, None]) & ((k < 4) | (length <= 12)[:, None])
+    inline[has] = messages.buffer[(messages.start[:, None] + k)[has]]
     buffers = [None, pa.py_buffer(views), pa.py_buffer(messages.buffer)]
     return pa.Array.from_buffers(pa.binary_view(), len(messages), buffers)
 

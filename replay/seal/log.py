@@ -46,7 +46,10 @@ def with_seal(path: Path, opened: Callable[[], Log], *, is_part: bool = False) -
     """
     found = seal_over(path)
     if found is None or (is_part and found[0] != seal_path(path)):
-        return opened()
+        log = opened()
+        if found is None and isinstance(log, Touching):
+            log.touched.of_opening()  # of a log without a seal, blocks need not be recorded
+        return log
     at, seal = found
     try:
         return SealedLog(opened(), seal, None if at == seal_path(path) else at)

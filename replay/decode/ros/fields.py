@@ -161,5 +161,6 @@ def _nanoseconds(
     seconds = "i4" if is_cdr or code == "duration" else "u4"
     rest = "i4" if not is_cdr and code == "duration" else "u4"
     whole = found.numbers(seconds, 0, place, rows).astype(np.int64)
-    fraction = found.numbers(rest, 0, place + 4, rows).astype(np.int64)
-    return whole * 1_000_000_000 + fraction
+    whole *= 1_000_000_000
+    whole += found.numbers(rest, 0, place + 4, rows)
+    return whole

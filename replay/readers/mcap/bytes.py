@@ -75,11 +75,14 @@ class ByteFile:
         """
         return self.window(at, size)[:size]
 
-    def window(self, at: int, min_bytes: int) -> memoryview:
-        """Return available bytes from ``at`` on: at least ``min_bytes``, fewer only at the end."""
+    def window(self, at: int, min_bytes: int, ahead: int = WINDOW) -> memoryview:
+        """Return available bytes from ``at`` on: at least ``min_bytes``, fewer only at the end.
+
+        ``ahead`` is how many a local file reads if it has to.
+        """
         begin = at - self._window_at
         if begin < 0 or begin + min_bytes > len(self._window):
-            self._window = self._pread(at, max(min_bytes, WINDOW))
+            self._window = self._pread(at, max(min_bytes, ahead))
             self._window_at, begin = at, 0
         return memoryview(self._window)[begin:]
 
@@ -151,7 +154,7 @@ class RangedByteFile(ByteFile):
         self.size = ranged.size
         self.buffers = Buffers()
 
-    def window(self, at: int, min_bytes: int) -> memoryview:
+    def window(self, at: int, min_bytes: int, ahead: int = WINDOW) -> memoryview:  # noqa: ARG002
         """Return available bytes from ``at`` on: at least ``min_bytes``, fewer only at the end."""
         return self._ranged.at_least(at, min_bytes)
 

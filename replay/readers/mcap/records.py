@@ -163,10 +163,18 @@ class ChunkIndex:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MessageIndex:
-    """Log times and offsets of a channel's messages within a chunk, shape (N,), INDEX_ENTRY."""
+    """Log times and offsets of a channel's N messages within a chunk; N ``INDEX_ENTRY``, packed."""
 
     channel_id: int
-    entries: NDArray[np.void]
+    packed: bytes
+
+    def __len__(self) -> int:
+        return len(self.packed) // INDEX_ENTRY.itemsize
+
+    @property
+    def entries(self) -> NDArray[np.void]:
+        """Shape (N,), INDEX_ENTRY."""
+        return np.frombuffer(self.packed, INDEX_ENTRY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,8 +254,8 @@ def read_message_index(content: bytes | memoryview) -> MessageIndex:
     channel_id, size = _INDEX_HEAD.unpack_from(content)
     if size % INDEX_ENTRY.itemsize or _INDEX_HEAD.size + size > len(content):
         raise BrokenRecordError(f"a message index of {size} bytes does not match its record")
-    count = size // INDEX_ENTRY.itemsize
-    return MessageIndex(channel_id, np.frombuffer(content, INDEX_ENTRY, count, _INDEX_HEAD.size))
+    # A copy: a view would keep everything that was read with it.
+    return MessageIndex(channel_id, bytes(content[_INDEX_HEAD.size : _INDEX_HEAD.size + size]))
 
 
 def read_statistics(content: bytes | memoryview) -> Statistics:

@@ -25,7 +25,7 @@ from crosscue.replay.readers.mcap.damage.find import (
 )
 from crosscue.replay.readers.mcap.damage.resync import McapResync, Plausible, is_definition
 
-from .bytes import ByteFile
+from .bytes import WINDOW, ByteFile
 from .records import (
     CHUNK_FIXED,
     COMPRESSIONS,
@@ -33,6 +33,7 @@ from .records import (
     FOOTER_SIZE,
     INDEX_ENTRY,
     MAGIC,
+    MAX_HEAD,
     MESSAGE_FIXED,
     MESSAGE_HEAD,
     PREFIX,
@@ -469,10 +470,12 @@ class Walk:
         """Read the message indexes from ``at`` on, and move the walk to their end."""
         bound = self._bound(self._at)
         reported_end = min(at + index.index_length, bound) if index is not None else at
+        # Up to the fields of the next chunk, or what is read without knowing.
+        ahead = min(reported_end - at + MAX_HEAD, WINDOW) if reported_end > at else WINDOW
         found: list[MessageIndex] = []
         fault = ""
         while at + PREFIX.size <= bound:
-            near = self._file.window(at, PREFIX.size)
+            near = self._file.window(at, PREFIX.size, ahead)
             if len(near) < PREFIX.size:
                 break
             opcode, length = PREFIX.unpack_from(near)
@@ -481,7 +484,7 @@ class Walk:
                 break
             self._at = at
             try:
-                found.append(read_message_index(bytes(self._whole(length, near))))
+                found.append(read_message_index(self._whole(length, near)))
             except BrokenRecordError as error:
                 fault = str(error)
             at = after

@@ -105,25 +105,17 @@ class ChunkTable(Mapping[int, ChunkIndex]):
 
     def __getitem__(self, at: int) -> ChunkIndex:
         i = self._row[at]
-        first, last, *numbers = (column[i] for column in self._numbers)
-        return ChunkIndex(
-            first,
-            last,
-            at,
-            numbers[0],
-            frozenset(self.channel[self.edges[i] : self.edges[i + 1]].tolist()),
-            numbers[1],
-            self.compression[i].decode("utf-8", "backslashreplace"),
-            numbers[2],
-            numbers[3],
-        )
+        first, last, length, index_length, body_size, size = self._numbers[i]
+        channels = frozenset(self.channel[self.edges[i] : self.edges[i + 1]].tolist())
+        name = self.compression[i].decode("utf-8", "backslashreplace")
+        return ChunkIndex(first, last, at, length, channels, index_length, name, body_size, size)
 
     @cached_property
     def _row(self) -> dict[int, int]:
         return {at: i for i, at in enumerate(self.at.tolist())}
 
     @cached_property
-    def _numbers(self) -> tuple[list[int], ...]:
+    def _numbers(self) -> list[tuple[int, ...]]:
         columns = (
             self.start,
             self.end,
@@ -132,7 +124,7 @@ class ChunkTable(Mapping[int, ChunkIndex]):
             self.sizes[:, 0],
             self.sizes[:, 1],
         )
-        return tuple(column.tolist() for column in columns)
+        return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
 def run_of(records: bytes, at: int, size: int) -> int:

@@ -130,9 +130,10 @@ def _fill_lz4(body: Bytes, size: int, room: Bytes, _: int) -> tuple[int, str]:
             if not is_stored:
                 past = out[max(0, done - _LZ4_WINDOW) : done] if frame["block_linked"] else b""
                 part = lz4.block.decompress(part, uncompressed_size=most, dict=past)
-            step, at = min(len(part), size + 1 - done), after
-            out[done : done + step] = part[:step]
-            done += step
+            if len(part) > size + 1 - done:
+                part = part[: size + 1 - done]
+            begin, done, at = done, done + len(part), after
+            out[begin:done] = part
     except (RuntimeError, ValueError, EOFError, lz4.block.LZ4BlockError) as error:
         return done, f"lz4: {error}"
     if at + 4 > len(view):

@@ -124,14 +124,15 @@ def rows_by_index(
     pieces: dict[int, list[tuple[int, MessageIndex]]] = {}
     for owner, (_, _, indexes) in enumerate(chunks):
         for index in indexes:
-            if len(index.entries):
+            if len(index):
                 pieces.setdefault(index.channel_id, []).append((owner, index))
     every = [piece for of_channel in pieces.values() for piece in of_channel]
     owners = [owner for owner, _ in every]
     if len({*owners}) < len(chunks):
         return None
-    counts = [len(index.entries) for _, index in every]
-    entries = np.concatenate([index.entries.view("<u8") for _, index in every]).reshape(-1, 2)
+    counts = [len(index) for _, index in every]
+    packed = b"".join([index.packed for _, index in every])
+    entries = np.frombuffer(packed, "<u8").reshape(-1, 2)
     log, offset = entries[:, 0].copy(), entries[:, 1].astype(np.int64)
     last = len(buffer) - MESSAGE_HEAD.itemsize
     if np.minimum.reduce(offset) < 0 or np.maximum.reduce(offset) > last:
@@ -158,7 +159,7 @@ def rows_by_index(
     others = _between_messages(buffer, offset, stop, [chunk[0] for chunk in chunks[1:]])
     if others is None:
         return None
-    lengths = [sum(len(i.entries) for _, i in of_channel) for of_channel in pieces.values()]
+    lengths = [sum(len(i) for _, i in of_channel) for of_channel in pieces.values()]
     inner = [0, *accumulate(lengths)]
     groups = zip(pieces, (slice(*edge) for edge in pairwise(inner)), strict=True)
     low, high = (of.reduceat(log, edges[:-1]).tolist() for of in (np.minimum, np.maximum))
