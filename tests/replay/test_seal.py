@@ -15,9 +15,11 @@ from crosscue.eval.cli import run
 from crosscue.replay.base import Selection
 from crosscue.replay.errors import LogError
 from crosscue.replay.files.identity import SHARE_BYTES, log_identity
-from crosscue.replay.ledger import CHANGED, DIFFERS
+from crosscue.replay.ledger import CHANGED, DIFFERS, Ledger
 from crosscue.replay.limits import MIB
+from crosscue.replay.logs.opening import open_log
 from crosscue.replay.seal import seal as sealing
+from crosscue.replay.seal.log import Touching
 from crosscue.replay.seal.seal import digests_of, read_seal, seal_path
 from crosscue.replay.versions import commit
 from support.accounted import read
@@ -433,3 +435,14 @@ def test_window_of_indexed_log_checks_only_its_blocks(tmp_path: Path, kind: str)
     at = rows[10].payload[4:20]
     _flip(log, log.read_bytes().index(at)) if at in log.read_bytes() else _flip(log, 5000)
     assert losses(early) == [f"{log.name}: bytes 0 to {MIB}"]
+
+
+def test_blocks_read_are_recorded_for_a_seal_only(tmp_path: Path) -> None:
+    log = next(write_folder(tmp_path / "bag", rows_of(40_000), "mcap").glob("*.mcap"))
+    assert log.stat().st_size > 3 * MIB
+    with open_log(log) as opened:
+        assert isinstance(opened, Touching)
+        blocks = sum(1 for _ in opened.read(Ledger(str(log))))
+        recorded = opened.touched.of_opening()[log]
+    assert blocks > 1
+    assert 1 not in recorded

@@ -154,7 +154,7 @@ class RangedByteFile(ByteFile):
         self.size = ranged.size
         self.buffers = Buffers()
 
-    def window(self, at: int, min_bytes: int, ahead: int = WINDOW) -> memoryview:  # noqa: ARG002
+    def window(self, at: int, min_bytes: int, ahead: int = WINDOW) -> memoryview:
         """Return available bytes from ``at`` on: at least ``min_bytes``, fewer only at the end."""
         return self._ranged.at_least(at, min_bytes)
 

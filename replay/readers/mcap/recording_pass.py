@@ -228,7 +228,7 @@ class SegmentPass:
             return True
         if chunk.fault or chunk.differs or chunk.index_fault or chunk.is_cut:
             return True
-        filled = [m for m in chunk.messages if len(m)]
+        filled = [m for m in chunk.messages if m.count]
         ids = {m.channel_id for m in filled}
         if ids != index.channels or not ids <= self._declarations.complete:
             return True
@@ -280,7 +280,7 @@ class SegmentPass:
 
     def _joined_rows(self, waiting: Sequence[tuple[UnreadChunk, ChunkRecords]]) -> Rows | None:
         """Parse the messages of several chunks at once; None if any of them needs its own care."""
-        entries = sum(len(index) for chunk, _ in waiting for index in chunk.messages)
+        entries = sum(index.count for chunk, _ in waiting for index in chunk.messages)
         has_crc = all(chunk.head is not None and chunk.head.crc for chunk, _ in waiting)
         if len(waiting) < 2 or not has_crc or entries > self._limits.records_per_chunk:
             return None
@@ -302,7 +302,7 @@ class SegmentPass:
             BrokenRecordError: A check failed, or there are too many messages.
         """
         max_records = self._limits.records_per_chunk
-        if sum(map(len, chunk.messages)) > max_records:
+        if sum(index.count for index in chunk.messages) > max_records:
             raise BrokenRecordError(f"its index names more than {max_records} messages")
         one = [(0, len(buffer), chunk.messages)]
         rows = rows_by_index(buffer, one) if chunk.messages else None
@@ -365,7 +365,7 @@ class SegmentPass:
         span = "" if source is None else f"; log times {source.start} to {source.end}"
         detail = f"{self._where}chunk at byte {chunk.at}: {why}{span}"
         reason = CUT if chunk.is_cut else DAMAGED_CHUNK
-        counts = {m.channel_id: len(m) for m in chunk.messages if len(m)}
+        counts = {m.channel_id: m.count for m in chunk.messages if m.count}
         for channel_id, count in counts.items():
             self._builder.drop_of_channel(channel_id, reason, count, detail, t_ns)
         held = chunk.index.channels if chunk.index is not None else frozenset[int]()
@@ -469,7 +469,7 @@ class SegmentPass:
                 )
             case Stray(at, index):
                 detail = f"{self._where}message index at byte {at}: no chunk precedes it"
-                counts = {index.channel_id: len(index)}
+                counts = {index.channel_id: index.count}
                 self._damages.append(DamagedPart(DAMAGED_CHUNK, detail, None, counts))
             case End(at, how):
                 self._end(at, how)
@@ -576,5 +576,5 @@ def _is_as_indexed(chunk: UnreadChunk) -> bool:
     index = chunk.index
     if index is None or chunk.fault or chunk.differs:
         return False
-    held = {m.channel_id for m in chunk.messages if len(m)}
+    held = {m.channel_id for m in chunk.messages if m.count}
     return held <= index.channels or not index.channels

@@ -163,13 +163,11 @@ class ChunkIndex:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MessageIndex:
-    """Log times and offsets of a channel's N messages within a chunk; N ``INDEX_ENTRY``, packed."""
+    """Log times and offsets of a channel's messages within a chunk: ``count`` ``INDEX_ENTRY``s."""
 
     channel_id: int
+    count: int
     packed: bytes
-
-    def __len__(self) -> int:
-        return len(self.packed) // INDEX_ENTRY.itemsize
 
     @property
     def entries(self) -> NDArray[np.void]:
@@ -255,7 +253,8 @@ def read_message_index(content: bytes | memoryview) -> MessageIndex:
     if size % INDEX_ENTRY.itemsize or _INDEX_HEAD.size + size > len(content):
         raise BrokenRecordError(f"a message index of {size} bytes does not match its record")
     # A copy: a view would keep everything that was read with it.
-    return MessageIndex(channel_id, bytes(content[_INDEX_HEAD.size : _INDEX_HEAD.size + size]))
+    packed = bytes(content[_INDEX_HEAD.size : _INDEX_HEAD.size + size])
+    return MessageIndex(channel_id, size // INDEX_ENTRY.itemsize, packed)
 
 
 def read_statistics(content: bytes | memoryview) -> Statistics:

@@ -474,10 +474,12 @@ class Walk:
         ahead = min(reported_end - at + MAX_HEAD, WINDOW) if reported_end > at else WINDOW
         found: list[MessageIndex] = []
         fault = ""
+        near = memoryview(b"")
         while at + PREFIX.size <= bound:
-            near = self._file.window(at, PREFIX.size, ahead)
             if len(near) < PREFIX.size:
-                break
+                near = self._file.window(at, PREFIX.size, ahead)
+                if len(near) < PREFIX.size:
+                    break
             opcode, length = PREFIX.unpack_from(near)
             after = at + PREFIX.size + length
             if opcode != Op.MESSAGE_INDEX or after > bound:
@@ -487,7 +489,7 @@ class Walk:
                 found.append(read_message_index(self._whole(length, near)))
             except BrokenRecordError as error:
                 fault = str(error)
-            at = after
+            at, near = after, near[PREFIX.size + length :]
         if at < reported_end:
             at, fault = reported_end, fault or "a message index cannot be read"
         self._at = at
@@ -496,17 +498,14 @@ class Walk:
 
 def _differences(head: ChunkHead, index: ChunkIndex, length: int) -> str:
     """Describe the fields in which a chunk and its entry in the summary differ, or empty."""
-    pairs = (
-        ("length", length, index.length),
-        ("start time", head.start, index.start),
-        ("end time", head.end, index.end),
-        ("size", head.size, index.size),
-        ("stored size", head.body_size, index.body_size),
-        ("compression", head.compression, index.compression),
-    )
+    found = (length, head.start, head.end, head.size, head.body_size, head.compression)
+    stated = (index.length, index.start, index.end, index.size, index.body_size, index.compression)
+    if found == stated:
+        return ""
+    names = ("length", "start time", "end time", "size", "stored size", "compression")
     return ", ".join(
         f"{name} {said!r} (the summary states {reported!r})"
-        for name, said, reported in pairs
+        for name, said, reported in zip(names, found, stated, strict=True)
         if said != reported
     )
 

@@ -86,7 +86,7 @@ class BlockBuilder:
 
     def skip_unread(self, index: MessageIndex) -> None:
         """Account for unselected messages without reading them."""
-        count = len(index)
+        count = index.count
         self.met[index.channel_id] += count
         self._account(self.declarations.topic(index.channel_id), index.entries["log"])
 

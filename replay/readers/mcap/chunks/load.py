@@ -254,7 +254,7 @@ def _size(chunk: UnreadChunk) -> int:
 
 
 def _rows(chunk: UnreadChunk) -> int:
-    return sum(map(len, chunk.messages))
+    return sum(index.count for index in chunk.messages)
 
 
 def _is_plain_case(chunk: UnreadChunk) -> bool:

@@ -124,13 +124,13 @@ def rows_by_index(
     pieces: dict[int, list[tuple[int, MessageIndex]]] = {}
     for owner, (_, _, indexes) in enumerate(chunks):
         for index in indexes:
-            if len(index):
+            if index.count:
                 pieces.setdefault(index.channel_id, []).append((owner, index))
     every = [piece for of_channel in pieces.values() for piece in of_channel]
     owners = [owner for owner, _ in every]
     if len({*owners}) < len(chunks):
         return None
-    counts = [len(index) for _, index in every]
+    counts = [index.count for _, index in every]
     packed = b"".join([index.packed for _, index in every])
     entries = np.frombuffer(packed, "<u8").reshape(-1, 2)
     log, offset = entries[:, 0].copy(), entries[:, 1].astype(np.int64)
@@ -159,13 +159,13 @@ def rows_by_index(
     others = _between_messages(buffer, offset, stop, [chunk[0] for chunk in chunks[1:]])
     if others is None:
         return None
-    lengths = [sum(len(i) for _, i in of_channel) for of_channel in pieces.values()]
+    lengths = [sum(i.count for _, i in of_channel) for of_channel in pieces.values()]
     inner = [0, *accumulate(lengths)]
     groups = zip(pieces, (slice(*edge) for edge in pairwise(inner)), strict=True)
-    low, high = (of.reduceat(log, edges[:-1]).tolist() for of in (np.minimum, np.maximum))
-    times = [(1 << 64, 0)] * len(chunks)
-    for owner, begin, end in zip(owners, low, high, strict=True):
-        times[owner] = (min(times[owner][0], begin), max(times[owner][1], end))
+    early = np.full(len(chunks), (1 << 64) - 1, np.uint64)
+    late = np.zeros(len(chunks), np.uint64)
+    np.minimum.at(early, owners, np.minimum.reduceat(log, edges[:-1]))
+    np.maximum.at(late, owners, np.maximum.reduceat(log, edges[:-1]))
     rows = Rows(
         buffer,
         offset,
@@ -177,7 +177,7 @@ def rows_by_index(
         *others,
         len(buffer),
         tuple(groups),
-        tuple(times),
+        tuple(zip(early.tolist(), late.tolist(), strict=True)),
     )
     turns = sum(bool(offset[edge] < offset[edge - 1]) for edge in inner[1:-1])
     is_stored_order = np.count_nonzero(offset[1:] < offset[:-1]) == turns
@@ -196,8 +196,8 @@ def _between_messages(
     Starts and ends can therefore be sorted separately. No record between messages extends past one
     of the ``borders``, where the next chunk begins.
     """
-    begin = np.concatenate([offset, borders, [len(buffer)]]).astype(np.int64)
-    end = np.concatenate([[0], borders, stop]).astype(np.int64)
+    begin = np.concatenate([offset, borders, [len(buffer)]], dtype=np.int64, casting="unsafe")
+    end = np.concatenate([[0], borders, stop], dtype=np.int64, casting="unsafe")
     begin.sort(kind="stable")
     end.sort(kind="stable")
     gaps = (end != begin).nonzero()[0]
