@@ -162,5 +162,5 @@ def _nanoseconds(
     rest = "i4" if not is_cdr and code == "duration" else "u4"
     whole = found.numbers(seconds, 0, place, rows).astype(np.int64)
     whole *= 1_000_000_000
-    whole += found.numbers(rest, 0, place + 4, rows)
+    whole += found.numbers(rest, 0, place + 4, rows).astype(np.int64)
     return whole
