@@ -7,17 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import pytest
 
 from crosscue.eval import cli
-from support.coco import stop_signs
-from support.command_lines import VALID
-from support.empty_inputs import empty_inputs
-from support.gap_drive import BEGIN, BUS, Clock, write_drive
-from support.landmark_files import database_of
-from support.mcap_files import McapFile
-from support.onnx_models import bright_box_model
+from support.command_lines import LOGS, VALID, valid_inputs
 from support.opened_files import opened_files
 from support.refusals import refusal
 
@@ -78,7 +71,6 @@ NAMES_NOTHING: Final[dict[str, str]] = {
 NEEDS_LOG: Final = {"--topics", "--map"}
 
 NUMBERS: Final = ("int", "float", "metres", "_fraction")
-LOGS: Final = ("log", "bus_log", "empty_log")
 
 
 def _options() -> Iterator[tuple[str, str]]:
@@ -118,28 +110,10 @@ def test_every_option_has_spelling_of_nonexistent_thing_or_names_nothing() -> No
 def names(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Valid inputs of every kind, and things that do not exist."""
     folder = tmp_path_factory.mktemp("inputs")
-    found = empty_inputs(folder)
-    drive = found["car"].parent
-    (folder / "empty.mcap").write_bytes(McapFile([]).coded())
-    (folder / "net.onnx").write_bytes(bright_box_model())
-    score = ["score", str(found["run"]), "--truth", f"{drive}/truth.json", "--without-figures"]
+    found = valid_inputs(folder)
+    score = ["score", str(found["run"]), "--truth", str(found["truth"]), "--without-figures"]
     assert cli.run(score) == 0
-    (folder / "labels.json").write_text(stop_signs([("a.png", BEGIN)], (160, 90)))
-    return {
-        **found,
-        "truth": drive / "truth.json",
-        "gone": folder / "nosuch_gone",
-        "bus_log": write_drive(folder / "bus", Clock(), seconds=4, topics=[BUS]),
-        "empty_log": folder / "empty.mcap",
-        "db": database_of(folder / "known.db", np.array([[0.0, 1.0]])),
-        "runs": found["run"].parent,
-        "onnx": folder / "net.onnx",
-        "there": folder,
-        "coco": folder / "labels.json",
-        "labels": found["empty"] / "pairs.csv",
-        "picture": found["empty"] / "a.png",
-        "streets": found["empty"] / "streets.osm",
-    }
+    return {**found, "gone": folder / "nosuch_gone", "runs": folder}
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,17 @@
-"""A valid command line of each command that reads a file, for tests that change a word of it."""
+"""A valid command line of each command that reads a file, and its inputs."""
 
+from pathlib import Path
 from typing import Final
+
+from crosscue.eval import cli
+from support.coco import stop_signs
+from support.failures import table_of_failures
+from support.gap_drive import BEGIN, BUS, Clock, replayed, write_drive
+from support.landmark_files import empty_database
+from support.mcap_files import McapFile
+from support.onnx_models import bright_box_model
+from support.pictures import picture
+from support.street_map import write_crossing
 
 # Arguments come first, in their order; names in braces are places of inputs, and ``out`` is new.
 VALID: Final[dict[str, str]] = {
@@ -48,3 +59,46 @@ VALID: Final[dict[str, str]] = {
     "train mask-rcnn": "--data {coco} --images {pictures} -o {out}.safetensors",
     "study intersections": "-o {out}",
 }
+# A log of the car, one without pictures and one without messages.
+LOGS: Final = ("log", "bus_log", "empty_log")
+
+
+def valid_inputs(folder: Path) -> dict[str, Path]:
+    """Valid inputs of every kind."""
+    drive, photos = folder / "drive", folder / "photos"
+    log = write_drive(drive, Clock(), seconds=4)
+    run = replayed(drive, log, "../run")
+    (folder / "empty.mcap").write_bytes(McapFile([]).coded())
+    for place in ("images", "masks"):
+        (photos / place).mkdir(parents=True)
+        for number in range(2):
+            (photos / place / f"{number}.png").write_bytes(picture(number, width=64, height=48))
+    (photos / "coco.json").write_text(stop_signs([("0.png", 0), ("1.png", 1)], (64, 48)))
+    (photos / "labels.csv").write_text("picture,label,x0,y0,x1,y1\nimages/0.png,stop,1,1,9,9\n")
+    (photos / "places.csv").write_text("image,x_m,y_m,sd_m\n0.png,0,0,1\n")
+    (photos / "pairs_m.csv").write_text(
+        "height_px,range_m\n" + "".join(f"{200 / m},{m}\n" for m in range(5, 60))
+    )
+    (photos / "net.onnx").write_bytes(bright_box_model())
+    assert cli.run(["model", "init", str(photos / "net.onnx"), "-q"]) == 0
+    return {
+        "log": log,
+        "bus_log": write_drive(folder / "bus", Clock(), seconds=4, topics=[BUS]),
+        "empty_log": folder / "empty.mcap",
+        "run": run.path,
+        "car": drive / "car.toml",
+        "truth": drive / "truth.json",
+        "db": empty_database(folder / "known.db"),
+        "pictures": photos / "images",
+        "picture": photos / "images" / "0.png",
+        "masks": photos,
+        "coco": photos / "coco.json",
+        "labels": photos / "labels.csv",
+        "places": photos / "places.csv",
+        "pairs_m": photos / "pairs_m.csv",
+        "onnx": photos / "net.onnx",
+        "card": photos / "net.toml",
+        "there": photos,
+        "streets": write_crossing(photos / "streets.osm"),
+        "failures": table_of_failures(run.path, photos / "failures.parquet", BEGIN),
+    }
