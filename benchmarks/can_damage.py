@@ -16,8 +16,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from support.can_files import damaged
-from support.can_kinds import KINDS, Kind, judge
+from support.can_files import KINDS, Kind, damaged, judge
 
 COLUMNS = ("refused", "same", "reported", "undetectable", "SILENT", "INVENTED", "UNCLEAR", "CRASH")
 

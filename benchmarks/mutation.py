@@ -94,7 +94,6 @@ PARTS: Final = {
                 "frames_by_hand",
                 "looked_for",
                 "pairs_by_hand",
-                "past",
                 "road",
                 "road_area",
                 "road_by_hand",
@@ -102,7 +101,8 @@ PARTS: Final = {
             )
         ),
         (
-            "tests/detectors/cues/test_past.py::test_bus_samples_do_not_depend_on_block_boundaries",
+            "tests/detectors/cues/test_far_side_by_hand.py::"
+            "test_bus_samples_do_not_depend_on_block_boundaries",
             "tests/detectors/cues/test_looked_for.py::test_built_in_detectors_list_their_labels",
         ),
     ),

@@ -35,7 +35,7 @@ from crosscue.localization.town.drive import (
 )
 from crosscue.localization.town.random_stream import key_of
 from crosscue.localization.town.settings import City, Navigation, Sensors, TownDrive
-from support.arc_consistency import nees_along_the_arc
+from support.beliefs import nees_along_the_arc
 
 NEES = DriveResult._fields.index("nees")
 FINE_M = 1e-4

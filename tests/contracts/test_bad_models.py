@@ -19,11 +19,11 @@ from crosscue.detectors.catalog.card import read_card
 from crosscue.eval import cli
 from crosscue.eval.runs.folder import open_run
 from support.decoder_samples import CLASSES, SAMPLES, export
+from support.mask_rcnn import network
 from support.onnx_models import constant_model, write_card
 from support.pandaset_drive import START_S, pandaset_drive
 from support.pictures import picture, picture_folder
 from support.refusals import refusal
-from support.torchvision_files import network
 
 ROWS = np.array([[[4.0, 4.0, 20.0, 20.0, 0.9, 1.0]]], np.float32)
 OUTPUT = 'kind = "end-to-end"\nscore = 0.3\nclasses = {}\n'

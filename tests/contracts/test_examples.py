@@ -30,8 +30,15 @@ from support.catalog_runs import runs_below
 from support.commands import output_of
 from support.every_format import _bytes
 from support.pages import NOTEBOOKS as NOTEBOOK_FILES
-from support.pages import PAGES, ROOT, Code, code_of_notebooks, code_of_pages, commands_of
-from support.public_calls import faults_in
+from support.pages import (
+    PAGES,
+    ROOT,
+    Code,
+    code_of_notebooks,
+    code_of_pages,
+    commands_of,
+    faults_in,
+)
 from support.refusals import refusal
 
 CODE: Final = code_of_pages()

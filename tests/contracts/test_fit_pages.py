@@ -22,9 +22,8 @@ from crosscue.replay.vehicle.vehicle import parse
 from support.commands import output_of
 from support.fusion_runs import write_drives
 from support.landmark_files import write_walls
-from support.lights import write_lights
 from support.refusals import refusal
-from support.sign_scenes import scene
+from support.sign_scenes import scene, write_lights
 
 # Arguments, words of each chart's caption, and the section to paste.
 FITS: Final[dict[str, tuple[str, tuple[str, ...], str]]] = {

@@ -9,7 +9,7 @@ import grimp
 import pyarrow.parquet as pq
 import pytest
 
-from support.child import python
+from support.commands import python
 from support.gap_drive import Clock, write_drive
 from support.onnx_models import bright_box_model, write_card
 

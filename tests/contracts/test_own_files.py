@@ -18,7 +18,7 @@ from crosscue.replay.errors import LogError
 from crosscue.replay.formats import FORMATS
 from crosscue.replay.limits import Limits
 from crosscue.replay.logs.opening import open_log
-from support.child import python
+from support.commands import python
 from support.empty_inputs import empty_inputs
 from support.every_format import EVERY_FORMAT
 from support.pictures import picture_folder

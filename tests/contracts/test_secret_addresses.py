@@ -15,7 +15,7 @@ from crosscue.eval.cli import COMMANDS, parser_of
 from crosscue.eval.cli import run as crosscue
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.remote import ranges as remote_ranges
-from support.child import python
+from support.commands import python
 from support.gap_drive import Clock, write_drive
 from support.range_server import Served, serving
 from support.street_map import write_crossing

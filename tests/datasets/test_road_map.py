@@ -1,16 +1,29 @@
-"""Intersections of a map along a track: distances, legs and controls, turned and mirrored."""
+"""Intersections of a map along a track, and those of a Lanelet2 map."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from crosscue.datasets.truth.lanelet2 import read_map
+from crosscue.datasets.truth.lanes import MAX_STEPS
 from crosscue.datasets.truth.road_map import Ahead, RoadMap, approaches_along
 from crosscue.replay.errors import AnnotationError
-from support.street_map import ahead_of, roads_of, write_map
+from support.street_map import (
+    LANE_M,
+    MIDDLE,
+    Bound,
+    ahead_of,
+    crossing_lanes,
+    joined_lane,
+    roads_of,
+    straight_lane,
+    write_lanelets,
+    write_map,
+)
 from support.trees import written
 
 # A street to the east with a crossing at 60 m; a T junction follows, with its arm on the left.
@@ -165,3 +178,172 @@ def test_unusable_map_is_refused_in_one_line(tmp_path: Path, content: str, said:
 
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def _turned(
+    lanelets: Mapping[str, tuple[Bound, Bound, str]], turn_rad: float
+) -> dict[str, tuple[Bound, Bound, str]]:
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+
+    def moved(bound: Bound) -> Bound:
+        return [(c * x - s * y, s * x + c * y) for x, y in bound]
+
+    return {k: (moved(left), moved(right), said) for k, (left, right, said) in lanelets.items()}
+
+
+def _ahead_on_lane(
+    roads: RoadMap, x_m: float, y_m: float = -1.75, turn_rad: float = 0.0
+) -> Ahead | None:
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+    return ahead_of(roads, c * x_m - s * y_m, s * x_m + c * y_m, turn_rad)
+
+
+def _exits(roads: RoadMap, ahead: Ahead) -> set[str]:
+    return {side for side, legs in roads.legs(ahead).items() if any(leg.is_out for leg in legs)}
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 37.0, 215.0])
+@pytest.mark.parametrize("reversed_bounds", [False, True])
+def test_distances_are_those_to_the_kerbs_of_the_crossroad(
+    tmp_path: Path, turn_deg: float, reversed_bounds: bool
+) -> None:
+    turn_rad = np.radians(turn_deg)
+    lanelets = _turned(crossing_lanes(), turn_rad)
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", lanelets, reversed_bounds=reversed_bounds))
+
+    ahead = _ahead_on_lane(roads, 10.0, turn_rad=turn_rad)
+
+    assert ahead is not None
+    assert [ahead.start_m, ahead.end_m] == pytest.approx([50.0, 57.0], abs=0.3)
+    assert _exits(roads, ahead) == {"left", "right", "straight", "back"}
+
+
+def test_an_approach_goes_on_past_the_stop_line_to_the_kerb(tmp_path: Path) -> None:
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", crossing_lanes()))
+    x_m = np.arange(40.25, 70.0, 0.5)
+
+    found = roads.along(np.column_stack([x_m, np.full(len(x_m), -1.75)]), np.zeros(len(x_m)))
+
+    start_m = [x + one.start_m for x, one in zip(x_m.tolist(), found, strict=True) if one]
+    assert start_m == pytest.approx([60.0] * 40, abs=0.3)
+
+
+def test_an_arm_counts_where_the_map_ends_at_its_mouth(tmp_path: Path) -> None:
+    cut = {key: lane for key, lane in crossing_lanes().items() if not key.startswith("n-")}
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", cut))
+
+    ahead = _ahead_on_lane(roads, 10.0)
+
+    assert ahead is not None
+    assert [ahead.start_m, ahead.end_m] == pytest.approx([50.0, 57.0], abs=0.3)
+    assert "left" in _exits(roads, ahead)
+
+
+def test_control_is_that_of_the_lane(tmp_path: Path) -> None:
+    rules = {"light": ("traffic_light", "w-in"), "sign": ("stop", "e-in")}
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", crossing_lanes(), rules))
+    east = ahead_of(roads, 100.0, 1.75, np.pi)
+    south = ahead_of(roads, MIDDLE + 1.75, -40.0, np.pi / 2.0)
+
+    controls = [
+        one.control for one in (_ahead_on_lane(roads, 30.0), east, south) if one is not None
+    ]
+
+    assert controls == ["traffic_light", "stop_sign", None]
+
+
+def test_lanes_with_a_turn_direction_are_inside_and_their_rules_count_before(
+    tmp_path: Path,
+) -> None:
+    turns = {
+        k: (left, right, "turn_direction=straight" if k == "w-e" else said)
+        for k, (left, right, said) in crossing_lanes().items()
+        if k not in ("s-n", "n-s")
+    }
+    rules = {"light": ("traffic_light", "w-e")}
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", turns, rules))
+
+    ahead = _ahead_on_lane(roads, 30.0)
+
+    assert ahead is not None
+    assert ahead.control == "traffic_light"
+    assert ahead.start_m == pytest.approx(30.0, abs=0.3)
+
+
+def _wide(a: tuple[float, float], b: tuple[float, float]) -> tuple[Bound, Bound]:
+    (x0, y0), (x1, y1) = a, b
+    length = np.hypot(x1 - x0, y1 - y0)
+    x, y = -LANE_M * (y1 - y0) / length, LANE_M * (x1 - x0) / length
+    return [(x0 + x, y0 + y), (x1 + x, y1 + y)], [(x0 - x, y0 - y), (x1 - x, y1 - y)]
+
+
+def test_one_wide_lane_each_way_has_its_side_road_where_it_meets(tmp_path: Path) -> None:
+    west, east = _wide((-80.0, 0.0), (55.0, 0.0)), _wide((72.0, 0.0), (160.0, 0.0))
+    north = _wide((63.5, 5.0), (63.5, 60.0))
+    lanelets = {"w": west, "e": east, "n": north, "w-e": joined_lane(west, east)}
+    lanelets |= {
+        "w-n": joined_lane(west, north),
+        "n-e": joined_lane((north[0][::-1], north[1][::-1]), east),
+    }
+    # From the north to the east the bounds change sides.
+    lanelets["n-e"] = [north[1][0], east[0][0]], [north[0][0], east[1][0]]
+    told = {key: (*bounds, "one_way=no") for key, bounds in lanelets.items()}
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", told))
+
+    ahead = _ahead_on_lane(roads, 0.0, y_m=0.0)
+
+    assert ahead is not None
+    assert [ahead.start_m, ahead.end_m] == pytest.approx([60.0, 67.0], abs=0.3)
+    assert _exits(roads, ahead) == {"left", "straight", "back"}
+    westward = ahead_of(roads, 120.0, 0.0, np.pi)
+    assert westward is not None
+    assert _exits(roads, westward) == {"right", "straight", "back"}
+
+
+STREET = {
+    f"w{part}": (*straight_lane((-80.0 + 80.0 * part, 0.0), (80.0 * part, 0.0)), "")
+    for part in range(3)
+}
+
+
+@pytest.mark.parametrize("height_m", [0.0, 6.0])
+def test_a_bridge_is_no_intersection(tmp_path: Path, height_m: float) -> None:
+    over = {
+        f"s{part}": (*straight_lane((20.0, -120.0 + 80.0 * part), (20.0, -40.0 + 80.0 * part)), "")
+        for part in range(3)
+    }
+    heights_m = dict.fromkeys(over, height_m)
+    path = write_lanelets(tmp_path / "a.osm", {**STREET, **over}, heights_m=heights_m)
+
+    assert (_ahead_on_lane(roads_of(path), -30.0) is None) is (height_m > 0.0)
+
+
+@pytest.mark.parametrize("tags", ["", "subtype=walkway", "participant:bicycle=yes"])
+def test_a_crossing_for_people_is_no_intersection(tmp_path: Path, tags: str) -> None:
+    over = {"over": (*straight_lane((30.0, -9.0), (30.0, 9.0)), tags)}
+    roads = roads_of(write_lanelets(tmp_path / "a.osm", STREET | over))
+
+    assert _ahead_on_lane(roads, -10.0) is None
+
+
+@pytest.mark.parametrize("height", ["nan", "inf", "1e300", "high"])
+def test_height_that_is_none_is_refused_in_one_line(tmp_path: Path, height: str) -> None:
+    path = write_lanelets(tmp_path / "a.osm", crossing_lanes())
+    path.write_text(path.read_text().replace("v='0.0'", f"v='{height}'"))
+    with pytest.raises(AnnotationError, match=r"a.osm: node \d+: ele .*expected metres"):
+        read_map(path)
+
+
+def test_a_lane_around_the_earth_takes_no_more_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far = {"far": (*straight_lane((0.0, 0.0), (5e6, 0.0)), "")}
+    path = write_lanelets(tmp_path / "a.osm", far)
+    (road,) = roads_of(path).roads
+    assert len(road.nodes) == MAX_STEPS + 1
+
+    monkeypatch.setattr("crosscue.datasets.truth.lanelet2.MAX_POINTS", 100)
+    with pytest.raises(
+        AnnotationError, match=r"a.osm: lanes of over .* km; cut the map to the drive"
+    ):
+        roads_of(path)

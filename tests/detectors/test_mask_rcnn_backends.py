@@ -29,7 +29,7 @@ from crosscue.detectors.networks.mask_rcnn.detector import (
 )
 from crosscue.detectors.networks.mask_rcnn.network import build_network
 from crosscue.detectors.networks.mask_rcnn.parts import TorchParts, as_input
-from support.child import python
+from support.commands import python
 from support.mask_rcnn import CPU, noise_frame, plan_of, random_checkpoint
 
 BACKENDS = ("torch", "openvino")

@@ -23,8 +23,8 @@ from crosscue.detectors.catalog.card import read_card
 from crosscue.detectors.networks.devices import threads_of
 from crosscue.detectors.networks.model_detector import build
 from crosscue.eval.cli import run
+from support.mask_rcnn import NAMES, class_names, hollow, network
 from support.refusals import refusal
-from support.torchvision_files import NAMES, class_names, hollow, network
 
 SIZE = (160, 96)
 SSDLITE = "ssdlite320_mobilenet_v3_large"

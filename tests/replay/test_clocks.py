@@ -13,7 +13,7 @@ from crosscue.replay.clocks.clock import Clock
 from crosscue.replay.clocks.findings import findings
 from crosscue.replay.clocks.reports import ClockWatch, StampReport
 from crosscue.replay.columns import Block, Int64s
-from support.clock_streams import SECOND_NS, START_NS, Stream, table_of, watch, watch_stream
+from support.memory_log import SECOND_NS, START_NS, Stream, table_of, watch, watch_stream
 
 MS = 1_000_000
 quick = settings(max_examples=40, deadline=None)

@@ -37,7 +37,7 @@ from crosscue.replay.remote.logs import Store, fetch_log
 from crosscue.replay.write.convert import LogWriter
 from crosscue.replay.write.mcap import McapWriter
 from support.can_files import candump, random_frames
-from support.child import python
+from support.commands import python
 from support.every_format import EVERY_FORMAT
 from support.memory_log import GYRO, WHEELS, gyro_block, wheel_block
 from support.range_server import Served, serving

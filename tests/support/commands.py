@@ -1,7 +1,10 @@
-"""Commands that end as they should, and what they print."""
+"""Run commands of crosscue, and Python in a process of its own."""
 
 import io
 import json
+import os
+import subprocess
+import sys
 from contextlib import redirect_stdout
 from typing import Any
 
@@ -20,3 +23,11 @@ def output_of(*words: object, status: int = 0) -> str:
 def json_of(*words: object, status: int = 0) -> Any:
     """Run a command with ``--json``, and return what it prints."""
     return json.loads(output_of(*words, "--json", status=status))
+
+
+def python(code: str, *words: object, **more: Any) -> subprocess.CompletedProcess[str]:
+    """Run code with arguments, which imports what this process can, by ``subprocess.run``."""
+    settings: dict[str, Any] = {"timeout": 120, "capture_output": True, "text": True, **more}
+    path = os.pathsep.join(filter(None, sys.path))
+    settings["env"] = {**(settings.get("env") or os.environ), "PYTHONPATH": path}
+    return subprocess.run([sys.executable, "-c", code, *map(str, words)], check=False, **settings)

@@ -8,7 +8,7 @@ from crosscue.localization.landmarks.features import CameraGeometry, Keypoints
 from crosscue.replay.columns import Bytes
 
 from .gap_drive import ROW, SECOND, SPEED_MPS
-from .landmark_drive import NearnessMatcher, features_at
+from .landmark_files import NearnessMatcher, features_at
 
 # Distance between rows.
 STEP_M: Final = SPEED_MPS * ROW / SECOND

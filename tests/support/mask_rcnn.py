@@ -1,4 +1,4 @@
-"""Small Mask R-CNN checkpoints with random weights, and tiny labelled pictures."""
+"""Small Mask R-CNN networks, and torchvision's files of weights."""
 
 import json
 from functools import cache
@@ -8,6 +8,7 @@ from typing import Any, Final
 import cv2
 import numpy as np
 import torch
+from torchvision.models import detection
 
 from crosscue.detectors.base import Frame
 from crosscue.detectors.networks.mask_rcnn.checkpoint import Checkpoint, Facts
@@ -82,4 +83,28 @@ def write_bars(folder: Path, count: int) -> Path:
     }
     path = folder / "coco.json"
     path.write_text(json.dumps(tree), encoding="utf-8")
+    return path
+
+
+NAMES = ("car", "stop sign", "traffic light")
+
+
+def network(architecture: str, classes: int = 4, **more: Any) -> Any:
+    """A torchvision network with the same random weights in each call."""
+    torch.manual_seed(1)
+    make = getattr(detection, architecture)
+    return make(weights=None, weights_backbone=None, num_classes=classes, **more).eval()
+
+
+def hollow(architecture: str, classes: int) -> dict[str, torch.Tensor]:
+    """A state dict with names and shapes, in which one zero backs each tensor."""
+    with torch.device("meta"):
+        state = network(architecture, classes).state_dict()
+    return {name: torch.zeros(()).expand(value.shape) for name, value in state.items()}
+
+
+def class_names(folder: Path, names: tuple[str, ...] = NAMES) -> Path:
+    """Write a file of class names."""
+    path = folder / "names.txt"
+    path.write_text("\n".join(names), encoding="utf-8")
     return path

@@ -15,9 +15,9 @@ from crosscue.eval.fit.detector.class_fit import TRIED, bounded_threshold, fewes
 from crosscue.eval.scoring.boxes.reliability import class_calibration
 from crosscue.eval.scoring.intervals import lower_bound
 from crosscue.replay.errors import FitError, SchemaError, UsageError
-from support.lights import boxes, write_lights
 from support.onnx_models import constant_model, write_card
 from support.pictures import picture_log
+from support.sign_scenes import boxes, write_lights
 
 
 def test_lower_bound_equals_clopper_pearson() -> None:

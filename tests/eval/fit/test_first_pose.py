@@ -26,6 +26,8 @@ from crosscue.replay.columns import Block, Floats, Table, Topic
 from crosscue.replay.errors import EmptyResultError, VehicleError
 from crosscue.replay.vehicle.pose import Gnss, GnssUse, Odometry, Start
 from crosscue.replay.vehicle.vehicle import Vehicle
+from support.commands import output_of
+from support.gap_drive import Clock, replayed, write_drive
 from support.kitti_drive import raw_drive, true_path
 from support.memory_log import GYRO, WHEELS, MemoryLog, driven_blocks
 from support.street_map import write_crossing, write_lanelets, write_map
@@ -60,7 +62,7 @@ def straight_drive(speed_mps: float = SPEED_MPS, seconds: int = 30) -> MemoryLog
     return MemoryLog((WHEELS, GYRO, GNSS), blocks, path=Path(__file__))
 
 
-def replayed(folder: Path, vehicle: Vehicle) -> RunFolder:
+def replayed_with(folder: Path, vehicle: Vehicle) -> RunFolder:
     return replay_drive(Drive([straight_drive()], vehicle), create(folder, overwrite=False)).run
 
 
@@ -125,7 +127,7 @@ def test_fused_gnss_positions_bound_the_drift_of_odometry(tmp_path: Path) -> Non
     uses: tuple[GnssUse, ...] = ("start", "fuse")
     for use in uses:
         vehicle = with_start([straight_drive()], LONG_WHEELS, EVERYTHING, gnss=use)
-        run = replayed(tmp_path / use, vehicle)
+        run = replayed_with(tmp_path / use, vehicle)
         table = run.table("pose")
         origin = vehicle.start.map_origin
         assert origin is not None
@@ -140,7 +142,7 @@ def test_fused_gnss_positions_bound_the_drift_of_odometry(tmp_path: Path) -> Non
 
 def test_smoother_uses_gnss_positions_of_the_filter(tmp_path: Path) -> None:
     vehicle = with_start([straight_drive()], LONG_WHEELS, EVERYTHING, gnss="fuse")
-    run = replayed(tmp_path / "run", vehicle)
+    run = replayed_with(tmp_path / "run", vehicle)
     truth = truth_file(tmp_path / "truth")
 
     assert score_smoother(run, truth, {}).smoother_rmse_m < 1.0
@@ -208,3 +210,13 @@ def test_map_of_another_place_is_refused(tmp_path: Path) -> None:
         crosscue.truth_from_map(raw_drive(tmp_path / "kitti"), streets, tmp_path / "truth")
 
     assert not (tmp_path / "truth").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("by_s", [-7.0, -3600.0])
+def test_truth_of_log_with_clock_set_back_is_accepted(tmp_path: Path, by_s: float) -> None:
+    log, truth = write_drive(tmp_path, Clock(set_at_s=6.0, by_s=by_s)), tmp_path / "truth.json"
+
+    # The approach and its stop sign end at 11.6 s, the log's own clock at 6 or 7.
+    assert "outside    2 of them reach beyond the log" in output_of("check", truth, log)
+    output_of("score", replayed(tmp_path, log).path, "--truth", truth)

@@ -43,7 +43,7 @@ from support.gap_drive import (
     write_drive,
 )
 from support.gap_landmarks import STEP_M, PlaceByNumber
-from support.landmark_drive import features_at
+from support.landmark_files import features_at
 from support.memory_log import GYRO, WHEELS, MemoryLog, gyro_block, wheel_block
 from support.refusals import refusal
 

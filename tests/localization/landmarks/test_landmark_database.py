@@ -19,7 +19,7 @@ from crosscue.localization.landmarks.database import (
 )
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import LogError, LogFormatError, OutputError
-from support.child import python
+from support.commands import python
 from support.landmark_files import database_of, place_at, some_features
 
 

@@ -31,8 +31,15 @@ from crosscue.replay.columns import Floats
 from crosscue.replay.errors import UsageError
 from support.beliefs import joseph
 from support.data import shared
-from support.landmark_drive import PlaceMeasurements, features_at, landmarks_along, search_in
-from support.landmark_files import seen_from, some_features, wall
+from support.landmark_files import (
+    PlaceMeasurements,
+    features_at,
+    landmarks_along,
+    search_in,
+    seen_from,
+    some_features,
+    wall,
+)
 from support.simulated_drive import TRACK_M, Truth, compass, drive, gyro, nees_of, wheels
 
 ODOMETRY = OdometrySettings(

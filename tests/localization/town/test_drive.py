@@ -44,7 +44,7 @@ from crosscue.localization.town.streets import (
 )
 from crosscue.replay.columns import Floats
 from crosscue.replay.compiled import compile_function, fingerprint
-from support.arc_consistency import nees_along_the_arc
+from support.beliefs import nees_along_the_arc
 
 FIELD = {name: i for i, name in enumerate(DriveResult._fields)}
 TOWN = City(largest_km2=3.0)

@@ -19,8 +19,10 @@ from crosscue.replay.mobileye.settings import MobileyeSettings
 from support.can_layouts import join
 from support.mobileye_frames import (
     MS,
+    TOPIC_TYPES,
     block_of,
     frames,
+    messages_of,
     random_drive,
     random_words,
     status,
@@ -28,7 +30,6 @@ from support.mobileye_frames import (
     triple,
     values,
 )
-from support.mobileye_ros import TOPIC_TYPES, messages_of
 
 ROTATED = MobileyeSettings(mounting=DevicePosition(1.85, -0.1, 0.02))
 UNROTATED = MobileyeSettings(mounting=DevicePosition(1.85, -0.1))

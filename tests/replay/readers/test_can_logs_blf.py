@@ -13,17 +13,19 @@ from crosscue.replay.base import Selection
 from crosscue.replay.columns import ERROR
 from crosscue.replay.ledger import NOT_ASKED_TIME
 from support.can_files import (
+    KINDS,
     START_NS,
+    Kind,
     Sent,
     assert_equal_to_python_can,
     blf,
     by_bus,
     damaged,
+    judge,
     python_can_message,
     random_frames,
     read_back,
 )
-from support.can_kinds import KINDS, Kind, judge
 from support.data import shared
 from support.trees import written
 
