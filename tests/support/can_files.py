@@ -171,8 +171,8 @@ def blf(
     times, count = ((*start, *stop), len(frames)) if is_closed else ((0,) * 16, 0)
     size = 144 + len(body) if is_closed else 144
     # Size of the header, application, its version, and BLF's; sizes, objects, and times.
-    head = (b"LOGG", 144, *(5, 0, 0, 0), *(2, 6, 8, 1))
-    header = struct.pack("<4sL8BQQLL16H", *head, size, 144 + len(content), count, 0, *times)
+    opening = (b"LOGG", 144, *(5, 0, 0, 0), *(2, 6, 8, 1))
+    header = struct.pack("<4sL8BQQLL16H", *opening, size, 144 + len(content), count, 0, *times)
     return header.ljust(144, b"\0") + body
 
 

@@ -6,7 +6,7 @@ from typing import Final
 from crosscue.eval import cli
 from support.coco import stop_signs
 from support.failures import table_of_failures
-from support.gap_drive import BEGIN, BUS, Clock, replayed, write_drive
+from support.gap_drive import BEGIN, BUS, ROW, SIZE, Clock, replayed, write_drive
 from support.landmark_files import empty_database
 from support.mcap_files import McapFile
 from support.onnx_models import bright_box_model
@@ -72,8 +72,10 @@ def valid_inputs(folder: Path) -> dict[str, Path]:
     for place in ("images", "masks"):
         (photos / place).mkdir(parents=True)
         for number in range(2):
-            (photos / place / f"{number}.png").write_bytes(picture(number, width=64, height=48))
-    (photos / "coco.json").write_text(stop_signs([("0.png", 0), ("1.png", 1)], (64, 48)))
+            (photos / place / f"{number}.png").write_bytes(
+                picture(number, width=SIZE[0], height=SIZE[1])
+            )
+    (photos / "coco.json").write_text(stop_signs([("0.png", BEGIN), ("1.png", BEGIN + ROW)], SIZE))
     (photos / "labels.csv").write_text("picture,label,x0,y0,x1,y1\nimages/0.png,stop,1,1,9,9\n")
     (photos / "places.csv").write_text("image,x_m,y_m,sd_m\n0.png,0,0,1\n")
     (photos / "pairs_m.csv").write_text(
