@@ -30,6 +30,9 @@ def _empty_cases(*first_words: str) -> list[tuple[int, str]]:
     ]
 
 
+WITHOUT_RESULT: Final = {f"{name} {line}" for name, line in COMMANDS.items()}
+
+
 def _all_four(log: str) -> list[tuple[int, str]]:
     return [
         (4, f"replay {log} -o {{out}} --vehicle {{car}}"),
@@ -110,7 +113,7 @@ EMPTY: Final[dict[str, list[tuple[int, str]]]] = {
     "`vehicle init`, `check`": _empty_cases("vehicle", "check"),
     "`check` of a log": [(1, "check {can_log}"), (3, "check {log} --vehicle {car} --for cues")],
     "`check` of a model": [(3, "check {net} --picture {white}")],
-    "`merge`": _empty_cases("merge"),
+    "`merge`": _empty_cases("merge", "browse", "export"),
     "`info`, `query`": [
         (0, "info {rowless}"),
         (3, "info {nothing_whole}"),
@@ -223,9 +226,14 @@ def test_commands_return_documented_exit_status(
 
     for number, (status, line) in enumerate(cases):
         argv = line.format(**names, out=tmp_path / f"out{number}").split()
-        got, error = cli.run(argv), capsys.readouterr().err
+        before = {*tmp_path.rglob("*"), *names["run"].rglob("*")}
+        got, (out, error) = cli.run(argv), capsys.readouterr()
         if got != status or "bug" in error or (got != 3 and error.count("\n") > 1):
             found[line] = (got, error)
+        # Valid input without a result: one line, and no files.
+        if line in WITHOUT_RESULT:
+            assert {*tmp_path.rglob("*"), *names["run"].rglob("*")} == before, line
+            assert (out, error[:10], error.count("\n")) == ("", "crosscue: ", 1), line
 
     assert not found
     assert stated <= {status for status, _ in cases}

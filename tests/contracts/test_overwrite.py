@@ -15,19 +15,22 @@ import pytest
 from crosscue.datasets.scenes.drive import MADE_OF
 from crosscue.datasets.scenes.rendering.camera import SceneCamera
 from crosscue.datasets.scenes.settings import SceneSettings
+from crosscue.datasets.simulated.drive import DriveSettings
+from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.eval import cli
-from crosscue.eval.runs.folder import RunFolder, own_files
+from crosscue.eval.runs.folder import MANIFEST, RunFolder, own_files
 from crosscue.eval.runs.owned import files_in
 from crosscue.replay.errors import OutputError
 from crosscue.replay.files.made_of import made_of
 from crosscue.replay.files.tree_text import strict_json
 from support.coco import stop_signs
+from support.commands import output_of
 from support.empty_inputs import empty_inputs
 from support.failures import table_of_failures
-from support.pictures import picture
+from support.pictures import picture, picture_folder
 from support.refusals import refusal
 from support.scenes import shorten
-from support.trees import tree
+from support.trees import contents, tree
 
 REPLAY: Final = "replay {log} -o {out} --vehicle {car} --no-cache"
 DETECT: Final = "detect {log} -o {out} --vehicle {car} --detectors grey --no-cache --draw 3"
@@ -359,3 +362,47 @@ def test_drive_without_recorded_inputs_is_not_overwritten(tmp_path: Path) -> Non
     argv = ["simulate", "A", "-o", tmp_path, "--width", "64", "--overwrite"]
     assert "its inputs are not recorded" in refusal(2, *argv)
     assert (tmp_path / "A-01" / "drive.mcap").read_bytes() == b"recorded"
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> DriveFiles:
+    folder = tmp_path_factory.mktemp("drive")
+    return write_drive(folder, DriveSettings(seed=3, blocks=1, block_m=60.0))
+
+
+@pytest.mark.parametrize("command", ["replay", "estimate", "decode", "detect"])
+def test_finished_run_is_unchanged_if_next_result_is_empty(
+    drive: DriveFiles, tmp_path: Path, command: str
+) -> None:
+    out, car = tmp_path / "out", tmp_path / "car.toml"
+    first = "replay" if command == "estimate" else command
+    log, flags = str(drive.log), ["--vehicle", str(drive.vehicle), "-o", str(out)]
+    if command == "detect":
+        log = str(picture_folder(tmp_path / "front", 3, "rate_hz: 10\n"))
+        flags = ["--detectors", "signs", "--no-cache", "-o", str(out)]
+    assert cli.run([first, log, *flags]) == 0
+    before = contents(out)
+    car.write_text("version = 1\n")
+    argv = ["--overwrite", "--from", "100000", *flags]
+
+    if command == "estimate":
+        refusal(1, "estimate", out, "--vehicle", car)
+    else:
+        refusal(1, command, log, *argv)
+
+    assert contents(out) == before
+
+
+def test_overwritten_run_contains_only_new_files(drive: DriveFiles, tmp_path: Path) -> None:
+    out, fresh = tmp_path / "out", tmp_path / "fresh"
+    argv = ["replay", str(drive.log), "--vehicle", str(drive.vehicle)]
+    assert cli.run([*argv, "-o", str(out)]) == 0
+    (out / "score").mkdir()
+    (out / "cues.parquet").write_bytes(b"")
+    message = output_of(*argv, "-o", out, "--overwrite", "--to", "5", "--json")
+    assert cli.run([*argv, "-o", str(fresh), "--to", "5"]) == 0
+
+    assert json.loads(message)["run"] == str(out)
+    timed = {MANIFEST, "timings.json"}
+    kept = {name: data for name, data in contents(out).items() if name not in timed}
+    assert kept == {name: data for name, data in contents(fresh).items() if name not in timed}

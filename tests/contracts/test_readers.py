@@ -18,8 +18,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.testing import check_dataset, check_reader
 from support.every_format import EVERY_FORMAT
-from support.kitti_drive import raw_drive
-from support.kitti_odometry_drive import kitti_odometry_drive
+from support.kitti_drive import kitti_odometry_drive, raw_drive
 from support.mcap_files import MAGIC, McapFile, channel, message, schema
 from support.nuscenes_drive import nuscenes_drive
 from support.one_row import ONE_ROW

@@ -361,14 +361,6 @@ def test_picture_of_another_size_than_annotated_is_refused(tmp_path: Path) -> No
 MASK_HEAD = ("roi_heads.mask_head.", "roi_heads.mask_predictor.")
 
 
-def _without_masks(path: Path, every: int = 1) -> None:
-    """Remove the mask of each annotation, or of every ``every``-th."""
-    tree = json.loads(path.read_text())
-    for row in tree["annotations"][::every]:
-        row.pop("segmentation", None)
-    path.write_text(json.dumps(tree))
-
-
 def _mask_head(network: Any) -> dict[str, torch.Tensor]:
     return {
         name: value.clone()
@@ -391,7 +383,10 @@ def test_previously_trained_mask_head_keeps_its_masks(tmp_path: Path) -> None:
     )
     first = crosscue.train_mask_rcnn(masked, tmp_path / "first.safetensors")
     bare = write_bars(tmp_path / "b", 2)
-    _without_masks(bare)
+    tree = json.loads(bare.read_text())
+    for row in tree["annotations"]:
+        del row["segmentation"]
+    bare.write_text(json.dumps(tree))
     later = replace(masked, data=bare, images=tmp_path / "b" / "images", init=first.path)
 
     second = crosscue.train_mask_rcnn(later, tmp_path / "second.safetensors")

@@ -419,23 +419,6 @@ def test_published_presence_is_not_withdrawn_by_dissent() -> None:
     assert steps[-1].probabilities["left"] == pytest.approx(for_it / (for_it + against))
 
 
-def test_crawling_car_keeps_one_approach_until_passed() -> None:
-    slow = run_steps(drive(40.0, -20.0, {"stop_sign": (40.0, 1)}, step_m=0.02))
-
-    numbers = {one.approach for one in slow if one.approach is not None}
-    assert numbers == {1}
-    assert slow[-1].approach is None
-    assert max(p for one in slow for p in one.probabilities.values()) < 1.0
-
-
-def test_continuous_road_cue_is_split_into_approaches_of_max_length() -> None:
-    loop = approaches()
-
-    run_steps([frame(i, 1.0, road_left=1) for i in range(1000)], loop)
-
-    assert loop.counts["approaches closed: too long"] == 9
-
-
 def test_isolated_false_detections_never_establish_presence() -> None:
     loop = approaches()
     noise = [frame(i, 1.0, road_left=int(i % 50 == 0)) for i in range(500)]
@@ -454,15 +437,6 @@ def test_gate_stays_closed_until_presence_is_established() -> None:
     assert shut.probabilities == pytest.approx(
         {"intersection": 0.5, "left": 0.77, "right": 0.5, "straight": 0.5}
     )
-
-
-def test_dissent_begins_within_20_m_of_intersection() -> None:
-    taken = run_steps(drive(40.0, 10.0, {"stop_sign": (40.0, 1)}))
-    by_range = {round(one.ranges[0].range_m): one.probabilities["left"] for one in taken}
-
-    assert by_range[21] == 0.5
-    assert by_range[20] == pytest.approx(0.49**3 / (0.49**3 + 0.51**3))
-    assert by_range[10] < by_range[15] < by_range[20]
 
 
 def test_past_cues_receive_start_range_and_are_counted() -> None:

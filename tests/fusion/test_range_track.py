@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from crosscue.fusion.intersection_range import (
     RangeBelief,
     initialise,
-    nis,
     predict,
     smooth_ranges,
     update,
@@ -29,14 +28,6 @@ from crosscue.replay.vehicle.fusion import RangeFilter
 METRES = st.floats(-200.0, 200.0)
 VARIANCES = st.floats(0.01, 400.0)
 FEW_EXAMPLES = settings(max_examples=60, deadline=None)
-
-
-def test_first_measurement_initialises_belief() -> None:
-    assert initialise(31.0, 0.5) == RangeBelief(31.0, 0.5)
-
-
-def test_nis_uses_sum_of_both_variances() -> None:
-    assert nis(RangeBelief(20.0, 6.0), 24.0, 2.0) == pytest.approx(2.0)
 
 
 @FEW_EXAMPLES

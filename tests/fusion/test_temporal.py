@@ -473,17 +473,6 @@ def test_lapse_mixes_prior_into_probabilities() -> None:
     assert careful.probabilities()[1] <= careful.probabilities()[0]
 
 
-def test_stationary_car_gains_no_evidence_from_repeated_pictures() -> None:
-    belief = TemporalFilter(temporal_model(GRAPH, learned()))
-    belief.update({"sign": 1}, moved_m=2.0, passed_s=0.1)
-    before = belief.probabilities()[0]
-
-    for _ in range(100):
-        belief.update({"sign": 1}, passed_s=0.1, is_new_picture=False)
-
-    assert belief.probabilities()[0] == pytest.approx(before)
-
-
 def frame(number: int, sign: int, range_m: float | None = None) -> FrameEvidence:
     signs = () if range_m is None else (SignRange(Reference.START, range_m, 4.0),)
     return FrameEvidence(

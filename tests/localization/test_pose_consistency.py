@@ -23,7 +23,6 @@ from crosscue.localization.odometry import (
 )
 from crosscue.localization.pose_filter import major_axis_m
 from crosscue.localization.pose_track import (
-    NO_HEADINGS,
     Advance,
     Headings,
     TrackCounts,
@@ -198,19 +197,6 @@ def test_windowed_track_is_bit_identical(
     np.testing.assert_array_equal(last_of_parts.belief.cov, last.belief.cov)
     assert counts_of_parts == counts
     assert counts.headings_accepted > 0
-
-
-def test_missing_compass_raises_the_heading_variance() -> None:
-    with_compass, truth = run(3, EVERY_READING)
-    rng = np.random.default_rng(3)
-    truth = drive(rng)
-    made = integrate(wheels(truth, ODOMETRY, rng), ODOMETRY, gyro(truth, ODOMETRY, rng)).increments
-    first = TrackState(draw_start(truth, np.random.default_rng(3)))
-    without = advance_pose(first, made, EVERY_READING, NO_HEADINGS, truth.t_ns[::200])
-
-    assert len(without.poses) == len(with_compass.poses)
-    assert without.poses.cov_xyh[-1, 5] > with_compass.poses.cov_xyh[-1, 5]
-    assert without.counts.headings == 0
 
 
 def straight(n: int = 11, speed: float = 10.0, first_ns: int = 0) -> Increments:

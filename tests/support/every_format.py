@@ -10,8 +10,7 @@ import can
 import numpy as np
 
 from support.can_files import Sent, asc, blf, candump, python_can_message, random_frames, trc
-from support.kitti_drive import raw_drive
-from support.kitti_odometry_drive import kitti_odometry_drive
+from support.kitti_drive import kitti_odometry_drive, raw_drive
 from support.nuscenes_drive import nuscenes_drive
 from support.openpilot_drive import openpilot_drive
 from support.pandaset_drive import pandaset_drive

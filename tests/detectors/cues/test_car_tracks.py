@@ -180,23 +180,6 @@ def test_moving_car_counts_as_crossing_to_its_side(
     assert not parked(last, RULES)
 
 
-def test_mirrored_drive_has_mirrored_car_speeds() -> None:
-    steps = steady(8, turned_rad=0.01)
-    mirrored = [one._replace(turned_rad=-one.turned_rad) for one in steps]
-
-    *_, last = drive([Car(35.0, -4.0, 7.0), Car(30.0, 6.0)], steps)
-    *_, other = drive([Car(35.0, 4.0, -7.0), Car(30.0, -6.0)], mirrored)
-
-    assert [one.right_mps for one in other] == pytest.approx([-one.right_mps for one in last])
-
-
-@pytest.mark.parametrize("ahead_mps", [-14.0, 8.0, 14.0])
-def test_oncoming_and_outgoing_cars_neither_cross_nor_park(ahead_mps: float) -> None:
-    for cars in drive([Car(45.0, -3.5, ahead_mps=ahead_mps)], steady(12)):
-        assert not crossing(cars, RULES)
-        assert not parked(cars, RULES)
-
-
 def test_growing_box_of_an_occluded_car_does_not_cross() -> None:
     tracks = CarTracks(CAMERA, RULES)
     for i in range(10):
@@ -216,15 +199,6 @@ def test_distant_parked_car_is_recognised_over_more_frames(
 
     assert not parked(last, RULES)
     assert bool(parked(tracks.standing(), RULES)) == is_parked
-
-
-@given(bearing=st.floats(-0.9, 0.9))
-def test_car_parallel_to_the_street_is_not_parked(bearing: float) -> None:
-    # Length of the outline at this bearing: the car's length is foreshortened, its width is not.
-    long = (CAR_LENGTH_M * abs(bearing) + 1.8) / CAR_HEIGHT_M
-    car = CarMotion(1, 10, 30.0, bearing, 0.0, 0.1, 0.0, 0.5, True, long, 1.0)
-
-    assert not parked([car], RULES)
 
 
 def past(car: Car, steps: Sequence[CarStep], place: Place | None) -> Ways | None:
@@ -268,11 +242,6 @@ def test_bearing_shows_an_oncoming_car_earlier_than_growth() -> None:
 @given(steps=ego_motions, car=standing)
 def test_stationary_car_is_neither_oncoming_nor_outgoing(steps: list[CarStep], car: Car) -> None:
     assert not sum(past(car, steps, Place(1.0, 2.0, 0.1)) or ())
-
-
-def test_turning_crossing_and_lateral_cars_do_not_count_past() -> None:
-    for car in (Car(60.0, -5.0, 8.0, -8.0), Car(60.0, 20.0, 0.0, -10.0), Car(50.0, 0.0, 9.0)):
-        assert past(car, steady(15), Place(5.0, 10.0, 1.0)) == Ways(0, 0)
 
 
 def test_car_rules_default_to_pairs_only_for_the_simulated_car() -> None:

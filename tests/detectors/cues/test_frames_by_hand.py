@@ -718,13 +718,3 @@ def test_dropped_detection_overlaps_a_kept_one_of_another_detector(results: list
                 and boxes[other].scores[j] >= one.scores[i]
                 for j in range(len(boxes[other]))
             )
-
-
-@given(OBJECTS)
-def test_identical_second_detector_is_dropped_completely(things: Shown) -> None:
-    one = objects_of(things)
-
-    first, second = same_objects((one, one), label_meanings(VEHICLE), (False, False))
-
-    assert (first == KEPT).all()
-    assert (second == 0).all()

@@ -350,13 +350,6 @@ def _sides(before: CarShapes, now: CarShapes) -> tuple[Sides, Sides]:
     return cross_traffic(pairs, STRICT), parked_cars(pairs, STRICT)
 
 
-@pytest.mark.parametrize(("nose", "expected"), [(-1, Sides(1, 0)), (1, Sides(0, 1))])
-def test_parked_car_counts_on_the_side_of_its_nose(nose: int, expected: Sides) -> None:
-    before, now = _shapes(_car(200, nose, 0)), _shapes(_car(200, nose, 10**8))
-
-    assert _sides(before, now) == (Sides(0, 0), expected)
-
-
 @given(
     x=st.integers(60, 220),
     dx=st.integers(-25, 25),

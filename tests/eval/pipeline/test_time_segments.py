@@ -71,39 +71,10 @@ def _moved(blocks: Sequence[Block], at_ns: int, by_ns: int) -> list[Block]:
     ]
 
 
-def _part(blocks: Sequence[Block], first: int = 0, last: int = 1 << 62) -> list[Block]:
-    return [b.take((b.log_ns >= first) & (b.log_ns < last)) for b in blocks]
-
-
 def _replay(path: Path, blocks: Sequence[Block], vehicle: Vehicle | None = None) -> Outcome:
     log = MemoryLog((WHEELS, GYRO), [b for b in blocks if len(b)], path=Path(__file__))
     vehicle = vehicle or Vehicle(version=1, start=Start(heading_rad=0.0))
     return replay_drive(Drive([log], vehicle), create(path, overwrite=True))
-
-
-@pytest.mark.slow
-@settings(max_examples=10, phases=[Phase.explicit, Phase.reuse, Phase.generate])
-@given(
-    cut=st.integers(25, 175),
-    offset_ns=st.integers(0, ROW - 1),
-    by_ms=st.one_of(st.integers(-4_000_000, -350), st.integers(1_100, 4_000_000)),
-    rows_a_block=st.sampled_from([3, 7, 50, 200]),
-)
-def test_distance_around_any_clock_jump_is_sum_of_halves(
-    tmp_path: Path, cut: int, offset_ns: int, by_ms: int, rows_a_block: int
-) -> None:
-    blocks = _drive(rows_a_block=rows_a_block)
-    cut_ns = BEGIN + cut * ROW + offset_ns
-    halves = [
-        _replay(tmp_path / "half", part)
-        for part in (_part(blocks, last=cut_ns), _part(blocks, first=cut_ns))
-    ]
-    alone = [half.travelled_m for half in halves]
-
-    jumped = _replay(tmp_path / "whole", _moved(blocks, cut_ns, by_ms * 1_000_000))
-
-    assert len(jumped.segments) == 2
-    assert jumped.travelled_m == pytest.approx(sum(alone), abs=1e-9)
 
 
 @pytest.mark.parametrize("by_s", [1000, -900])

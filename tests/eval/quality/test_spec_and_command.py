@@ -19,7 +19,7 @@ from crosscue.replay.errors import UnknownFormatError, UsageError
 from crosscue.replay.logs.log_summary import LogSummary, copies, summarise_log
 from crosscue.replay.losses import losses_heard
 from support.commands import output_of
-from support.kitti_odometry_drive import kitti_odometry_drive
+from support.kitti_drive import kitti_odometry_drive
 from support.quality_logs import Drive, Streams, log_of, streams_of
 
 
