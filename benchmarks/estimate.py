@@ -29,7 +29,7 @@ from crosscue.detectors.base import Detections, DetectorChoice, Found, Frame, Vi
 from crosscue.detectors.catalog.known_models import OBJECTS, ROAD
 from crosscue.detectors.cues.road_area import RoadArea
 from crosscue.detectors.cues.road_openings import RoadOpenings
-from crosscue.detectors.cues.tracked import tracks
+from crosscue.detectors.cues.tracked.motion import Windows
 from crosscue.detectors.images import Encoded, decode
 from crosscue.detectors.networks.box_model import BoxModel
 from crosscue.detectors.networks.picture_input import prepared
@@ -157,7 +157,8 @@ def counted(seconds: dict[str, float]) -> Iterator[None]:
         (RoadArea, "plan", "road area"),
         (RoadOpenings, "__call__", "road area"),
         (object_tracks, "range_from_motion", "ranges from motion"),
-        (tracks, "motions_of", "motion of cars"),
+        (Windows, "__init__", "motion of cars"),
+        (Windows, "motions", "motion of cars"),
     )
 
     def timed(function: Callable[..., Any], part: str) -> Callable[..., Any]:

@@ -167,9 +167,8 @@ class Detections:
         are_sure = np.asarray(self.scores > (MIN_SCORE if min_score is None else min_score))
         if not self.decisions:
             return are_sure
-        decided = np.array([one == ACCEPTED for one in self.decisions], np.bool_)
-        is_open = np.array([not one for one in self.decisions], np.bool_)
-        return np.where(is_open, are_sure, decided)
+        both = zip(self.decisions, are_sure.tolist(), strict=True)
+        return np.array([one == ACCEPTED if one else is_sure for one, is_sure in both], np.bool_)
 
     def with_min_scores(self, by_label: Mapping[str, float]) -> Self:
         """The same detections with their detector's thresholds, by label."""

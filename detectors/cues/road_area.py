@@ -243,13 +243,13 @@ def _shown(road: RoadMask, boxes_px: Floats, away_m: Floats, top: int = 0) -> ND
     keys.sort()
     starts, is_road = keys >> 1, (keys & 1).cumsum() & 1 > 0
     first = starts % height
-    stop = first + np.diff(starts, append=width * height)
+    stop = first + np.append(starts[1:], width * height) - starts
     # For each end of a run without road, first row that is not too far behind it.
     falling_m = np.maximum.accumulate(away_m[::-1])[::-1]
     until = np.searchsorted(BESIDE_M - np.minimum.accumulate(away_m), -falling_m)
     behind = np.where(is_road, 0, until.take(stop - 1))
-    edges = np.stack([first, np.minimum(np.maximum(behind, first), stop), stop], axis=1)
-    lengths = np.diff(np.maximum(edges, top), axis=1)
+    edges = np.maximum([first, np.minimum(np.maximum(behind, first), stop), stop], top)
+    lengths = (edges[1:] - edges[:-1]).T
     kinds = np.full(lengths.shape, SHOWS_BEHIND, np.uint8)
     kinds[:, 1] = np.where(is_road, SHOWS_ROAD, SHOWS_GROUND)
     framed = np.zeros((width + 2, height - top + 2), np.uint8)

@@ -13,6 +13,7 @@ the proportion of lights, a third, is taken off. So the score is used as it is, 
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -159,7 +160,7 @@ class ControlTracks:
 
 def _log_odds(score: float) -> float:
     kept = min(max(score, 1e-3), 1.0 - 1e-3)
-    return float(np.log(kept / (1.0 - kept)))
+    return math.log(kept / (1.0 - kept))
 
 
 def _other_sign(track: ObjectTrack) -> str | None:

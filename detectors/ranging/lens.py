@@ -31,6 +31,11 @@ HUES: Final[Mapping[Lens, tuple[tuple[int, int], ...]]] = {
     "yellow": ((11, 34),),
     "green": ((45, 105),),
 }
+# Number of the colour, from 1, by hue.
+_COLOURS: Final = np.zeros(256, np.uint8)
+for _number, _bands in enumerate(HUES.values(), 1):
+    for _low, _high in _bands:
+        _COLOURS[_low : _high + 1] = _number
 # Bounds of the spot's diameter over the box's width: 0.30 m of 0.35 m without a backplate and of
 # 0.60 m with one, with a margin for glare and blur.
 LENS_PER_WIDTH: Final = (0.2, 1.0)
@@ -62,9 +67,10 @@ def lens_of(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Lens:
     hue, saturation, value = cv2.split(cv2.cvtColor(crop, cv2.COLOR_BGR2HSV))
     is_lit = (saturation >= MIN_SATURATION) & (value >= MIN_VALUE)
     lit: dict[Lens, float] = {"dark": 0.0}
-    for colour, bands in HUES.items():
-        is_colour = np.any([(hue >= low) & (hue <= high) for low, high in bands], axis=0)
-        lit[colour] = _spot_px(is_lit & is_colour, min(width, height))
+    colours = np.asarray(cv2.LUT(hue, _COLOURS), np.uint8) * is_lit
+    for number, colour in enumerate(HUES, 1):
+        is_colour = colours == number
+        lit[colour] = _spot_px(is_colour, min(width, height)) if is_colour.any() else 0.0
     return max(lit, key=lambda colour: lit[colour])
 
 

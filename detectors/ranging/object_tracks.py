@@ -243,11 +243,12 @@ class ObjectTrack:
         """Predict the track to the next frame."""
         way_m, scale = motion.way_m or 0.0, 1.0
         if way_m:
-            scale = self.range_m / max(self.range_m - way_m, 0.1 * self.range_m, 1e-3)
+            range_m = self.range_m
+            scale = range_m / max(range_m - way_m, 0.1 * range_m, 1e-3)
         shift_px = self.lens.focal_px * math.tan(max(min(motion.turned_rad, 1.0), -1.0))
-        center = np.array([*self.lens.center_px, *self.lens.center_px])
-        self.box_px = center + (self.box_px - center) * scale
-        self.box_px += np.array([shift_px, 0.0, shift_px, 0.0])
+        (x, y), (x0, y0, x1, y1) = self.lens.center_px, self.box_px.tolist()
+        left, right = (x + (at - x) * scale + shift_px for at in (x0, x1))
+        self.box_px = np.array([left, y + (y0 - y) * scale, right, y + (y1 - y) * scale])
         self.height_px *= scale
         self.is_seen = False
         self.since_m += way_m

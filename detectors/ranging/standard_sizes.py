@@ -8,6 +8,7 @@ times as high as wide, those with one about twice.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -31,12 +32,12 @@ class SizePrior:
     @cached_property
     def log_var(self) -> float:
         """Variance of the logarithm."""
-        return float(np.log1p(self.spread**2))
+        return math.log1p(self.spread**2)
 
     @cached_property
     def log_mean(self) -> float:
         """Mean of the logarithm."""
-        return float(np.log(self.mean_m)) - 0.5 * self.log_var
+        return math.log(self.mean_m) - 0.5 * self.log_var
 
 
 class Housing(NamedTuple):
@@ -65,6 +66,7 @@ HOUSINGS: Final[Mapping[str, Housing]] = {
     "2 lenses of 0.30 m": Housing(0.71, 0.35, 0.02),
 }
 _COLUMNS: Final = np.array(list(HOUSINGS.values())).T.copy()
+_LOG_ASPECTS: Final = np.log(_COLUMNS[0] / _COLUMNS[1])
 # Spread of a box's aspect (height over width) about its housing's, in logarithms.
 ASPECT_SPREAD: Final = 0.15
 OBLIQUE: Final = 0.10
@@ -92,15 +94,16 @@ def light_size(aspect: float | None = None) -> SizePrior:
     Args:
         aspect: Positive; None where unknown, as for lights that are not upright.
     """
-    heights, widths, weights = _COLUMNS
+    heights, _, weights = _COLUMNS
     if aspect is not None:
-        off = np.log(aspect / (heights / widths)) / ASPECT_SPREAD
-        density = np.exp(-0.5 * off**2) / (ASPECT_SPREAD * np.sqrt(2.0 * np.pi))
+        off = (_LOG_ASPECTS - math.log(aspect)) / ASPECT_SPREAD
+        density = np.exp(-0.5 * off * off) / (ASPECT_SPREAD * math.sqrt(2.0 * math.pi))
         weights = weights * ((1.0 - OBLIQUE) * density + OBLIQUE / ANY_ASPECT)
-    weights = weights / weights.sum()
-    mean_m = float(weights @ heights)
-    spread = float(np.sqrt(weights @ (heights - mean_m) ** 2)) / mean_m
-    return SizePrior(mean_m, float(np.hypot(spread, BOX_SPREAD)))
+    whole = float(np.add.reduce(weights))
+    mean_m = float(weights.dot(heights)) / whole
+    off = heights - mean_m
+    spread = math.sqrt(float(weights.dot(off * off)) / whole) / mean_m
+    return SizePrior(mean_m, math.hypot(spread, BOX_SPREAD))
 
 
 def size_prior(cue: str, aspect: float | None = None) -> SizePrior:

@@ -377,8 +377,9 @@ class OtherVersionError(ValueError):
     """A manifest that another version of crosscue wrote."""
 
 
+@lru_cache(maxsize=4)
 def parse_manifest(content: bytes) -> Manifest:
-    """Parse the text of ``manifest.json``.
+    """Parse the text of ``manifest.json``; cached, as an estimate reads it several times.
 
     Raises:
         OtherVersionError: The manifest has another version, which the message states.

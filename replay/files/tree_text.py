@@ -148,7 +148,7 @@ def yaml_tree(text: str, scalars: Literal["safe", "base"] = "safe") -> Any:
 
 def strict_json(value: object) -> str:
     """Return JSON text with sorted keys; NaN and infinities become null, all text valid."""
-    return json.dumps(_finite(value), sort_keys=True, indent=2, allow_nan=False)
+    return _text(value, "\n")
 
 
 def spelled(name: str) -> str:
@@ -166,6 +166,8 @@ def unspelled(text: str) -> str:
 
 def valid_text(text: str) -> str:
     """Return a sentence that may contain file names, with bytes that are not UTF-8 escaped."""
+    if text.isascii():
+        return text
     return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
@@ -175,16 +177,21 @@ def _escape(found: re.Match[str]) -> str:
     return "".join(f"\\x{byte:02x}" for byte in os.fsencode(found[0]))
 
 
-def _finite(value: object) -> object:
+def _text(value: object, line: str) -> str:
+    """Return JSON text of which each line begins with ``line``; json itself indents slowly."""
+    inner = f"{line}  "
     if isinstance(value, str):
-        return valid_text(value)
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        return json.dumps(valid_text(value))
     if isinstance(value, Mapping):
-        return {valid_text(str(key)): _finite(item) for key, item in value.items()}
+        items = sorted({valid_text(str(key)): item for key, item in value.items()}.items())
+        rows = [f"{json.dumps(key)}: {_text(item, inner)}" for key, item in items]
+        return f"{{{inner}{f',{inner}'.join(rows)}{line}}}" if rows else "{}"
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return value
+        rows = [_text(item, inner) for item in value]
+        return f"[{inner}{f',{inner}'.join(rows)}{line}]" if rows else "[]"
+    if isinstance(value, float) and not math.isfinite(value):
+        return "null"
+    return json.dumps(value)
 
 
 def _branches(value: Any) -> list[Any]:

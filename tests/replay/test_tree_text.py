@@ -2,6 +2,7 @@
 
 import ast
 import json
+import math
 import os
 import shutil
 import signal
@@ -33,7 +34,7 @@ from crosscue.replay.errors import CrosscueError
 from crosscue.replay.files import partial_file
 from crosscue.replay.files.bounded import read_at_most
 from crosscue.replay.files.partial_file import PARTIAL, Scratch, sweep
-from crosscue.replay.files.tree_text import MAX_DEPTH, json_tree, toml_tree, yaml_tree
+from crosscue.replay.files.tree_text import MAX_DEPTH, json_tree, strict_json, toml_tree, yaml_tree
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.processes import in_processes
 from crosscue.replay.vehicle import vehicle
@@ -86,6 +87,21 @@ def test_json_within_depth_limit_equals_json_loads(value: object, around: int) -
         else:
             with pytest.raises(ValueError, match=f"nested over {MAX_DEPTH} levels"):
                 json_tree(form)
+
+
+@given(_VALUES | st.lists(st.floats() | st.booleans() | st.text(max_size=3)))
+def test_strict_json_is_sorted_and_indented_as_by_json(value: object) -> None:
+    """Numbers without a JSON form are null; other text is what ``json`` itself makes."""
+
+    def plain(one: object) -> object:
+        if isinstance(one, list):
+            return [plain(item) for item in one]
+        return None if isinstance(one, float) and not math.isfinite(one) else one
+
+    assert strict_json(value) == json.dumps(plain(value), sort_keys=True, indent=2)
+    assert strict_json({1: ("\udcff",), "a": {}}) == (
+        '{\n  "1": [\n    "\\\\xff"\n  ],\n  "a": {}\n}'
+    )
 
 
 def _depth(value: object) -> int:

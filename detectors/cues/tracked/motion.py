@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from statistics import median
+from struct import Struct
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ USUAL_MPS: Final = 10.0
 ALONG_ASIDE_MPS: Final = 0.3
 # Sum of squared residuals per degree of freedom above which the motion is not steady.
 MAX_MISFIT: Final = 4.0
+_NUMBERS: Final = Struct("8d")
 
 
 class Observation(NamedTuple):
@@ -113,10 +115,44 @@ def motions_of(
             vehicle's road. The change of bearing then determines the speed along the road far
             sooner than the change of size.
     """
-    if not cars:
-        return []
-    fits = zip(*(of.tolist() for of in _fit(cars, aside_mps)), strict=True)
-    return [_motion(seen, *fit) for seen, fit in zip(cars, fits, strict=True)]
+    numbers = [b"".join(map(numbers_of, seen)) for seen in cars]
+    return Windows(cars, numbers).motions(
+        [(i, len(seen)) for i, seen in enumerate(cars)], aside_mps
+    )
+
+
+def numbers_of(one: Observation) -> bytes:
+    """Return what the fit uses of an observation, as bytes, which join fast to an array."""
+    return _NUMBERS.pack(one.t_s, *one.pose, one.distance_m, one.error, *one.edges_rad)
+
+
+class Windows:
+    """Observations of C cars, prepared once for several fits of their motion.
+
+    Args:
+        cars: Observations of each car, oldest first.
+        numbers: The same by ``numbers_of``, joined for each car.
+    """
+
+    def __init__(
+        self, cars: Sequence[Sequence[Observation]], numbers: Sequence[bytes | bytearray]
+    ) -> None:
+        self._cars = cars
+        self._rows = _rows(cars, numbers) if cars else np.empty(0)
+
+    def motions(
+        self, windows: Sequence[tuple[int, int]], aside_mps: float = USUAL_MPS
+    ) -> list[CarMotion]:
+        """Fit as ``motions_of``, each time a car by its index to a number of newest observations.
+
+        All observations are used where there are fewer.
+        """
+        if not windows:
+            return []
+        seen = [self._cars[i][-frames:] for i, frames in windows]
+        rows = self._rows[[i for i, _ in windows]]
+        fits = zip(*(of.tolist() for of in _fit(rows, [*map(len, seen)], aside_mps)), strict=True)
+        return [_motion(one, *fit) for one, fit in zip(seen, fits, strict=True)]
 
 
 def _motion(
@@ -148,55 +184,60 @@ def _motion(
     )
 
 
+def _rows(
+    cars: Sequence[Sequence[Observation]], numbers: Sequence[bytes | bytearray]
+) -> NDArray[np.float64]:
+    """Equations of both ends of C cars, in the axes of the camera pose at the newest observation.
+
+    Returns:
+        Shape (C, 2, N, 2, 5), newest last: for each observation, an equation along its line of
+        sight, whose error is large, and one across it, in standard deviations. Its numbers are the
+        factors of the place ahead and to the right and of the speed in both directions, and the
+        right side. Shorter tracks are padded at the front with their oldest observation.
+    """
+    most = max(map(len, cars))
+    parts: list[bytes | bytearray] = []
+    for seen, mine in zip(cars, numbers, strict=True):
+        parts += (mine[: _NUMBERS.size] * (most - len(seen)), mine)
+    table = np.frombuffer(b"".join(parts)).reshape(len(cars), most, 8)
+    newest = table[:, -1:, :4]
+    late_s, x, y, heading = (table[:, :, :4] - newest).transpose(2, 0, 1)[:, :, None, :]
+    distance_m, error = table[:, None, :, 4], table[:, None, :, 5]
+    edge = np.swapaxes(table[:, :, 6:], 1, 2)
+    far_m, sight = distance_m / np.cos(edge), heading - edge
+    cos, sin = np.cos(newest[:, :, None, 3]), np.sin(newest[:, :, None, 3])
+    ahead_m, right_m = x * cos + y * sin, x * sin - y * cos
+    c, s = np.cos(sight), np.sin(sight)
+    rows = np.empty((*far_m.shape, 2, 5))
+    along, across = rows[..., 0, :], rows[..., 1, :]
+    along[..., 0], along[..., 1], along[..., 4] = c, -s, ahead_m * c - right_m * s + far_m
+    across[..., 0], across[..., 1], across[..., 4] = s, c, ahead_m * s + right_m * c
+    rows[..., 2:4] = rows[..., :2] * late_s[..., None, None]
+    along /= (error * far_m)[..., None]
+    across /= (error * CAR_HEIGHT_M)[..., None]
+    return rows
+
+
 def _fit(
-    cars: Sequence[Sequence[Observation]], aside_mps: float
+    rows: NDArray[np.float64], frames: Sequence[int], aside_mps: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Fit both ends of C cars, each in the axes of the camera pose at its newest observation.
+    """Fit both ends of C cars to a number of newest observations of each.
 
     Returns:
         Speed ahead and to the right of each end, shape (C, 2, 2), their standard deviations, and
         the misfit of each end, shape (C, 2).
     """
-    counts = np.array([len(seen) for seen in cars])
-    most = int(counts.max())
-    # Shorter tracks are padded with their newest observation, without weight.
-    values: list[float] = []
-    for seen in cars:
-        for one in seen:
-            values += (one.t_s, *one.pose, one.distance_m, one.error, *one.edges_rad)
-        values += (seen[-1].t_s, *seen[-1].pose, 1.0, 1.0, 0.0, 0.0) * (most - len(seen))
-    table = np.array(values).reshape(len(cars), most, 8)
-    is_real = (np.arange(most) < counts[:, None])[:, None, :]
-    newest = table[np.arange(len(cars)), counts - 1, :4]
-    late_s, x, y, heading = (table[:, :, :4] - newest[:, None, :]).transpose(2, 0, 1)[:, :, None, :]
-    distance_m, error = table[:, None, :, 4], table[:, None, :, 5]
-    edge = np.swapaxes(table[:, :, 6:], 1, 2)
-    far_m, sight = distance_m / np.cos(edge), heading - edge
-    cos, sin = np.cos(newest[:, 3, None, None]), np.sin(newest[:, 3, None, None])
-    c, s = np.cos(sight), np.sin(sight)
-    places = np.stack([x * cos + y * sin + far_m * c, x * sin - y * cos - far_m * s])
-    # Inverse covariances: the errors are large along the line of sight and small across it.
-    along, across = is_real / (error * far_m) ** 2, is_real / (error * CAR_HEIGHT_M) ** 2
-    turned = (across - along) * c * s
-    weights = np.array(
-        [[along * c**2 + across * s**2, turned], [turned, along * s**2 + across * c**2]]
-    )
-    powers = np.broadcast_to(late_s ** np.arange(3)[:, None, None, None], (3, *far_m.shape))
-    normal = np.einsum("abkin,mkin->mkiab", weights, powers)
-    weighted = np.einsum("abkin,bkin->akin", weights, places)
-    information = np.empty((*counts.shape, 2, 4, 4))
-    pulled = [np.einsum("akin,kin->kia", weighted, one) for one in powers[:2]]
-    for m in (0, 1):
-        information[..., 2 * m : 2 * m + 2, :2] = normal[m]
-        information[..., 2 * m : 2 * m + 2, 2:] = normal[m + 1]
-    information[..., (2, 3), (2, 3)] += (USUAL_MPS**-2, aside_mps**-2)
-    covariance = np.linalg.inv(information)
-    state = np.einsum("kiab,kib->kia", covariance, np.concatenate(pulled, axis=2))
-    predicted = state[..., :2, None] + state[..., 2:, None] * late_s[:, :, None, :]
-    off = places - predicted.transpose(2, 0, 1, 3)
-    squares = np.einsum("akin,abkin,bkin->ki", off, weights, off)
-    sd = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
-    return state[..., 2:], sd[..., 2:], squares / np.maximum(2 * counts - 4, 1)[:, None]
+    most, counts = max(frames), np.array(frames)
+    is_used = np.arange(most) >= (most - counts)[:, None]
+    used = (rows[:, :, -most:] * is_used[:, None, :, None, None]).reshape(len(frames), 2, -1, 5)
+    sums = used.swapaxes(2, 3) @ used
+    sums[..., (2, 3), (2, 3)] += (USUAL_MPS**-2, aside_mps**-2)
+    covariance = np.linalg.inv(sums[..., :4, :4])
+    state = covariance @ sums[..., :4, 4:]
+    off = used[..., :4] @ state - used[..., 4:]
+    squares = np.add.reduce(off * off, axis=(2, 3))
+    sd = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3)[..., 2:])
+    return state[..., 2:, 0], sd, squares / np.maximum(2 * counts - 4, 1)[:, None]
 
 
 def place_of_end(one: Observation, side: int, newest: Observation) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -25,7 +25,8 @@ from crosscue.detectors.cues.tracked.motion import (
     USUAL_MPS,
     CarMotion,
     Observation,
-    motions_of,
+    Windows,
+    numbers_of,
     place_of_end,
 )
 from crosscue.detectors.ranging.ground_plane import GroundPlane
@@ -72,7 +73,8 @@ class _Track:
     number: int
     box_px: NDArray[np.float64]
     edges_pxps: NDArray[np.float64]
-    seen: list[Observation] = field(default_factory=list)
+    seen: list[Observation]
+    numbers: bytearray
     step_px: tuple[float, float] = (0.0, 0.0)
 
     def take(self, box_px: NDArray[np.float64], one: Observation, settings: Cars) -> None:
@@ -81,13 +83,14 @@ class _Track:
         edges_pxps = steps_px / (one.t_s - self.seen[-1].t_s)
         is_first = len(self.seen) == 1
         self.edges_pxps += (1.0 if is_first else NEWEST) * (edges_pxps - self.edges_pxps)
-        self.step_px = (
-            0.5 * float(steps_px[0] + steps_px[2]),
-            0.5 * float(steps_px[1] + steps_px[3]),
-        )
+        x0, y0, x1, y1 = steps_px.tolist()
+        self.step_px = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
         self.box_px = box_px
         self.seen.append(one)
-        del self.seen[: -max(settings.max_frames, settings.parked_frames, settings.past_frames)]
+        self.numbers += numbers_of(one)
+        most = max(settings.max_frames, settings.parked_frames, settings.past_frames)
+        if len(self.seen) > most:
+            del self.numbers[: len(self.numbers) // len(self.seen)], self.seen[0]
 
 
 class CarTracks:
@@ -104,6 +107,7 @@ class CarTracks:
         self._farthest_m = max(settings.within_m, past_within_m(camera, settings))
         self._tracks: list[_Track] = []
         self._again: list[_Track] = []
+        self._windows = Windows([], [])
         self._axle = self._pose = (0.0, 0.0, 0.0)
         self._t_s = 0.0
         self._begun = 0
@@ -130,7 +134,10 @@ class CarTracks:
         within_m = self._settings.within_m
         self.seen = sum(one.is_sure and one.distance_m <= within_m for _, one in cars)
         self._again = [track for track in again if track.seen[-1].is_sure]
-        return _motions(self._again, [self._settings.max_frames] * len(self._again))
+        self._windows = Windows(
+            [track.seen for track in self._again], [track.numbers for track in self._again]
+        )
+        return self._motions([(i, self._settings.max_frames) for i in range(len(self._again))])
 
     def longer(self, wanted: Wanted = _any) -> list[CarMotion]:
         """Fit the same cars to their newest ``past_frames``, because distant cars grow slowly.
@@ -156,16 +163,29 @@ class CarTracks:
 
     def _steady(self, frames: int, wanted: Wanted, aside_mps: float) -> list[CarMotion]:
         shortest = self._settings.max_frames
-        tracks = [one for one in self._again if wanted(one.seen)]
-        found = _motions(tracks, [frames] * len(tracks), aside_mps)
+        cars = [(i, frames) for i, one in enumerate(self._again) if wanted(one.seen)]
+        found = self._motions(cars, aside_mps)
         while again := [
-            i for i, one in enumerate(found) if not one.is_steady and one.frames > shortest
+            k for k, one in enumerate(found) if not one.is_steady and one.frames > shortest
         ]:
-            fewer = [max(found[i].frames // 2, shortest) for i in again]
-            refitted = _motions([tracks[i] for i in again], fewer, aside_mps)
-            for i, one in zip(again, refitted, strict=True):
-                found[i] = one
+            fewer = [(cars[k][0], max(found[k].frames // 2, shortest)) for k in again]
+            for k, one in zip(again, self._motions(fewer, aside_mps), strict=True):
+                found[k] = one
         return found
+
+    def _motions(
+        self, windows: Sequence[tuple[int, int]], aside_mps: float = USUAL_MPS
+    ) -> list[CarMotion]:
+        """Fit the motion of cars of the newest frame, each to a number of its newest frames."""
+        return [
+            found._replace(
+                number=track.number, box_px=tuple(track.box_px.tolist()), step_px=track.step_px
+            )
+            for found, (i, _) in zip(
+                self._windows.motions(windows, aside_mps), windows, strict=True
+            )
+            for track in (self._again[i],)
+        ]
 
     def _observed(
         self, found: Sequence[Detections]
@@ -235,7 +255,9 @@ class CarTracks:
         for i, (box, one) in enumerate(cars):
             if i not in used and one.is_sure:
                 self._begun += 1
-                self._tracks.append(_Track(self._begun, box, np.zeros(4), [one]))
+                self._tracks.append(
+                    _Track(self._begun, box, np.zeros(4), [one], bytearray(numbers_of(one)))
+                )
         return again
 
     def _predicted(
@@ -244,13 +266,9 @@ class CarTracks:
         """Boxes that overlap a predicted box: cost, index of the box and of the track."""
         if not cars or not self._tracks:
             return []
-        late_s = [self._t_s - track.seen[-1].t_s for track in self._tracks]
-        boxes_px = np.array(
-            [
-                track.box_px + late * track.edges_pxps
-                for track, late in zip(self._tracks, late_s, strict=True)
-            ]
-        )
+        late_s = np.array([[self._t_s - track.seen[-1].t_s] for track in self._tracks])
+        boxes_px = np.array([track.box_px for track in self._tracks])
+        boxes_px += late_s * np.array([track.edges_pxps for track in self._tracks])
         overlap = box_ious(boxes_px[:, None], np.array([box for box, _ in cars]))
         last_m = np.array([track.seen[-1].distance_m for track in self._tracks])
         grown = np.array([one.distance_m for _, one in cars]) / last_m[:, None]
@@ -287,19 +305,6 @@ def are_hidden(boxes_px: NDArray[np.float64], are_sure: NDArray[np.bool_]) -> li
     lower = y1 > (y1 + BOX_FRACTION * (y1 - y0))[:, None]
     is_covered = are_sure & lower & (y0 < y1[:, None]) & (shared > MAX_COVERED * (x1 - x0)[:, None])
     return [bool(one) for one in is_covered.any(axis=1)]
-
-
-def _motions(
-    tracks: Sequence[_Track], frames: Sequence[int], aside_mps: float = USUAL_MPS
-) -> list[CarMotion]:
-    """Fit the motion of each track to its newest frames, of a number for each track."""
-    seen = [track.seen[-number:] for track, number in zip(tracks, frames, strict=True)]
-    return [
-        found._replace(
-            number=track.number, box_px=tuple(track.box_px.tolist()), step_px=track.step_px
-        )
-        for track, found in zip(tracks, motions_of(seen, aside_mps), strict=True)
-    ]
 
 
 def _moved(axle: tuple[float, float, float], motion: CarStep) -> tuple[float, float, float]:

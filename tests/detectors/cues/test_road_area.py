@@ -11,20 +11,25 @@ from numpy.typing import NDArray
 from crosscue.detectors import rle
 from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues.road_area import (
+    ASIDE_M,
     BESIDE_M,
     CELL_M,
     CELLS,
     HALF_M,
     HIDDEN,
+    NEAREST_M,
+    SHARP_M,
     SHOWS_BEHIND,
     SHOWS_GROUND,
     SHOWS_ROAD,
+    WEIGHTS,
     RoadArea,
     RoadPlan,
     _shown,
     reach_of,
 )
 from crosscue.detectors.cues.road_openings import Legs, RoadOpenings, Seen
+from crosscue.detectors.ranging.ground_plane import GroundPlane
 from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.camera import Camera
 
@@ -122,6 +127,46 @@ def test_plan_shows_the_cells_of_the_grid_below(turn_rad: float) -> None:
     expected = np.where(seen >= 0.05, area._road[cells] / seen, np.nan)
     # A place on the border of two cells may be either's.
     assert np.isclose(plan.road, expected, equal_nan=True).mean() > 0.9999
+
+
+@pytest.mark.parametrize(
+    ("yaw_rad", "roll_rad", "pitch_rad", "turn_rad"),
+    [(0.0, 0.0, 0.0, 0.0), (0.3, 0.02, 0.01, 0.7), (-1.2, -0.03, -0.01, -2.4)],
+)
+def test_each_cell_of_the_ground_in_reach_takes_what_its_pixel_shows(
+    yaw_rad: float, roll_rad: float, pitch_rad: float, turn_rad: float
+) -> None:
+    """Every cell is projected alone; by rounding, a cell at the border of pixels may differ."""
+    at = {"yaw_rad": yaw_rad, "roll_rad": roll_rad, "y_m": 0.4}
+    camera = CAMERA.model_copy(update=at)
+    area, boxes_px = RoadArea(camera, 30.0), np.array([[300.0, 150.0, 420.0, 376.0]])
+    area.move(7.3, turn_rad)
+    road = mask(crossing, Pose(25.0), flipped=0.05)
+
+    area.see(road, boxes_px, pitch_rad)
+
+    x_m, y_m = 7.3 * math.cos(0.5 * turn_rad), 7.3 * math.sin(0.5 * turn_rad)
+    middles_m = (np.arange(CELLS) + 0.5) * CELL_M - HALF_M
+    east, north = np.meshgrid(middles_m - x_m, middles_m - y_m, indexing="ij")
+    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+    ground_m = np.column_stack(
+        [(east * cos + north * sin).ravel(), (north * cos - east * sin).ravel()]
+    )
+    plane = GroundPlane.of(camera.model_copy(update={"pitch_rad": pitch_rad}), SIZE_PX)
+    pixels = np.nan_to_num(np.floor(plane.project(ground_m) * 0.5), nan=-1.0).astype(int)
+    ahead_m, left_m = (ground_m - [1.0, 0.4]).T
+    is_in = (ahead_m > NEAREST_M) & (ahead_m < 30.0) & (np.abs(left_m + 0.4) < ASIDE_M)
+    is_in &= ((pixels >= 0) & (pixels < MASK_PX)).all(axis=1)
+    rows_px = (np.arange(MASK_PX[1]) + 0.5) * 2.0 - 183.0
+    above_px = 707.0 * math.cos(pitch_rad) - rows_px * math.sin(pitch_rad)
+    below = 707.0 * math.sin(pitch_rad) + rows_px * math.cos(pitch_rad)
+    shown = _shown(road, 0.5 * boxes_px, 1.65 * above_px / np.maximum(below, 1e-3))
+    kinds = np.where(is_in, shown[tuple(np.where(is_in[:, None], pixels + 1, 0).T)], HIDDEN)
+    far_m2 = np.maximum(ahead_m**2 + left_m**2, SHARP_M**2)
+    weight = WEIGHTS[kinds] * SHARP_M**2 / far_m2
+    assert (weight > 0.0).sum() > 1000
+    assert np.isclose(area._seen.ravel(), weight, rtol=1e-5).mean() > 0.9999
+    assert np.isclose(area._road.ravel(), weight * (kinds == SHOWS_ROAD), rtol=1e-5).mean() > 0.9999
 
 
 def straight(x: Floats, y: Floats) -> NDArray[np.bool_]:

@@ -297,6 +297,19 @@ def test_lit_lens_is_found_at_each_position(colour: str, at: int) -> None:
 
 
 @pytest.mark.parametrize(
+    ("hue", "lens"),
+    [(5, "red"), (170, "red"), (20, "yellow"), (75, "green"), (40, "dark"), (130, "dark")],
+)
+def test_colour_of_a_lens_is_that_of_its_hue(hue: int, lens: Lens) -> None:
+    picture = housing(None)
+    lit = np.full((1, 1, 3), (hue, 200, 220), np.uint8)
+    colour = cv2.cvtColor(lit, cv2.COLOR_HSV2BGR)[0, 0].tolist()
+    cv2.circle(picture, (32, 36), 7, colour, -1)
+
+    assert lens_of(picture, BOX) == lens
+
+
+@pytest.mark.parametrize(
     ("frame", "box", "lens"),
     [
         (0, (722, 292, 744, 339), "dark"),
