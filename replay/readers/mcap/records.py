@@ -61,6 +61,7 @@ MESSAGE_HEAD: Final = np.dtype(
 INDEX_ENTRY: Final = np.dtype([("log", "<u8"), ("offset", "<u8")])
 MESSAGE_FIXED: Final = MESSAGE_HEAD.itemsize - PREFIX.size
 _INDEX_HEAD: Final = struct.Struct("<HI")
+_INDEX_RECORD: Final = struct.Struct("<BQHI")
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 CHUNK_FIXED: Final = 40
 # Maximum size of a chunk record before its compressed records.
@@ -123,7 +124,8 @@ class Channel:
     converted_from: str = ""
 
 
-@dataclass(frozen=True, slots=True)
+# These are not frozen, because several are created for each chunk, which takes three times as long.
+@dataclass(slots=True)
 class ChunkHead:
     """The fields of a chunk record before its records.
 
@@ -146,7 +148,7 @@ class ChunkHead:
     body_size: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ChunkIndex:
     """The entry of a chunk in the summary; offsets count from the file's start."""
 
@@ -161,7 +163,7 @@ class ChunkIndex:
     size: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class MessageIndex:
     """Log times and offsets of a channel's messages within a chunk: ``count`` ``INDEX_ENTRY``s."""
 
@@ -255,6 +257,23 @@ def read_message_index(content: bytes | memoryview) -> MessageIndex:
     # A copy: a view would keep everything that was read with it.
     packed = bytes(content[_INDEX_HEAD.size : _INDEX_HEAD.size + size])
     return MessageIndex(channel_id, size // INDEX_ENTRY.itemsize, packed)
+
+
+def read_message_indexes(records: memoryview, max_bytes: int) -> tuple[list[MessageIndex], int]:
+    """Parse the whole MessageIndex records of up to ``max_bytes`` at the start, and their size."""
+    found: list[MessageIndex] = []
+    at, last = 0, len(records) - _INDEX_RECORD.size
+    while at <= last:
+        opcode, length, channel_id, size = _INDEX_RECORD.unpack_from(records, at)
+        begin, after = at + _INDEX_RECORD.size, at + PREFIX.size + length
+        if opcode != Op.MESSAGE_INDEX or length > max_bytes or after > len(records):
+            break
+        if size % INDEX_ENTRY.itemsize or size > after - begin:
+            break
+        packed = bytes(records[begin : begin + size])
+        found.append(MessageIndex(channel_id, size // INDEX_ENTRY.itemsize, packed))
+        at = after
+    return found, at
 
 
 def read_statistics(content: bytes | memoryview) -> Statistics:

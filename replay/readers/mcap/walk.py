@@ -45,6 +45,7 @@ from .records import (
     check_metadata,
     read_chunk_head,
     read_message_index,
+    read_message_indexes,
 )
 
 # Maximum number of bytes outside chunks read at once, unless one record is larger.
@@ -54,7 +55,7 @@ STOPS_A_RUN: Final = ~opcodes(Op.SCHEMA, Op.CHANNEL, Op.MESSAGE)
 SMALL: Final = 1 << 20
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class UnreadChunk:
     """A chunk that is not yet read, with the message indexes that follow it.
 
@@ -189,6 +190,7 @@ class Walk:
         self._chunks = chunks or {}
         self._known = sorted(self._chunks)
         self._limits = limits
+        self._max_index_bytes = limits.records_per_chunk * INDEX_ENTRY.itemsize
         self._run_bytes = 0
         self._is_over = False
         self._last_at = begin
@@ -320,7 +322,7 @@ class Walk:
 
     def _whole(self, length: int, near: memoryview | None = None) -> memoryview:
         """Return the content of the record here, of which ``near`` may have been read."""
-        if length > self._limits.records_per_chunk * INDEX_ENTRY.itemsize:
+        if length > self._max_index_bytes:
             raise BrokenRecordError(f"a record of {length} bytes is over the limit")
         if near is not None and len(near) >= PREFIX.size + length:
             return near[PREFIX.size : PREFIX.size + length]
@@ -473,13 +475,16 @@ class Walk:
         # Up to the fields of the next chunk, or what is read without knowing.
         ahead = min(reported_end - at + MAX_HEAD, WINDOW) if reported_end > at else WINDOW
         found: list[MessageIndex] = []
-        fault = ""
-        near = memoryview(b"")
+        near, fault = memoryview(b""), ""
         while at + PREFIX.size <= bound:
             if len(near) < PREFIX.size:
-                near = self._file.window(at, PREFIX.size, ahead)
+                near = self._file.window(at, PREFIX.size, ahead)[: bound - at]
                 if len(near) < PREFIX.size:
                     break
+                whole, size = read_message_indexes(near, self._max_index_bytes)
+                found += whole
+                at, near = at + size, near[size:]
+                continue
             opcode, length = PREFIX.unpack_from(near)
             after = at + PREFIX.size + length
             if opcode != Op.MESSAGE_INDEX or after > bound:

@@ -40,7 +40,7 @@ SMALL_BYTES: Final = 1 << 20
 WORTHWHILE: Final = 1.5
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class ChunkRecords:
     """The records of one chunk within a buffer: bytes ``begin`` to ``end`` of ``whole``."""
 
@@ -92,7 +92,7 @@ class ChunkGroup:
         return self.size + _size(chunk) <= GROUP_BYTES
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Load:
     """One chunk of a group."""
 
