@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
@@ -60,16 +60,8 @@ class _Claim:
     t_ns: Int64s
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Speed:
-    """Speed of the car over the log's time, shape (N,)."""
-
-    t_ns: Int64s
-    mps: Floats
-
-    def between(self, start_ns: int, end_ns: int) -> Floats:
-        """Return the speeds in a span."""
-        return self.mps[(self.t_ns >= start_ns) & (self.t_ns <= end_ns)]
+# Times of the log, and the speed of the car, shape (N,) each.
+_Speed: TypeAlias = tuple[Int64s, Floats]
 
 
 def suspects(run: RunFolder) -> list[Failure]:
@@ -208,6 +200,7 @@ def _unheeded(
     run: str, claims: Sequence[_Claim], speed: _Speed, ranges: RangeRows | None
 ) -> Iterator[Failure]:
     """Yield stop signs and lights that the car passed without slowing."""
+    t_ns, mps = speed
     for one in claims:
         if one.cue not in SLOWING or ranges is None:
             continue
@@ -215,7 +208,8 @@ def _unheeded(
         if not mine.any():
             continue
         passed_ns = int(ranges.t_ns[mine].max())
-        driven = speed.between(int(one.t_ns[0]), max(passed_ns, int(one.t_ns[-1])))
+        is_on_way = (t_ns >= one.t_ns[0]) & (t_ns <= max(passed_ns, int(one.t_ns[-1])))
+        driven = mps[is_on_way]
         if len(driven) and driven[0] > DRIVING_MPS and driven.min() > SLOWED * driven[0]:
             text = f"found in {len(one.t_ns)} frames; {driven[0]:.1f} to {driven.min():.1f} m/s"
             severity = math.log2(1 + len(one.t_ns))
@@ -230,7 +224,8 @@ def _unexplained(
     """Yield stops for which the run shows no reason: no sign, light, crossing car or queue."""
     reasons = [one.t_ns for one in claims if one.cue in SLOWING or "cross_traffic" in one.cue]
     seen_ns = np.concatenate([ahead_ns, *reasons]) if reasons else ahead_ns
-    standing = speed.t_ns[np.abs(speed.mps) < STANDING_MPS]
+    t_ns, mps = speed
+    standing = t_ns[np.abs(mps) < STANDING_MPS]
     for times in _episodes(standing):
         if times[-1] - times[0] < STANDING_NS:
             continue
@@ -303,7 +298,7 @@ def _in_log_time(run: RunFolder, name: str) -> tuple[Int64s, pa.Table | None]:
 
 def _speed(run: RunFolder) -> _Speed | None:
     t_ns, table = _in_log_time(run, "pose")
-    return None if table is None else _Speed(t_ns, table["speed_mps"].to_numpy())
+    return None if table is None else (t_ns, table["speed_mps"].to_numpy())
 
 
 def _vehicles_ahead(run: RunFolder) -> Int64s:

@@ -8,14 +8,12 @@ short gap is assumed from the last speed, and is reported as assumed.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crosscue.fusion.intersection_range import range_noise_m2
-from crosscue.replay.columns import Floats, Int64s
 
 from .parquet import TableFolder, arrow_column, numbers_of
 
@@ -42,7 +40,9 @@ class Way(NamedTuple):
     assumed_m: float = 0.0
 
 
-class _Row(NamedTuple):
+class OdometryRow(NamedTuple):
+    """Motion between two times."""
+
     start_ns: int
     stop_ns: int
     distance_m: float
@@ -51,22 +51,18 @@ class _Row(NamedTuple):
     is_gap: bool
 
 
-_Part = tuple[Int64s, Int64s, Floats, Floats, Floats, NDArray[np.bool_]]
-
-
 @dataclass(slots=True)
 class Odometer:
     """Forward reader of a run's odometry; memory holds one batch.
 
     Attributes:
-        parts: Batches of columns in the order of ``COLUMNS``, and flags of gaps, sorted by time.
+        rows: The odometry, sorted by time.
         at_ns: Time up to which the odometry has been read.
     """
 
-    parts: Iterator[_Part]
+    rows: Iterator[OdometryRow]
     at_ns: int | None = None
-    _rows: list[_Row] = field(default_factory=list)
-    _next: int = 0
+    _row: OdometryRow | None = None
 
     def until(self, t_ns: int) -> Way:
         """Return the motion since the last call, or since the start of the odometry.
@@ -91,7 +87,7 @@ class Odometer:
                 assumed_m += abs(fraction * row.distance_m) * row.is_gap
             if row.stop_ns > t_ns:
                 break
-            self._next += 1
+            self._row = None
         self.at_ns = t_ns
         var = range_noise_m2(distance, var, covered * 1e-9)
         return Way(distance, var, turn, covered, assumed, assumed_m)
@@ -101,17 +97,12 @@ class Odometer:
         self.until(t_ns)
         row = self._peek()
         if row is not None and row.is_gap and row.start_ns < t_ns:
-            self._next += 1
+            self._row = None
 
-    def _peek(self) -> _Row | None:
-        while self._next == len(self._rows):
-            part = next(self.parts, None)
-            if part is None:
-                return None
-            columns = (column.tolist() for column in part)
-            self._rows = [_Row(*row) for row in zip(*columns, strict=True)]
-            self._next = 0
-        return self._rows[self._next]
+    def _peek(self) -> OdometryRow | None:
+        if self._row is None:
+            self._row = next(self.rows, None)
+        return self._row
 
 
 def odometer_of(run: TableFolder) -> Odometer:
@@ -120,10 +111,10 @@ def odometer_of(run: TableFolder) -> Odometer:
     Raises:
         RunError: The table is missing or damaged.
     """
-    return Odometer(_parts(run))
+    return Odometer(_rows(run))
 
 
-def _parts(run: TableFolder) -> Iterator[_Part]:
+def _rows(run: TableFolder) -> Iterator[OdometryRow]:
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -133,14 +124,10 @@ def _parts(run: TableFolder) -> Iterator[_Part]:
         is_way = pc.is_in(kind, kinds)
         part = batch.filter(is_way)
         if part.num_rows:
-            start, stop, metres, radians, variance = (numbers_of(part[name]) for name in COLUMNS)
+            start, stop, *numbers = (numbers_of(part[name]) for name in COLUMNS)
             is_gap = numbers_of(pc.is_in(kind.filter(is_way), gap).cast("uint8")).astype(np.bool_)
+            columns = (start.astype(np.int64), stop.astype(np.int64), *numbers, is_gap)
             moves = stop > start
-            yield (
-                start[moves].astype(np.int64),
-                stop[moves].astype(np.int64),
-                metres[moves],
-                radians[moves],
-                variance[moves],
-                is_gap[moves],
+            yield from map(
+                OdometryRow._make, zip(*(c[moves].tolist() for c in columns), strict=True)
             )

@@ -21,7 +21,7 @@ from .agreement import (
     spread_mps,
 )
 from .candidates import WHEELS, Candidate, SignalKind
-from .observed import Bus, Observed
+from .observed import Observed
 from .series import Grid, Series
 
 # Typical wheel radius, used to detect motion where the true radius is unknown.
@@ -251,15 +251,12 @@ def _wheel_rank(one: WheelSet) -> tuple[object, ...]:
 def _yaw_rates(
     seen: Observed, turnings: Sequence[Turning], speed: Series | None, grid: Grid
 ) -> tuple[ChosenSignal, ...]:
+    on_buses = seen.of_kind(SignalKind.YAW_RATE)
+    found = [(one.name, bus.topic, series) for bus, one, series in on_buses]
+    found += [(series.name, "", series) for series in seen.yaw_rates if len(series) > 1]
     return _ranked(
         ChosenSignal(name, bus, series, judge_yaw_rate(series, turnings, speed, grid))
-        for name, bus, series in (
-            *(
-                (one.name, bus.topic, series)
-                for bus, one, series in seen.of_kind(SignalKind.YAW_RATE)
-            ),
-            *((series.name, "", series) for series in seen.yaw_rates if len(series) > 1),
-        )
+        for name, bus, series in found
     )
 
 
@@ -267,10 +264,3 @@ def _ranked(choices: Iterator[ChosenSignal]) -> tuple[ChosenSignal, ...]:
     return tuple(
         sorted(choices, key=lambda one: (bool(one.verdict.wrong), *one.verdict.rank, one.name))
     )
-
-
-def bus_of(buses: Sequence[Bus], choices: Choices) -> str:
-    """Return the bus for ``can.bus``: that of the wheels, else the one with most known messages."""
-    if choices.wheels and choices.is_chosen(choices.wheels[0]):
-        return choices.wheels[0].bus
-    return buses[0].topic

@@ -147,7 +147,7 @@ class _Collected:
         found = [] if database is None else [*candidates(database.messages)]
         self._candidates: Final = {(one.message, one.signal): one for one in found}
         self._decoders: dict[str, BusDecoder] = {}
-        self._parts: dict[tuple[str, str, str], list[tuple[Int64s, Floats]]] = {}
+        self._parts: dict[tuple[str, str], dict[str, list[tuple[Int64s, Floats]]]] = {}
         self._first_ns: list[int] = []
         self._last_ns: list[int] = []
 
@@ -195,29 +195,24 @@ class _Collected:
         return self._decoders[bus]
 
     def _add(self, topic: str, part: str, column: str, t_ns: Int64s, values: Floats) -> None:
-        self._parts.setdefault((topic, part, column), []).append((t_ns, values))
+        columns = self._parts.setdefault((topic, part), {})
+        columns.setdefault(column, []).append((t_ns, values))
 
     def result(self) -> Observed:
         """Return the collected observations."""
-        joined = {
-            place: (
-                np.concatenate([t_ns for t_ns, _ in parts]),
-                np.concatenate([values for _, values in parts]),
-            )
-            for place, parts in self._parts.items()
+        columns: dict[tuple[str, str], _Columns] = {
+            place: {name: _joined(parts) for name, parts in found.items()}
+            for place, found in self._parts.items()
         }
-        for bus in self.buses.values():
-            if self._database is not None:
-                bus.known = sum(self._database.find(*key) is not None for key in bus.ids)
-            for (topic, message, signal), (t_ns, values) in joined.items():
+        for (topic, message), found in columns.items():
+            for signal, readings in found.items():
                 one = self._candidates.get((message, signal))
-                if topic == bus.topic and one is not None:
-                    bus.signals.append((one, Series.of(one.name, t_ns, values)))
+                if topic in self.buses and one is not None:
+                    self.buses[topic].signals.append((one, Series.of(one.name, *readings)))
+        if self._database is not None:
+            for bus in self.buses.values():
+                bus.known = sum(self._database.find(*key) is not None for key in bus.ids)
         known_first = sorted(self.buses.values(), key=lambda bus: (-bus.known, bus.topic))
-        topics = list(dict.fromkeys((topic, part) for topic, part, _ in joined))
-        columns = {
-            place: {c: v for (t, p, c), v in joined.items() if (t, p) == place} for place in topics
-        }
         return Observed(
             tuple(known_first),
             tuple(
@@ -240,6 +235,11 @@ class _Collected:
             max(min(self._first_ns), middle_ns - OBSERVED_NS),
             min(max(self._last_ns), middle_ns + OBSERVED_NS),
         )
+
+
+def _joined(parts: Sequence[tuple[Int64s, Floats]]) -> tuple[Int64s, Floats]:
+    t_ns, values = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return t_ns, values
 
 
 _Columns = Mapping[str, tuple[Int64s, Floats]]

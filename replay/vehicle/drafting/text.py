@@ -16,7 +16,7 @@ from crosscue.replay.vehicle.roles import Role, role_of
 from .agreement import SignalVerdict
 from .camera import AFTER_CAMERA, CameraMounting, camera_lines
 from .candidates import WHEELS
-from .choice import Choices, ChosenSignal, bus_of, rank_candidates
+from .choice import Choices, ChosenSignal, rank_candidates
 from .observed import Bus, Observed, observe
 
 if TYPE_CHECKING:
@@ -189,7 +189,9 @@ def _can_lines(examined: Examined, folder: Path) -> Iterator[str]:
     if not buses:
         yield from ("# The log has no CAN bus.", "")
         return
-    main = bus_of(buses, choices)
+    # The bus of the wheels, else the one with most known messages.
+    is_of_wheels = bool(choices.wheels) and choices.is_chosen(choices.wheels[0])
+    main = choices.wheels[0].bus if is_of_wheels else buses[0].topic
     yield "[can]"
     if len(buses) > 1:
         yield f"bus = {_quoted(main)}"

@@ -23,7 +23,7 @@ from crosscue.eval.report.frame_pictures import draw_pictures
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, create
 from crosscue.eval.runs.manifest import EstimateManifest, SceneSummary
-from crosscue.eval.runs.tables.travelled import Odometer, Way, odometer_of
+from crosscue.eval.runs.tables.travelled import Odometer, OdometryRow, Way, odometer_of
 from crosscue.eval.scoring.run_tables import in_log_time
 from crosscue.eval.scoring.scene.ranges import smoothed_rows
 from crosscue.replay.columns import Block, Topic
@@ -114,7 +114,8 @@ def _odometer() -> Odometer:
     stop = np.array([1, 2, 4, 5, 6]) * SECOND
     distance_m = np.array([10.0, 10.0, 20.0, 10.0, 10.0])
     is_gap = np.array([False, False, True, False, False])
-    return Odometer(iter([(start, stop, distance_m, 0.1 * distance_m, 0.01 * distance_m, is_gap)]))
+    columns = (start, stop, distance_m, 0.1 * distance_m, 0.01 * distance_m, is_gap)
+    return Odometer(map(OdometryRow._make, zip(*(one.tolist() for one in columns), strict=True)))
 
 
 def test_distance_across_gap_is_reported_as_assumed() -> None:

@@ -10,7 +10,7 @@ from crosscue.eval.pipeline.whole_run import replay_drive
 from crosscue.eval.report.summary import poses_summary
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import create
-from crosscue.eval.runs.tables.travelled import Odometer
+from crosscue.eval.runs.tables.travelled import Odometer, OdometryRow
 from crosscue.eval.scoring.columns import RangeRows
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.scoring.intervals import TOO_FEW
@@ -27,7 +27,8 @@ SENSOR_M2, WAY_M2, STEP_M, STEP_NS = 4.0, 0.01, 1.0, 100_000_000
 def odometer(steps: int) -> Odometer:
     start = np.arange(steps, dtype=np.int64) * STEP_NS
     same = np.full(steps, STEP_M), np.zeros(steps), np.full(steps, WAY_M2)
-    return Odometer(iter([(start, start + STEP_NS, *same, np.zeros(steps, np.bool_))]))
+    columns = (start, start + STEP_NS, *same, np.zeros(steps, np.bool_))
+    return Odometer(map(OdometryRow._make, zip(*(one.tolist() for one in columns), strict=True)))
 
 
 def filtered(measured_m: Floats) -> list[RangeBelief]:
