@@ -41,6 +41,9 @@ MEAN_S: Final = 0.6
 SEEN: Final = 1.25
 # Log odds of a road straight on in the simulated layouts: three of four go on.
 USUALLY_ON: Final = 1.0
+# Log odds that an intersection which is believed begins within about 30 m (assumed): the road seen
+# behind one that is further away may be the road before it.
+BELIEVED: Final = 2.0
 
 
 class LogOdds(NamedTuple):
@@ -58,10 +61,9 @@ class LogOdds(NamedTuple):
     straight: float
     intersection: float
 
-    @property
-    def goes_on(self) -> float:
-        """An intersection, and a road straight on behind it."""
-        return min(self.straight - USUALLY_ON, self.intersection)
+    def goes_on(self, is_believed: bool) -> float:
+        """An intersection, which other evidence may show, and a road straight on behind it."""
+        return min(self.straight - USUALLY_ON, self.intersection + BELIEVED * is_believed)
 
 
 @dataclass(slots=True)
@@ -70,9 +72,11 @@ class RoadLayout:
 
     Attributes:
         mean: Mean log odds after the newest frame; None until it is one of enough frames.
+        is_believed: Whether an intersection is believed already, by any evidence.
     """
 
     mean: LogOdds | None = None
+    is_believed: bool = False
     _mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(4))
     _first_ns: int | None = None
     _last_ns: int = 0
@@ -99,12 +103,13 @@ class RoadLayout:
         if t_ns - self._first_ns < MEAN_S * 1e9:
             return Legs(math.nan, math.nan, math.nan)
         self.mean = mean = LogOdds(*self._mean.tolist())
-        roads = (mean.left, mean.goes_on, mean.right)
+        roads = (mean.left, mean.goes_on(self.is_believed), mean.right)
         return Legs(*(1.0 if one > SEEN else math.nan for one in roads))
 
     def restart(self) -> None:
         """Forget all frames."""
         self._first_ns = self.mean = None
+        self.is_believed = False
 
 
 def log_odds(road: RoadMask, boxes_px: Floats) -> LogOdds:

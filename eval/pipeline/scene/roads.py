@@ -111,13 +111,17 @@ class Roads:
         if mean is None:
             return evidence
         sides = {"road_left": mean.left, "road_right": mean.right}
-        odds = {**sides, "road_straight": mean.goes_on}
+        odds = {**sides, "road_straight": mean.goes_on(self._layout.is_believed)}
         worth = {cue: max(one, SHAPE_LOG_ODDS * (one > SEEN)) for cue, one in odds.items()}
         return replace(
             evidence,
             weights={cue: one / log_odds(OPENING_PRECISION) for cue, one in worth.items()},
             roads_ahead={cue: one > SEEN for cue, one in sides.items() if not 0.0 <= one <= SEEN},
         )
+
+    def believe(self, is_established: bool) -> None:
+        """Note whether an intersection is believed: a road straight on is one behind it."""
+        self._layout.is_believed = is_established
 
     def plan(self) -> RoadPlan | None:
         """Return the plan view after the newest frame."""

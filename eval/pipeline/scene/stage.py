@@ -247,6 +247,8 @@ class Scene:
         """Return ranges and belief after a frame."""
         past = _without(self._past.cues(evidence.t_ns), self._without)
         step = self._approaches(evidence, past)
+        if self._roads is not None:
+            self._roads.believe(step.established)
         self._frames += 1
         self._looked.update(step.counts)
         self._positive.update(cue for cue, count in step.counts.items() if count)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from crosscue.detectors.cues import road_layout
-from crosscue.detectors.cues.road_layout import RoadLayout
+from crosscue.detectors.cues.road_layout import LogOdds, RoadLayout
 from crosscue.replay.errors import VehicleError
 from support.road_masks import LEFT, RIGHT, ROAD, SIZE_PX, Area, mask_of, seen_from
 
@@ -41,6 +41,36 @@ def test_the_road_ahead_is_seen_only_behind_an_intersection() -> None:
         alone = straight(t_ns, seen_from([ROAD], 0.8, 1.4, 0.45), NO_BOXES).straight
     assert ahead == 1.0
     assert math.isnan(alone)
+
+
+@pytest.mark.parametrize(
+    ("straight", "intersection", "is_believed", "is_seen"),
+    [
+        (3.0, 1.5, False, True),
+        (3.0, 0.0, False, False),
+        (3.0, 0.0, True, True),
+        # The road ends at the intersection, whoever shows that.
+        (2.0, 3.0, True, False),
+        # The intersection that is believed is too far away.
+        (3.0, -1.0, True, False),
+    ],
+)
+def test_straight_on_is_seen_behind_an_intersection_that_other_evidence_shows(
+    straight: float,
+    intersection: float,
+    is_believed: bool,
+    is_seen: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    odds = LogOdds(-2.0, -2.0, straight, intersection)
+    monkeypatch.setattr(road_layout, "log_odds", lambda road, boxes_px: odds)
+    layout = RoadLayout(is_believed=is_believed)
+    for n in range(10):
+        legs = layout(n * 100_000_000, seen_from([ROAD], 0.8, 1.4, 0.45), NO_BOXES)
+    assert (legs.straight == 1.0) is is_seen
+    assert math.isnan(legs.left)
+    layout.restart()
+    assert not layout.is_believed
 
 
 def test_a_side_street_of_one_frame_is_none() -> None:

@@ -13,7 +13,8 @@ import pytest
 
 import crosscue
 from crosscue.detectors import rle
-from crosscue.detectors.base import Frame, RoadMask, View
+from crosscue.detectors.base import Detections, Frame, RoadMask, View
+from crosscue.detectors.cues import road_layout
 from crosscue.detectors.cues.observed import NOT_SEEN, FrameDetections, RoadFractions
 from crosscue.detectors.cues.road_layout import LogOdds
 from crosscue.detectors.cues.road_openings import Legs, Seen
@@ -241,3 +242,42 @@ def test_a_map_that_cannot_be_used_is_refused_in_one_line(
     argv += ["--detectors", "support.detecting:Nothing", "--no-cache", "-o", tmp_path / "run"]
 
     assert said in refusal(4 if "none" in setting else 2, *argv)
+
+
+class Road(Streets):
+    """Every picture shows the same road."""
+
+    areas = ([ROAD],) * 36
+
+
+class Light:
+    """A detector of a light in all pictures."""
+
+    view, identity, labels = View(is_grey=True), "light", ("traffic light",)
+
+    def __call__(self, frames: Sequence[Frame], /) -> list[Detections]:
+        """Return the light, which moves a little: equal results would be a repeated picture."""
+        return [
+            Detections(frame.t_ns, frame.size_px, boxes_px, np.array([0.9]), self.labels, (None,))
+            for frame in frames
+            for at_px in (300.0 + frame.t_ns * 1e-8,)
+            for boxes_px in (np.array([[at_px, 60.0, at_px + 20.0, 110.0]]),)
+        ]
+
+
+@pytest.mark.parametrize("has_light", [False, True])
+def test_a_light_is_the_intersection_behind_which_the_road_goes_on(
+    has_light: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    odds = LogOdds(-2.0, -2.0, 4.0, 0.0)
+    monkeypatch.setattr(road_layout, "log_odds", lambda road, boxes_px: odds)
+    log = picture_log(
+        tmp_path / "log", [np.full(SIZE_PX[::-1], 5 * i, np.uint8) for i in range(36)]
+    )
+    (tmp_path / "car.toml").write_text("version = 1\n")
+    detectors = [Road, Light] if has_light else [Road]
+
+    run = crosscue.replay_drive(log, tmp_path / "run", tmp_path / "car.toml", detectors)
+
+    believed = {row["straight"] > 0.9 for row in run["belief"].to_pylist()[-5:]}
+    assert believed == ({True} if has_light else set())
