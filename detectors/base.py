@@ -241,6 +241,20 @@ class RoadMask:
 Found: TypeAlias = Detections | RoadMask
 
 
+def bars_beside(is_empty: NDArray[np.bool_]) -> int:
+    """Number of columns of each of two bars beside a picture of another shape; 0 without bars.
+
+    Args:
+        is_empty: Of each column, whether it can belong to a bar.
+    """
+    width, within = len(is_empty), np.flatnonzero(~is_empty)
+    if not len(within):
+        return 0
+    left, right = int(within[0]), width - 1 - int(within[-1])
+    are_bars = abs(left - right) <= 0.01 * width and min(left, right) >= 0.02 * width
+    return max(left, right) if are_bars else 0
+
+
 class Detector(Protocol):
     """Finds objects or road in frames, without memory of earlier frames (that is a tracker).
 

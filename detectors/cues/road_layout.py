@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.detectors.base import RoadMask
+from crosscue.detectors.base import RoadMask, bars_beside
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import VehicleError
 
@@ -32,6 +32,8 @@ WEIGHTS: Final = Path(__file__).parents[1] / "checkpoints" / "road_layout.onnx"
 SHA256: Final = "758d3c17fabecf6ad74a7b138139e0bd76119fe75aafab4ad6b5112f3daac57d"
 # Rows and columns of the network's input.
 SHAPE: Final = (128, 160)
+# Parts of a picture's width, each of which shows road in some frame or in none.
+_PARTS: Final = 320
 # Order of the network's outputs with left and right exchanged.
 MIRRORED: Final = (1, 0, 2, 3)
 # Time over which log odds are averaged.
@@ -77,6 +79,7 @@ class RoadLayout:
 
     mean: LogOdds | None = None
     is_believed: bool = False
+    _has_road: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(_PARTS, np.bool_))
     _mean: NDArray[np.float64] = field(default_factory=lambda: np.zeros(4))
     _first_ns: int | None = None
     _last_ns: int = 0
@@ -93,7 +96,11 @@ class RoadLayout:
             ValueError: The mask is damaged.
             VehicleError: The network's file is damaged.
         """
-        found = np.array(log_odds(road, boxes_px))
+        # Where no frame shows road, at both sides alike, there are bars beside the picture.
+        has_road = road.pixels().any(axis=0)
+        self._has_road |= has_road[np.arange(_PARTS) * len(has_road) // _PARTS]
+        beside = bars_beside(~self._has_road) / _PARTS
+        found = np.array(log_odds(road, boxes_px, beside))
         if self._first_ns is None:
             self._first_ns, gain = t_ns, 1.0
         else:
@@ -109,11 +116,17 @@ class RoadLayout:
     def restart(self) -> None:
         """Forget all frames."""
         self._first_ns = self.mean = None
+        self._has_road[:] = False
         self.is_believed = False
 
 
-def log_odds(road: RoadMask, boxes_px: Floats) -> LogOdds:
+def log_odds(road: RoadMask, boxes_px: Floats, beside: float = 0.0) -> LogOdds:
     """Return the log odds of one frame, the mean of those of the picture and of its mirror image.
+
+    Args:
+        road: Its mask.
+        boxes_px: Shape (N, 4): boxes of everything that hides the road.
+        beside: Share of the picture's width that each of two bars beside it takes.
 
     Raises:
         ValueError: The mask is damaged.
@@ -128,10 +141,14 @@ def log_odds(road: RoadMask, boxes_px: Floats) -> LogOdds:
     for left, top, right, bottom in np.maximum(np.round(boxes_px * scale), 0.0).astype(int):
         hidden[top:bottom, left:right] = 1.0
     planes = [
-        cv2.resize(one, (columns, rows), interpolation=cv2.INTER_AREA)
+        cv2.resize(
+            one[:, left : one.shape[1] - left], (columns, rows), interpolation=cv2.INTER_AREA
+        )
         for one in (road.pixels().astype(np.float32), hidden)
+        for left in (round(beside * one.shape[1]),)
     ]
-    picture = np.stack([*planes, np.full(SHAPE, height / width, np.float32)]).astype(np.float32)
+    shape = height / (width * (1.0 - 2.0 * beside))
+    picture = np.stack([*planes, np.full(SHAPE, shape, np.float32)]).astype(np.float32)
     both = np.stack([picture, picture[..., ::-1]])
     given, mirrored = next(iter(network()(both).values())).astype(np.float64)
     return LogOdds(*((given + mirrored[list(MIRRORED)]) / 2.0))

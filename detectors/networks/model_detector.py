@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.detectors import rle
-from crosscue.detectors.base import Detector, Found, Frame, RoadMask, View
+from crosscue.detectors.base import Detector, Found, Frame, RoadMask, View, bars_beside
 from crosscue.detectors.catalog.card import ModelCard, SegmentationOutput, read_card, read_weights
 from crosscue.detectors.catalog.entries import weights_folder
 from crosscue.detectors.decoders.base import Array, named
@@ -27,7 +27,9 @@ from .picture_input import Placement, prepared, view_of
 from .weights import Weights
 
 # Incremented when the same pixels, card and settings yield different numbers than before.
-VERSION: Final = 2
+VERSION: Final = 3
+# Brightness up to which a column counts as black.
+BLACK: Final = 32
 
 
 class ModelSettings(Settings):
@@ -131,8 +133,14 @@ class RoadModel:
         return found
 
     def road_mask(self, frame: Frame) -> NDArray[np.bool_]:
-        """Segment a whole picture at the network's resolution, shape (h, w), bool."""
-        given, placement = prepared(frame.pixels, self.card.input)
+        """Segment a whole picture at the network's resolution, shape (h, w), bool.
+
+        Black bars beside the picture are left out: a network sees edges of the road at them.
+        """
+        height, width = frame.pixels.shape[:2]
+        bar = bars_beside(frame.pixels.reshape(height, width, -1).max(axis=(0, 2)) <= BLACK)
+        pixels = frame.pixels[:, bar : width - bar]
+        given, placement = prepared(pixels, self.card.input)
         try:
             raw = named(self.network(given), self.output.name)
             classes = class_map(raw, len(self.output.classes))
@@ -143,9 +151,11 @@ class RoadModel:
             raise VehicleError(
                 f"{self.where}: output.road: none of {', '.join(self.output.road)} is a class"
             )
-        columns = _part(frame.pixels.shape[1], placement, 0, classes, self.card.input.width_px)
-        rows = _part(frame.pixels.shape[0], placement, 1, classes, self.card.input.height_px)
-        return np.isin(classes[rows, columns], names)
+        columns = _part(pixels.shape[1], placement, 0, classes, self.card.input.width_px)
+        rows = _part(height, placement, 1, classes, self.card.input.height_px)
+        road = np.isin(classes[rows, columns], names)
+        beside = round(bar * road.shape[1] / pixels.shape[1])
+        return np.pad(road, ((0, 0), (beside, beside)))
 
 
 def _part(length: int, placement: Placement, axis: int, classes: Array, side_px: int) -> slice:

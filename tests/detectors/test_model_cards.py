@@ -407,6 +407,36 @@ def test_maps_of_points_are_not_taken_for_classes(tmp_path: Path) -> None:
         )
 
 
+@pytest.mark.parametrize(
+    ("left", "right", "beside"),
+    [
+        (16, 16, 11),
+        # A column more or less is the compression's.
+        (16, 17, 12),
+        # Dark on one side, or a dark edge, is a part of the picture.
+        (16, 0, 0),
+        (2, 2, 0),
+        # A black picture is no bar.
+        (64, 64, 0),
+    ],
+)
+def test_black_bars_beside_a_picture_are_no_road_and_are_not_looked_at(
+    left: int, right: int, beside: int, tmp_path: Path
+) -> None:
+    card = crosscue.draft_card(network(tmp_path, mask=scores((64, 32))), classes="sky,road,curb")
+    detector = build(card=str(card.path))
+    assert isinstance(detector, RoadModel)
+    pixels = np.full((64, 128, 3), 33, np.uint8)
+    pixels[:, :left] = pixels[:, 128 - right :] = 32
+
+    mask = detector.road_mask(Frame(0, "", pixels, (128, 64)))
+
+    # The network is given all that is between the bars, and nothing else.
+    assert mask.shape == (32, 64 + 2 * beside)
+    assert mask[16:, beside : 64 + beside].all()
+    assert mask.sum() == 16 * 64
+
+
 def test_weak_scores_of_both_signs_are_classes(tmp_path: Path) -> None:
     """Logits of a network with random weights."""
     weak = np.random.default_rng(0).normal(0.0, 0.02, (1, 11, 8, 16)).astype(np.float32)

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from crosscue.detectors import rle
+from crosscue.detectors.base import RoadMask
 from crosscue.detectors.cues import road_layout
 from crosscue.detectors.cues.road_layout import LogOdds, RoadLayout
 from crosscue.replay.errors import VehicleError
@@ -63,7 +65,7 @@ def test_straight_on_is_seen_behind_an_intersection_that_other_evidence_shows(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     odds = LogOdds(-2.0, -2.0, straight, intersection)
-    monkeypatch.setattr(road_layout, "log_odds", lambda road, boxes_px: odds)
+    monkeypatch.setattr(road_layout, "log_odds", lambda *_: odds)
     layout = RoadLayout(is_believed=is_believed)
     for n in range(10):
         legs = layout(n * 100_000_000, seen_from([ROAD], 0.8, 1.4, 0.45), NO_BOXES)
@@ -96,6 +98,25 @@ def test_a_picture_without_road_shows_nothing() -> None:
     for n in range(10):
         legs = layout(n * 100_000_000, mask_of(np.zeros(SIZE_PX[::-1], np.bool_)), NO_BOXES)
         assert all(map(math.isnan, legs))
+
+
+def test_bars_beside_the_picture_change_nothing() -> None:
+    """A picture of another shape in the middle shows the same roads as without its bars."""
+    for areas in ([ROAD], [ROAD, RIGHT], [ROAD, LEFT, RIGHT]):
+        whole, within = RoadLayout(), RoadLayout()
+        for n in range(10):
+            mask = seen_from(areas, 0.8, 1.4, 0.45)
+            # A column more or less is the compression's.
+            wide = np.pad(mask.pixels(), ((0, 0), (90, 90 + n % 2)))
+            size = (SIZE_PX[0] + 180 + n % 2, SIZE_PX[1])
+            barred = RoadMask(
+                0, (SIZE_PX[0] + 180, SIZE_PX[1]), rle.encode_mask(wide, (0, 0), size), size
+            )
+            box = np.array([[300.0, 170.0, 340.0, 220.0]])
+            whole(n * 100_000_000, mask, box)
+            within(n * 100_000_000, barred, box + np.array([90.0, 0.0, 90.0, 0.0]))
+        assert whole.mean is not None
+        assert within.mean == pytest.approx(whole.mean, abs=0.3)
 
 
 def test_a_damaged_network_is_refused_in_one_line(

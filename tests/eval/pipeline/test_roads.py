@@ -258,7 +258,7 @@ class Light:
     def __call__(self, frames: Sequence[Frame], /) -> list[Detections]:
         """Return the light, which moves a little: equal results would be a repeated picture."""
         return [
-            Detections(frame.t_ns, frame.size_px, boxes_px, np.array([0.9]), self.labels, (None,))
+            Detections(frame.t_ns, frame.size_px, boxes_px, np.array([0.9]), self.labels, (b"",))
             for frame in frames
             for at_px in (300.0 + frame.t_ns * 1e-8,)
             for boxes_px in (np.array([[at_px, 60.0, at_px + 20.0, 110.0]]),)
@@ -270,7 +270,7 @@ def test_a_light_is_the_intersection_behind_which_the_road_goes_on(
     has_light: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     odds = LogOdds(-2.0, -2.0, 4.0, 0.0)
-    monkeypatch.setattr(road_layout, "log_odds", lambda road, boxes_px: odds)
+    monkeypatch.setattr(road_layout, "log_odds", lambda *_: odds)
     log = picture_log(
         tmp_path / "log", [np.full(SIZE_PX[::-1], 5 * i, np.uint8) for i in range(36)]
     )
