@@ -7,14 +7,13 @@ in this process, and ratios are medians over the rounds. Logs are those of ``win
 (2 s of one topic of 5 minutes, 700 MB), ``mcap_reading.py`` (1 minute) and ``bag_reading.py``
 (30 s), a video of 600 pictures of 1280 x 720, and runs that are copies of one short scored drive.
 Where a call cannot be faster than a part of it, that part is printed, too: NumPy's import in every
-command, SQLite's check of a .db3, reading and checksums of an MCAP.
+command, reading and checksums of an MCAP.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-import sqlite3
 import statistics
 import struct
 import subprocess
@@ -22,7 +21,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import closing
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -216,17 +214,8 @@ def mcap(folder: Path) -> None:
         path.unlink()
 
 
-def _sqlite_check(file: Path) -> int:
-    """Check a database as the reader does before its first row."""
-    with closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as database:
-        database.execute("PRAGMA cache_size=-200")
-        assert database.execute("PRAGMA integrity_check(5)").fetchall() == [("ok",)]
-    return 0
-
-
 def db3(folder: Path) -> None:
     path = write_db3(folder / "db3", 30)
-    (file,) = path.glob("*.db3")
 
     def ours() -> int:
         with crosscue.open(path) as log:
@@ -235,7 +224,6 @@ def db3(folder: Path) -> None:
     cases: dict[str, Work] = {
         "log.batches()": ours,
         "rosbags, objects": lambda: theirs(path, True),
-        "SQLite's check": lambda: _sqlite_check(file),
     }
     compare(".db3, 30 s", cases)
 

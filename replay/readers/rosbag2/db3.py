@@ -1,8 +1,9 @@
 """Reader of ROS 2 bags in SQLite (.db3): yields all readable rows and reports the others.
 
-SQLite has no checksums. The reader therefore runs SQLite's own integrity check, and checks the time
-index against the rows, the types and the order of the rows, and the file's length. In an undamaged
-file, common rows are read directly from the pages. All other rows are read through SQLite.
+SQLite has no checksums. The reader therefore checks the file's structure, with SQLite's own
+integrity check where the file is unusual, damaged or read in part, and the types and the order of
+the rows, and the file's length. In an undamaged file, common rows are read directly from the pages.
+All other rows are read through SQLite.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,8 +22,10 @@ from crosscue.replay.readers.can_rows import keep_memory
 from crosscue.replay.readers.mixed import MixedRows, blocks_of
 
 from .inflate import DAMAGED, inflated
+from .page_file import Soundness
 from .pages import page_rows
 from .rows import FIRST_ROWID, LAST_ROWID, Row, RowColumns, RowScan, index_times
+from .soundness import soundness
 from .sqlite import FAULTS, Database, open_database
 from .tables import StorageTables, fetched, read_storage_tables
 
@@ -118,17 +121,17 @@ class _Pass:
         self._scan = RowScan(database, FIRST_ROWID, LAST_ROWID, self._fetched)
         self._counts: dict[str, int] | None = None
         self._indexed: tuple[Int64s, Int64s] | None = None
+        self._sound: Soundness | None = None
         self._in_time_by_index: int | None = None
         self._in_time = 0
         self._met = 0
 
     def _numbers_asked(self) -> frozenset[int] | None:
         """Return the numbers of the selected topics, or None for all."""
-        if self._selection.topics is None:
-            return None
-        return frozenset(
+        asked = frozenset(
             n for n, at in self._place.items() if self._selection.wants(self._names[at])
         )
+        return None if len(asked) == len(self._place) else asked
 
     def blocks(self) -> Iterator[Block]:
         """Yield the selected blocks and account for all rows."""
@@ -141,16 +144,23 @@ class _Pass:
         problems = ""
         if self._in_time_by_index is None:
             with _lock(self._database) as is_locked:
-                problems = self._problems()
-                if is_locked and not problems and not self._database.damage:
+                is_plain = is_locked and not self._database.damage
+                if is_plain and self._fetched is None:
+                    self._sound = soundness(self._database, self._limits)
+                if self._sound is None:
+                    problems = self._problems()
+                if is_plain and not problems:
                     yield from self._plain_blocks()
+                # The chains of pages of long rows are checked when they are read.
+                if self._sound is not None and not self._sound.is_complete:
+                    problems = self._problems()
         for rows in self._scan.batches():
             yield from self._blocks_of(rows)
         self._finish(problems)
 
     def _plain_blocks(self) -> Iterator[Block]:
         """Yield rows directly from the pages, up to the first unusual one."""
-        for rows in page_rows(self._database, self._fetched, self._limits):
+        for rows in page_rows(self._database, self._fetched, self._limits, self._sound):
             self._met += len(rows)
             self._scan = RowScan(self._database, int(rows.ids[-1]) + 1, LAST_ROWID, self._fetched)
             yield from self._grouped(rows.messages, self._placed(rows.topics), rows.times)
@@ -291,7 +301,7 @@ class _Pass:
         if is_part:
             ledger.integrity += "; a part was read, the file's structure was not checked"
         elif not problems:
-            ledger.integrity += "; SQLite's check of its structure finds no fault"
+            ledger.integrity += "; the check of its structure finds no fault"
         else:
             ledger.integrity += "; SQLite's check finds damage"
             if ledger.is_whole:
@@ -303,12 +313,13 @@ class _Pass:
         """Drop rows whose numbers are missing, because recorders number rows consecutively."""
         try:
             # Asked for together, they make SQLite read every row.
-            first, last, count = (
-                fetched(self._database, f"SELECT {one} FROM messages")[0][0]  # noqa: S608
-                for one in ("MIN(rowid)", "MAX(rowid)", "COUNT(*)")
+            first, last = (
+                fetched(self._database, f"SELECT {one}(rowid) FROM messages")[0][0]  # noqa: S608
+                for one in ("MIN", "MAX")
             )
         except FAULTS:
             return
+        count = self._total()
         if count:
             detail = f"rows {first} to {last}, of which {count} exist"
             self._ledger.drop("", DELETED, last - first + 1 - count, detail)
@@ -333,6 +344,8 @@ class _Pass:
 
     def _total(self) -> int | None:
         """Return SQLite's number of rows, which it counts in the smallest index."""
+        if self._sound is not None:
+            return self._sound.rows
         try:
             return int(fetched(self._database, "SELECT COUNT(*) FROM messages")[0][0])
         except FAULTS:
