@@ -104,6 +104,9 @@ def test_bars_beside_the_picture_change_nothing() -> None:
     """A picture of another shape in the middle shows the same roads as without its bars."""
     for areas in ([ROAD], [ROAD, RIGHT], [ROAD, LEFT, RIGHT]):
         whole, within = RoadLayout(), RoadLayout()
+        # Another recording before, without bars.
+        within(-(10**9), mask_of(np.ones(SIZE_PX[::-1], np.bool_)), NO_BOXES)
+        within.restart()
         for n in range(10):
             mask = seen_from(areas, 0.8, 1.4, 0.45)
             # A column more or less is the compression's.
