@@ -97,7 +97,7 @@ class RoadLayout:
             VehicleError: The network's file is damaged.
         """
         # Where no frame shows road, at both sides alike, there are bars beside the picture.
-        has_road = road.pixels().any(axis=0)
+        has_road = np.asarray(road.pixels().any(axis=0))
         self._has_road |= has_road[np.arange(_PARTS) * len(has_road) // _PARTS]
         beside = bars_beside(~self._has_road) / _PARTS
         found = np.array(log_odds(road, boxes_px, beside))
