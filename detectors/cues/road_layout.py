@@ -126,7 +126,7 @@ def log_odds(road: RoadMask, boxes_px: Floats, beside: float = 0.0) -> LogOdds:
     Args:
         road: Its mask.
         boxes_px: Shape (N, 4): boxes of everything that hides the road.
-        beside: Share of the picture's width that each of two bars beside it takes.
+        beside: Fraction of the picture's width that each of two bars beside it takes.
 
     Raises:
         ValueError: The mask is damaged.
