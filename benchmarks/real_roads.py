@@ -15,8 +15,9 @@ where there is none. At its prior it is not seen; below, a missing leg is right.
 undecided. Beside it stand the messages: the legs that are there, and those that are not, that a
 road cue shows in any of the frames. Below, each cue and leg has a line with the numbers of drives
 and places it stands on, apart for drives of development (``*``), and so have the messages, by the
-openings of calibrated cameras and by the mask's shape for others. Times, frames and distances are
-those of the annotations; ranges are scored only where a track gives the true distance.
+openings of calibrated cameras and by the mask's shape for others; then the sums of legs and
+intersections. Times, frames and distances are those of the annotations; ranges are scored only
+where a track gives the true distance.
 """
 
 from __future__ import annotations
@@ -212,7 +213,7 @@ class Score:
         legs: What is believed of each leg.
         messages: Whether each leg is there, and whether a road cue shows it.
         first: Where the intersection is first believed.
-        pieces: Believed approaches to annotated intersections.
+        pieces: Believed approaches to each annotated intersection.
         false_intersections: Believed approaches to none.
         ranges: Numbers of ranges inside their interval, and of all.
         minutes: Duration.
@@ -222,7 +223,7 @@ class Score:
     legs: dict[str, str] = field(default_factory=dict)
     messages: dict[str, tuple[bool, bool]] = field(default_factory=dict)
     first: str = "-"
-    pieces: int = 0
+    pieces: list[int] = field(default_factory=list)
     false_intersections: int = 0
     ranges: tuple[int, int] = (0, 0)
     minutes: float = 0.0
@@ -346,7 +347,7 @@ def scored(run: Run, drive: Drive) -> Score:
         if not approach.features.get("intersection"):
             continue
         claimed |= ours
-        score.pieces += len(ours)
+        score.pieces.append(len(ours))
         frames = [frame for number in ours for frame in believed[number]]
         if frames:
             score.first = f"frame {min(frames)}"
@@ -401,10 +402,10 @@ def evidence(scores: Mapping[str, Score], drives: Mapping[str, Drive] = DRIVES) 
     Several stretches of one recording are one drive and several places; the same stretch with other
     settings counts once. A cue is right, missed or false in frames, a leg at annotated approaches.
     """
-    stretches = {(drives[name].folder, drives[name].cut): name for name in reversed([*scores])}
+    once = _once(scores, drives)
     rows: dict[tuple[str, bool], list[tuple[str, Counter[str]]]] = {}
-    for (folder, _), name in reversed(stretches.items()):
-        counts = dict(scores[name].cues)
+    for name in once:
+        folder, counts = drives[name].folder, dict(scores[name].cues)
         for leg, said in scores[name].legs.items():
             counts.setdefault(leg.split()[-1], Counter())[_LEG_WORDS[said.split()[0]]] += 1
         for what, count in counts.items():
@@ -426,7 +427,7 @@ def evidence(scores: Mapping[str, Score], drives: Mapping[str, Drive] = DRIVES) 
         for is_development in (True, False):
             shown = {
                 name: scores[name].messages
-                for (folder, _), name in reversed(stretches.items())
+                for name in once
                 if scores[name].messages
                 and drives[name].is_development is is_development
                 and bool(drives[name].camera) is is_calibrated
@@ -438,6 +439,40 @@ def evidence(scores: Mapping[str, Score], drives: Mapping[str, Drive] = DRIVES) 
                 f"{name:24} {len({drives[one].folder for one in shown}):6} {len(shown):6} "
                 f"{_shown(every)} ({', '.join(by_drive) or '-'})"
             )
+
+
+def sums(scores: Mapping[str, Score], drives: Mapping[str, Drive] = DRIVES) -> Iterator[str]:
+    """Yield a line with the sums of drives of development (``*``), and one of the others.
+
+    The same stretch with other settings counts once.
+    """
+    for is_development in (True, False):
+        some = [
+            scores[name]
+            for name in _once(scores, drives)
+            if drives[name].is_development is is_development
+        ]
+        legs = [(one.messages[leg][0], said) for one in some for leg, said in one.legs.items()]
+        there = [said for is_there, said in legs if is_there]
+        absent = [said for is_there, said in legs if not is_there]
+        pieces = [number for one in some for number in one.pieces]
+        false, minutes = (
+            sum(one.false_intersections for one in some),
+            sum(one.minutes for one in some),
+        )
+        yield (
+            f"{'sums*' if is_development else 'sums':24} legs there {there.count('right')} of "
+            f"{len(there)}, absent wrong {absent.count('WRONG')} of {len(absent)}; intersections "
+            f"{sum(number > 0 for number in pieces)} of {len(pieces)}, in one piece "
+            f"{pieces.count(1)}; false {false} in {minutes:.1f} minutes"
+            f"{f' ({false / minutes:.2f} a minute)' if minutes else ''}"
+        )
+
+
+def _once(scores: Mapping[str, Score], drives: Mapping[str, Drive]) -> list[str]:
+    """Names of scored drives, of the same stretch with other settings the first."""
+    stretches = {(drives[name].folder, drives[name].cut): name for name in reversed([*scores])}
+    return [*reversed(stretches.values())]
 
 
 def _shown(legs: Mapping[Any, tuple[bool, bool]]) -> str:
@@ -492,11 +527,11 @@ def main(arguments: Sequence[str]) -> None:
         print(
             f"{name + ('*' if drive.is_development else ''):24} {lights:>9} {stops:>10} "
             f"{'':20} {legs:52} {_shown(score.messages):>26} "
-            f"{score.first:>9} {score.pieces:6} {score.false_intersections:6} "
+            f"{score.first:>9} {sum(score.pieces):6} {score.false_intersections:6} "
             f"{f'{inside}/{total}' if total else '-':>8}",
             flush=True,
         )
-    print(*evidence(scores), sep="\n")
+    print(*evidence(scores), *sums(scores), sep="\n")
     brier = [one for score in scores.values() for one in score.brier]
     print(f"Brier score {np.mean(brier or [np.nan]):.3f} of {len(brier)} features of approaches")
 

@@ -146,6 +146,46 @@ def test_messages_of_roads_are_counted_apart_from_the_beliefs_they_lead_to() -> 
     assert lines["openings*"].startswith("1 1 1 of 1 true, 0 of 0 absent (kitti")
 
 
+def test_sums_of_legs_and_intersections_are_apart_for_drives_of_development() -> None:
+    drives = {
+        "a": Drive("one", "*.jpg", 10.0, is_development=False),
+        "a again": Drive("one", "*.jpg", 10.0, is_development=False),
+        "b": Drive("two", "*.jpg", 10.0, is_development=False),
+        "seen": Drive("three", "*.jpg", 10.0),
+    }
+    there, absent = (True, False), (False, False)
+    first = Score(
+        legs={"1 left": "right", "2 left": "not seen", "2 right": "right", "2 straight": "WRONG"},
+        messages={"1 left": there, "2 left": there, "2 right": absent, "2 straight": absent},
+        pieces=[1, 0],
+        false_intersections=1,
+        minutes=1.5,
+    )
+    scores = {
+        "a": first,
+        "a again": first,
+        "b": Score(
+            legs={"left": "undecided 0.61"},
+            messages={"left": there},
+            pieces=[2],
+            false_intersections=2,
+            minutes=0.5,
+        ),
+        "seen": Score(legs={"left": "WRONG"}, messages={"left": absent}),
+    }
+
+    development, others = NAMES["sums"](scores, drives)
+
+    assert " ".join(development.split()) == (
+        "sums* legs there 0 of 0, absent wrong 1 of 1; intersections 0 of 0, in one piece 0; "
+        "false 0 in 0.0 minutes"
+    )
+    assert " ".join(others.split()) == (
+        "sums legs there 1 of 3, absent wrong 1 of 2; intersections 2 of 3, in one piece 1; "
+        "false 3 in 2.0 minutes (1.50 a minute)"
+    )
+
+
 def test_a_message_in_any_annotated_frame_shows_its_leg() -> None:
     approach = Approach(
         1, 2, {"intersection": True, "left": True, "right": False, "straight": None}
@@ -160,6 +200,7 @@ def test_a_message_in_any_annotated_frame_shows_its_leg() -> None:
 
     assert scored.messages == {"left": (True, True), "right": (False, False)}
     assert scored.legs == {"left": "not seen", "right": "not seen"}
+    assert scored.pieces == [0]
 
 
 def test_belief_is_judged_in_each_annotated_frame_and_outside_approaches_by_its_prior() -> None:
