@@ -24,8 +24,9 @@ from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.camera import Camera
 
 CELL_M: Final = 0.25
-# Fractions of a cell in which places are added: whole numbers are added in a third of the time.
-FRACTIONS: Final = 2**20
+# Fractions of a cell in which places are added, as a power of 2: whole numbers are added in a third
+# of the time.
+FRACTIONS: Final = 20
 # Half of the side of the square grid.
 HALF_M: Final = 70.0
 CELLS: Final = round(2 * HALF_M / CELL_M)
@@ -164,7 +165,7 @@ class RoadArea:
         shown = _shown(road, boxes_px * [across, down, across, down], away_m, top)
         cells = x.astype(np.int32)
         cells *= shown.shape[1]
-        cells += np.maximum(np.subtract(y, top, out=y), 0.0, out=y).astype(np.int32)
+        cells += np.maximum(y.astype(np.int32) - top, 0)
         found = shown.take(cells, mode="clip")
         np.multiply(ahead_m, ahead_m, out=weight)
         weight += np.multiply(left_m, left_m, out=x)
@@ -189,7 +190,8 @@ class RoadArea:
         cells = _cells(x + ahead_m * cos, -left_m * sin)
         cells *= CELLS
         cells += _cells(y + ahead_m * sin, left_m * cos)
-        seen, road = (grid.take(cells, mode="clip") for grid in (self._seen, self._road))
+        places = cells.astype(np.intp)
+        seen, road = (grid.take(places, mode="clip") for grid in (self._seen, self._road))
         is_seen = seen >= min_weight
         # 0 / 0 is NaN; that takes a third of the time of a choice by cell.
         seen *= is_seen
@@ -203,14 +205,14 @@ class RoadArea:
 
     def _ahead(self) -> tuple[slice, slice, Floats, Floats]:
         """Part of the grid around the ground in reach, and its cells' middles from the car."""
-        x, y = np.array([[0.0, self._far_m], [-ASIDE_M, ASIDE_M]])
         cos, sin = math.cos(self._heading), math.sin(self._heading)
-        away_m = (x * cos - (y * sin)[:, None], x * sin + (y * cos)[:, None])
+        corners = [(x, y) for x in (0.0, self._far_m) for y in (-ASIDE_M, ASIDE_M)]
+        away_m = ([x * cos - y * sin for x, y in corners], [x * sin + y * cos for x, y in corners])
         parts, middles_m = [], []
-        for at_m, corners_m in zip(self._xy_m, away_m, strict=True):
+        for at_m, corners_m in zip(self._xy_m.tolist(), away_m, strict=True):
             first, last = (
                 min(max(int((at_m + off_m + HALF_M) / CELL_M), 0), CELLS - 1)
-                for off_m in (corners_m.min(), corners_m.max())
+                for off_m in (min(corners_m), max(corners_m))
             )
             parts.append(slice(first, last + 1))
             middles_m.append((np.arange(first, last + 1) + 0.5) * CELL_M - HALF_M - at_m)
@@ -219,10 +221,10 @@ class RoadArea:
 
 def _cells(along_m: Floats, across_m: Floats) -> NDArray[np.int32]:
     """Rows or columns of the grid at the sums of two places, in whole fractions of a cell."""
-    along = np.rint((along_m + HALF_M) * (FRACTIONS / CELL_M)).astype(np.int32)
-    across = np.rint(across_m * (FRACTIONS / CELL_M)).astype(np.int32)
+    along = np.rint((along_m + HALF_M) * (2**FRACTIONS / CELL_M)).astype(np.int32)
+    across = np.rint(across_m * (2**FRACTIONS / CELL_M)).astype(np.int32)
     found = np.add.outer(along, across)
-    found //= FRACTIONS
+    found >>= FRACTIONS
     return np.clip(found, 0, CELLS - 1, out=found)
 
 
@@ -240,7 +242,8 @@ def _shown(road: RoadMask, boxes_px: Floats, away_m: Floats, top: int = 0) -> ND
     # or back.
     turns = 2 * rle.checked_runs(road.mask, road.mask_size_px).cumsum()[:-1] + 1
     keys = np.concatenate([turns, 2 * height * np.arange(width)])
-    keys.sort()
+    # A stable sort merges the two parts, which are sorted, in a twentieth of the time.
+    keys.sort(kind="stable")
     starts, is_road = keys >> 1, (keys & 1).cumsum() & 1 > 0
     first = starts % height
     stop = first + np.append(starts[1:], width * height) - starts

@@ -226,19 +226,19 @@ def _edge(plan: RoadPlan, side: int) -> _Edge:
     # The nearest road to the car's axis, of two the outer one.
     aside = np.array(sorted(range(-around, around + 1), key=abs))
     near = is_road.take(middle + aside, axis=1)
-    starts = middle + aside.take(near.argmax(axis=1))
+    nearest, rows = near.argmax(axis=1), np.arange(len(road))
+    starts = middle + aside.take(nearest)
     # The edge is the last cell before the next one that ends the road. A gap of one cell is noise.
     ends = ~is_road
     ends[:, 2:] &= ~is_road[:, 1:-1]
     ends &= np.arange(road.shape[1]) < starts[:, None]
-    inwards = ends[:, ::-1].argmax(axis=1)
-    rows = np.arange(len(road))
-    last = np.where(ends.any(axis=1), road.shape[1] - 1 - inwards, -1)
-    has_road = near.any(axis=1)
+    last = road.shape[1] - 1 - ends[:, ::-1].argmax(axis=1)
+    last = np.where(ends[rows, last], last, -1)
+    has_road = near[rows, nearest]
     out_m = np.where(has_road, left_m[last + 1] + 0.5 * CELL_M, np.nan)
     is_kerb = has_road & (last >= 0) & np.isfinite(road[rows, last])
     span = np.isfinite(road[:, middle - around // 2 : middle + around // 2 + 1])
-    is_closed = ~has_road & (span.mean(axis=1) > 0.8)
+    is_closed = ~has_road & (np.add.reduce(span, axis=1) > 0.8 * span.shape[1])
     return _Edge(out_m, is_kerb, is_closed)
 
 
