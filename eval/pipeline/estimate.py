@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 from crosscue.eval.pipeline.outcome import DetectOutcome, Outcome
 from crosscue.eval.runs.account import UNATTRIBUTED, Account, account, joined_accounts, reading_of
 from crosscue.eval.runs.drive import Drive
-from crosscue.eval.runs.folder import MANIFEST, RunFolder, write_manifest, write_timings
+from crosscue.eval.runs.folder import RunFolder, write_manifest, write_timings
 from crosscue.eval.runs.logs import log_names, log_rows
 from crosscue.eval.runs.manifest import (
     DetectManifest,
@@ -147,8 +147,6 @@ class EstimateStage:
             search = landmark_stage(landmarks, vehicle, self._ledgers[camera[0]])
             self.pose.landmarks = search
             self._extractors[camera[0]].on_pictures = search.see
-        if before.detected is None:
-            begin_again(run, found)
         has_speed = self._planned.source_of(Signal.WHEEL_SPEEDS) is not None
         self._visual: VisualSource | None = None
         if not has_speed and vehicle.odometry.kind != "wheels":
@@ -344,14 +342,6 @@ def _driven_s(timeline: Timeline, tally: PoseTally) -> float:
     pairs = zip(timeline.segments, later, strict=False)
     gaps_ns = sum(b.start_ns - a.end_ns for a, b in pairs if b.breaks_odometry)
     return tally.seconds - gaps_ns * 1e-9
-
-
-def begin_again(run: RunFolder, found: DetectManifest | None) -> None:
-    """Restore the detect stage's manifest, so that an interrupted run does not look complete."""
-    if found is None:
-        run.file(MANIFEST).unlink(missing_ok=True)
-    else:
-        write_manifest(run, found)
 
 
 def _camera_skips(run: RunFolder, camera: str) -> pa.Table:

@@ -33,7 +33,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .detecting import Detecting
 from .drive_time import with_camera_segments, with_segments
 from .empty_result import nothing_left
-from .estimate import Earlier, begin_again
+from .estimate import Earlier
 from .replay import detect, estimate
 
 if TYPE_CHECKING:
@@ -175,8 +175,6 @@ def estimate_run(
         changed = None if vehicle is None else settings_changed(run, vehicle)
         new = stack.enter_context(staged(run, keep=True, until=manifest.detected))
         if changed is not None:
-            # In this order, an interrupted run does not look complete.
-            begin_again(new, manifest.detected)
             write_input(new, changed)
         drive = Drive(logs, settings, manifest.selection.selection)
         found = manifest.detected

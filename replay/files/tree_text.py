@@ -15,6 +15,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Mapping
+from json.encoder import encode_basestring_ascii as _quoted
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
@@ -179,12 +180,12 @@ def _escape(found: re.Match[str]) -> str:
 
 def _text(value: object, line: str) -> str:
     """Return JSON text of which each line begins with ``line``; json itself indents slowly."""
-    inner = f"{line}  "
     if isinstance(value, str):
-        return json.dumps(valid_text(value))
-    if isinstance(value, Mapping):
+        return _quoted(valid_text(value))
+    inner = f"{line}  "
+    if isinstance(value, dict | Mapping):
         items = sorted({valid_text(str(key)): item for key, item in value.items()}.items())
-        rows = [f"{json.dumps(key)}: {_text(item, inner)}" for key, item in items]
+        rows = [f"{_quoted(key)}: {_text(item, inner)}" for key, item in items]
         return f"{{{inner}{f',{inner}'.join(rows)}{line}}}" if rows else "{}"
     if isinstance(value, list | tuple):
         rows = [_text(item, inner) for item in value]
