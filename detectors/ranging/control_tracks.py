@@ -24,6 +24,7 @@ import numpy as np
 from crosscue.detectors.base import ACCEPTED, MIN_SCORE, Detections, is_repeated
 from crosscue.detectors.cues.candidates import TOO_LITTLE_EVIDENCE
 from crosscue.detectors.signs.second_look import OTHER_SIGNS
+from crosscue.replay.columns import Floats
 from crosscue.replay.vehicle.vehicle import STOP_SIGN, TRAFFIC_LIGHT, CueSpec, Vehicle
 
 from .ground_plane import GroundPlane
@@ -72,8 +73,11 @@ class ControlTracks:
         # The variance of slip_per_sqrt_m is not used: the tracks have scale_sd of the distance.
         slip_m2 = self.vehicle.odometry.slip_per_sqrt_m**2 * abs(motion.way_m or 0.0)
         motion = motion._replace(var_m2=max(motion.var_m2 - slip_m2, 0.0))
+        whole_px = [
+            np.where(are_cut(one.boxes_px, one.size_px), 0.0, one.heights_px) for one in found
+        ]
         for cue in (STOP_SIGN, TRAFFIC_LIGHT):
-            self._track(cue, found, motion, decisions, is_new=is_new)
+            self._track(cue, found, whole_px, motion, decisions, is_new=is_new)
         if self.vehicle.cues.kind != "tracks":
             return tuple(found)
         return tuple(
@@ -91,19 +95,20 @@ class ControlTracks:
         self,
         cue: CueSpec,
         found: Sequence[Detections],
+        whole_px: Sequence[Floats],
         motion: CarStep,
         decisions: list[list[str]],
         *,
         is_new: bool,
     ) -> None:
-        """Track the objects of one cue, and enter the decisions on its detections."""
+        """Track the objects of one cue, and enter the decisions on its detections.
+
+        Heights in ``whole_px`` are 0 for objects that the picture's edge cuts.
+        """
         labels, is_tracked = self.vehicle.labels_of(cue), self.vehicle.cues.kind == "tracks"
         if not is_tracked and source_of(self.vehicle, cue.name) != "motion":
             return
         rows: list[tuple[int, int]] = []
-        whole_px = [
-            np.where(are_cut(one.boxes_px, one.size_px), 0.0, one.heights_px) for one in found
-        ]
         for k, one in enumerate(found):
             _, score = self.vehicle.threshold_of(cue)
             is_taken = one.scores >= MIN_CANDIDATE if is_tracked else one.are_sure(score)

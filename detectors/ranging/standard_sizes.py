@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Final, NamedTuple
 
-import numpy as np
-
 
 @dataclass(frozen=True)
 class SizePrior:
@@ -65,8 +63,8 @@ HOUSINGS: Final[Mapping[str, Housing]] = {
     "4 lenses of 0.30 m, backplate": Housing(1.68, 0.61, 0.05),
     "2 lenses of 0.30 m": Housing(0.71, 0.35, 0.02),
 }
-_COLUMNS: Final = np.array(list(HOUSINGS.values())).T.copy()
-_LOG_ASPECTS: Final = np.log(_COLUMNS[0] / _COLUMNS[1])
+# Height, logarithm of the aspect, and proportion of each.
+_ROWS: Final = [(h, math.log(h / w), proportion) for h, w, proportion in HOUSINGS.values()]
 # Spread of a box's aspect (height over width) about its housing's, in logarithms.
 ASPECT_SPREAD: Final = 0.15
 OBLIQUE: Final = 0.10
@@ -94,15 +92,18 @@ def light_size(aspect: float | None = None) -> SizePrior:
     Args:
         aspect: Positive; None where unknown, as for lights that are not upright.
     """
-    heights, _, weights = _COLUMNS
-    if aspect is not None:
-        off = (_LOG_ASPECTS - math.log(aspect)) / ASPECT_SPREAD
-        density = np.exp(-0.5 * off * off) / (ASPECT_SPREAD * math.sqrt(2.0 * math.pi))
-        weights = weights * ((1.0 - OBLIQUE) * density + OBLIQUE / ANY_ASPECT)
-    whole = float(np.add.reduce(weights))
-    mean_m = float(weights.dot(heights)) / whole
-    off = heights - mean_m
-    spread = math.sqrt(float(weights.dot(off * off)) / whole) / mean_m
+    whole = first = second = 0.0
+    log_aspect = math.nan if aspect is None else math.log(aspect)
+    for height_m, usual, weight in _ROWS:
+        if aspect is not None:
+            off = (usual - log_aspect) / ASPECT_SPREAD
+            density = math.exp(-0.5 * off * off) / (ASPECT_SPREAD * math.sqrt(2.0 * math.pi))
+            weight *= (1.0 - OBLIQUE) * density + OBLIQUE / ANY_ASPECT
+        whole += weight
+        first += weight * height_m
+        second += weight * height_m * height_m
+    mean_m = first / whole
+    spread = math.sqrt(second / whole - mean_m * mean_m) / mean_m
     return SizePrior(mean_m, math.hypot(spread, BOX_SPREAD))
 
 

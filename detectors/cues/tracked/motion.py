@@ -231,7 +231,8 @@ def _fit(
     is_used = np.arange(most) >= (most - counts)[:, None]
     used = (rows[:, :, -most:] * is_used[:, None, :, None, None]).reshape(len(frames), 2, -1, 5)
     sums = used.swapaxes(2, 3) @ used
-    sums[..., (2, 3), (2, 3)] += (USUAL_MPS**-2, aside_mps**-2)
+    sums[..., 2, 2] += USUAL_MPS**-2
+    sums[..., 3, 3] += aside_mps**-2
     covariance = np.linalg.inv(sums[..., :4, :4])
     state = covariance @ sums[..., :4, 4:]
     off = used[..., :4] @ state - used[..., 4:]
