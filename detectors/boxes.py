@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-# Number of boxes compared with all others at a time; bounds the table of pairs.
-_BLOCK: Final = 128
+# Number of boxes compared with all others at a time. Most are suppressed by the first ones.
+_BLOCK: Final = 32
 
 
 def box_ious(boxes: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:

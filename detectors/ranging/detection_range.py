@@ -176,7 +176,6 @@ def _by_size(
         return size_range(height_px, focal_px, size_prior("stop_sign"))
     if label not in VEHICLES:
         return None
-    foot = np.array([[0.5 * (x0 + x1), y1]])
-    ((ahead, _, up),) = GroundPlane.of(camera, size_px).rays(foot).tolist()
+    slope = GroundPlane.of(camera, size_px).slope(0.5 * (x0 + x1), y1)
     over_ground = GroundCamera(focal_px, camera.z_m, camera.pitch_sd_rad)
-    return vehicle_range(-up / ahead, height_px, over_ground, VEHICLES[label])
+    return vehicle_range(slope, height_px, over_ground, VEHICLES[label])

@@ -60,6 +60,14 @@ class GroundPlane:
         body = np.column_stack([np.ones(len(right_down)), -right_down])
         return np.asarray(body @ self.to_car.T, np.float64)
 
+    def slope(self, x_px: float, y_px: float) -> float:
+        """Downward slope of one pixel's ray per metre ahead; ``rays`` in plain numbers."""
+        left = (self.center_px[0] - x_px) / self.focal_px
+        above = (self.center_px[1] - y_px) / self.focal_px
+        forward, _, up = self.to_car.tolist()
+        ahead, rise = (one + by * left + high * above for one, by, high in (forward, up))
+        return float(-rise / ahead)
+
     def seen_at(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Project directions in the car's axes, shape (N, 3), to the picture, shape (N, 2).
 

@@ -168,6 +168,16 @@ def test_unprojection_inverts_projection(
     )
 
 
+@given(angles, angles, angles, st.floats(0.0, 1280.0), st.floats(0.0, 720.0))
+def test_slope_of_one_pixel_is_that_of_its_ray(
+    yaw: float, pitch: float, roll: float, x_px: float, y_px: float
+) -> None:
+    mounted = plane(yaw, pitch, roll)
+
+    ((ahead, _, up),) = mounted.rays(np.array([[x_px, y_px]])).tolist()
+    assert mounted.slope(x_px, y_px) == pytest.approx(-up / ahead, rel=1e-9, abs=1e-12)
+
+
 @given(angles, angles, angles)
 def test_mounting_rotation_matches_scipy(yaw: float, pitch: float, roll: float) -> None:
     expected = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
