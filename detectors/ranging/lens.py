@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Version of the rule; cached results of other versions are not used.
-VERSION: Final = 1
+VERSION: Final = 2
 Lens = Literal["red", "yellow", "green", "dark", "unknown"]
 MIN_WIDTH_PX: Final = 6.0
 # Height below which a box is too small: its lens, a third of it, is under five pixels.
@@ -51,7 +51,7 @@ def lens_of(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Lens:
     """Find the lit lens in one box; ``dark`` if none is lit, ``unknown`` if the box is too small.
 
     Args:
-        pixels: Shape (H, W, 3), blue, green, red; or (H, W) grey, for which the lens is unknown.
+        pixels: Shape (H, W, 3), blue, green, red; or (H, W). In grey, the lens is unknown.
         box_px: x0, y0, x1, y1 in those pixels.
     """
     x0, y0, x1, y1 = box_px.tolist()
@@ -65,6 +65,8 @@ def lens_of(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Lens:
     import cv2
 
     hue, saturation, value = cv2.split(cv2.cvtColor(crop, cv2.COLOR_BGR2HSV))
+    if not saturation.any():
+        return "unknown"
     is_lit = (saturation >= MIN_SATURATION) & (value >= MIN_VALUE)
     lit: dict[Lens, float] = {"dark": 0.0}
     colours = np.asarray(cv2.LUT(hue, _COLOURS), np.uint8) * is_lit

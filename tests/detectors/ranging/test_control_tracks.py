@@ -11,7 +11,11 @@ from crosscue.detectors.base import ACCEPTED, Detections
 from crosscue.detectors.cues.candidates import TOO_LITTLE_EVIDENCE
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections
-from crosscue.detectors.ranging.control_tracks import ControlTracks
+from crosscue.detectors.ranging.control_tracks import (
+    BELOW_HORIZON,
+    ONLY_DARK,
+    ControlTracks,
+)
 from crosscue.detectors.ranging.lens import Lens, lens_of
 from crosscue.detectors.ranging.object_tracks import CarStep
 from crosscue.replay.columns import Bytes
@@ -70,7 +74,7 @@ def test_fifty_weak_consistent_frames_are_accepted() -> None:
 def test_isolated_strong_boxes_are_not_accepted(score: float) -> None:
     rng = np.random.default_rng(3)
     frames: list[list[Seen]] = [
-        [(float(rng.uniform(20, 1260)), float(rng.uniform(20, 700)), score, "red")]
+        [(float(rng.uniform(20, 1260)), float(rng.uniform(20, 600)), score, "red")]
         if i % 5 == 0
         else []
         for i in range(100)
@@ -140,7 +144,7 @@ def test_pause_of_the_log_neither_adds_evidence_nor_takes_a_decision_back() -> N
 @pytest.mark.parametrize("rate_hz", [10, 20, 50])
 def test_evidence_of_a_second_is_the_same_at_any_frame_rate(rate_hz: int) -> None:
     seconds = 1.0 / rate_hz
-    frames = [[(600.0, 140.0, 0.4, "unknown")]] * (6 * rate_hz)
+    frames = [[(600.0, 140.0, 0.37, "unknown")]] * (6 * rate_hz)
     found = decided(frames, step=STEP._replace(seconds=seconds))
 
     first_s = seconds * next(i for i, one in enumerate(found) if one == (ACCEPTED,))
@@ -156,7 +160,7 @@ def test_light_that_is_missed_in_every_other_frame_is_still_found() -> None:
 
 def test_acceptance_is_taken_back_when_the_evidence_turns() -> None:
     strong: list[Seen] = [(600.0, 140.0, 0.8, "unknown")]
-    weak: list[Seen] = [(600.0, 140.0, 0.12, "dark")]
+    weak: list[Seen] = [(600.0, 140.0, 0.1, "unknown")]
     found = decided([strong] * 5 + [weak] * 30 + [strong] * 10)
 
     assert found[4] == found[8] == found[-1] == (ACCEPTED,)
@@ -179,10 +183,48 @@ def test_light_is_followed_through_rare_pictures_without_odometry() -> None:
 def test_dark_housing_needs_more_frames_than_a_lit_one() -> None:
     first = {}
     for lens in ("red", "unknown", "dark"):
-        found = decided([[(600.0, 140.0, 0.5, lens)]] * 40)
-        first[lens] = found.index((ACCEPTED,))
+        found = decided([[(600.0, 140.0, 0.4, lens), (900.0, 140.0, 0.9, "red")]] * 40)
+        first[lens] = [one for one, _ in found].index(ACCEPTED)
 
     assert first["red"] < first["unknown"] < first["dark"]
+
+
+@pytest.mark.parametrize("lit", ["red", "yellow", "green"])
+def test_dark_light_counts_only_while_a_lit_one_is_beside_it(lit: str) -> None:
+    dark, beside = (600.0, 140.0, 0.9, "dark"), (900.0, 140.0, 0.9, lit)
+    flare = (900.0, 700.0, 0.9, lit)
+
+    assert set(decided([[dark]] * 40)[3:]) == {(ONLY_DARK,)}
+    assert decided([[dark, flare]] * 40)[-1] == (ONLY_DARK, BELOW_HORIZON)
+    # What was lit once, or is too small or grey to tell, needs no other.
+    assert decided([[(600.0, 140.0, 0.9, lit)], *[[dark]] * 40])[-1] == (ACCEPTED,)
+    assert decided([[(600.0, 140.0, 0.9, "unknown")]] * 40)[-1] == (ACCEPTED,)
+
+    found = decided([*[[dark, beside]] * 10, *[[dark]] * 30])
+
+    assert found[9] == (ACCEPTED, ACCEPTED)
+    assert found[-1] == (ONLY_DARK,)
+
+
+def test_at_one_score_small_and_long_boxes_are_more_evidence_whichever_way_they_lie() -> None:
+    tracks, half = ControlTracks(car()), 0.5 * CORNERS
+    places = np.array([[200.0, 100.0], [400.0, 100.0], [600.0, 100.0], [900.0, 150.0]])
+    sizes = np.array([[12.0, 30.0], [30.0, 12.0], [30.0, 30.0], [80.0, 200.0]])
+    boxes_px = np.hstack([places, places]) + half * np.hstack([sizes, sizes])
+    for i in range(60):
+        one = frame([(x, y, 0.45, "unknown") for x, y in places.tolist()])
+        (said,) = tracks([replace(one, boxes_px=boxes_px + 0.01 * i)], STEP)
+
+    assert said.decisions == (ACCEPTED, ACCEPTED, TOO_LITTLE_EVIDENCE, TOO_LITTLE_EVIDENCE)
+
+
+def test_flare_far_below_the_horizon_is_no_light() -> None:
+    looks_up = car("[camera]\nfocal_px = 1280.0\npitch_rad = -0.1\n")
+    below, above = [(600.0, 640.0, 0.9, "green")], [(600.0, 590.0, 0.9, "green")]
+
+    assert set(decided([below] * 40)) == {(BELOW_HORIZON,)}
+    assert decided([above] * 40)[-1] == (ACCEPTED,)
+    assert decided([below] * 40, vehicle=looks_up)[-1] == (ACCEPTED,)
 
 
 @pytest.mark.parametrize(
@@ -336,4 +378,5 @@ def test_small_grey_or_outside_box_has_an_unknown_lens() -> None:
 
     assert lens_of(picture, BOX * 0.2) == "unknown"
     assert lens_of(picture[:, :, 0].copy(), BOX) == "unknown"
+    assert lens_of(picture[:, :, :1].repeat(3, axis=2), BOX) == "unknown"
     assert lens_of(picture, BOX + 200.0) == "unknown"
