@@ -7,8 +7,6 @@ The six packages ``replay``, ``detectors``, ``fusion``, ``localization``, ``data
 are at the top of the repository and are linked here, so that only ``crosscue`` is installed.
 """
 
-from __future__ import annotations
-
 import re
 from importlib import import_module
 from pathlib import Path

@@ -4,8 +4,6 @@ A verb is a function of the package whose command line is generated from it; see
 ``crosscue.eval.command_line``.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Callable

@@ -5,8 +5,6 @@ from spatial to geographical coordinates", Survey Review 23, 1976); the constant
 STND.0036).
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The detector protocol, its input frames and its results."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Protocol, Self, TypeAlias

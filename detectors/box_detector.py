@@ -1,7 +1,5 @@
 """Base class of detectors that find boxes in one picture at a time."""
 
-from __future__ import annotations
-
 import inspect
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence

@@ -1,7 +1,5 @@
 """Overlap of boxes, and non-maximum suppression."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -4,8 +4,6 @@ A megabyte of PNG can decode to gigabytes, so the picture's header is read first
 is ignored: calibration refers to the pixels in the sensor's order.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """Draw detections and cues into pictures, for visual inspection."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

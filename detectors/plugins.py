@@ -1,7 +1,5 @@
 """List plug-ins of installed packages, with the reasons of those that do not load."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 
 from crosscue.detectors.registry import BUILTIN

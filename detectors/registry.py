@@ -7,8 +7,6 @@ and returns a ``Detector``; a class is its own factory. From Python, a class, a 
 frame to its boxes, or a detector itself can take the place of a name.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

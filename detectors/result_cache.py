@@ -4,8 +4,6 @@ It is one SQLite file; the key is a hash of the picture and the detector's ident
 fails its checksum is ignored. Times are not stored: two equal pictures share their result.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

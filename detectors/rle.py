@@ -11,8 +11,6 @@ For a mask known in a box it needs the whole picture, which takes 15 to 30 times
 where this module raises an error.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

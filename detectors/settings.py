@@ -1,7 +1,5 @@
 """Base of detectors' settings: typed, frozen, and without unknown keys."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ checksum covers description and weights and is stored in the file's header. For 
 the hash of the whole file is known.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

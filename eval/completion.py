@@ -1,7 +1,5 @@
 """Shell completion of commands, options, choices and files."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import shlex

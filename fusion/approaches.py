@@ -24,8 +24,6 @@ dropped.
 Only the published belief lets this distance end an approach whose evidence is still in view.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence

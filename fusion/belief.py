@@ -1,7 +1,5 @@
 """Belief over the features of one intersection, in log odds, and messages of cues (eq. 18)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

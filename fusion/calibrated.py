@@ -21,8 +21,6 @@ this. An edge without fitted rates (for example, without an annotated drive that
 uses the published message, discounted by the distance or time since it was last sent.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field

@@ -9,8 +9,6 @@ distance and how cues follow each other, the other only how much was seen, and t
 direction is more probable than the intersection itself.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """Evidence of one frame: ranges, counts of cues, and the distance since the previous frame."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 

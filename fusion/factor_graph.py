@@ -4,8 +4,6 @@ All features are binary and every cue is observed, so each marginal is the norma
 messages into it; in log odds, it is their sum.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields, replace
 from typing import Final, Self

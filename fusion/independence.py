@@ -1,7 +1,5 @@
 """Weights of correlated observations."""
 
-from __future__ import annotations
-
 import math
 
 

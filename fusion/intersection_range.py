@@ -7,8 +7,6 @@ the variance in Joseph's form, which remains positive. It is imported at the fir
 the import takes longer than the estimation of a short drive without ranges.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from enum import StrEnum
 from typing import NamedTuple

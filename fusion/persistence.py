@@ -21,8 +21,6 @@ another cue of the approach supports a feature, too: a light may be a pedestrian
 number of frames tells. Its messages beyond are held back until then.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Collection, Mapping

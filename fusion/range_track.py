@@ -6,8 +6,6 @@ measurements that agree with each other form a rival belief, which replaces the 
 enough measurements. Otherwise, one wrong first measurement would exclude all correct ones.
 """
 
-from __future__ import annotations
-
 import math
 from enum import StrEnum
 from typing import Final, NamedTuple

@@ -1,7 +1,5 @@
 """Situation of a frame: the input of a message model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

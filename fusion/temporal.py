@@ -25,8 +25,6 @@ With likelihoods raised to an exponent, because cues are redundant, the posterio
 Tutorial on Hidden Markov Models*, Proc. IEEE 77, 1989, section III.A).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Angles on the circle; radians, counter-clockwise, wrapped to (-pi, pi]."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

@@ -8,8 +8,6 @@ their correlation, which is that of this drive (long-run variance; Newey and Wes
 1987).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ part points to magnetic north. Heading is counter-clockwise from east; magnetic 
 Low Cost Compass Systems", IEEE PLANS 2000.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 from typing import Final, TypeAlias

@@ -12,8 +12,6 @@ less far than the arc says. These errors of all steps since a measurement have o
 their sum is kept, and not the sum of their squares.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, TypeAlias

@@ -5,8 +5,6 @@ State ``[x_m, y_m, heading_rad, speed_mps]``: the centre of the rear axle in a p
 filter's equations are those of ``pose_filter``.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final, NamedTuple

@@ -1,7 +1,5 @@
 """Covariances of positions, and their 2-sigma ellipses."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from crosscue.replay.columns import Floats

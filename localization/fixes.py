@@ -1,7 +1,5 @@
 """Measured positions of a point of the car: GNSS, a true track, or landmarks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -9,8 +9,6 @@ uniformly distributed over the disc that the car can reach (the variance along e
 quarter of the radius squared), and the heading over the angles that it can turn.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

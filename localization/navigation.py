@@ -7,8 +7,6 @@ The penalty grows each time the same option is taken at the same intersection, w
 dissertation compares to tabu search. Intersections are recognised by the *estimated* position only.
 """
 
-from __future__ import annotations
-
 import math
 from enum import IntEnum
 from typing import Final, NamedTuple, TypeVar

@@ -11,8 +11,6 @@ section 10.3 (EKF) and 5.2.3 (update, here as P - K S K').
 These equations exist only here. The replay calls them, and the Monte Carlo studies compile them.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final, NamedTuple
 

@@ -17,8 +17,6 @@ for bit, to that of a single window. A ``MeasurementSource`` adds measurements a
 as landmarks at a camera's frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Final, NamedTuple, Protocol, Self

@@ -5,8 +5,6 @@ skipped. A reading is about ``delay_s`` old at its timestamp, so it is moved ahe
 that the car travels in that time.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

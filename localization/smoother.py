@@ -10,8 +10,6 @@ chapter 10), which inverts only covariances of measurements. It is a reference, 
 replay.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Estimate the pose at the start of a drive from its first known positions."""
 
-from __future__ import annotations
-
 import math
 from typing import Final, NamedTuple
 

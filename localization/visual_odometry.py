@@ -14,8 +14,6 @@
 Hartley and Zisserman, Multiple View Geometry, chapters 9 and 13. Moving vehicles must be masked.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple

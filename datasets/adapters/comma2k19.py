@@ -5,8 +5,6 @@ one clock. The data set's axes [forward, right, down] are converted to REP-103's
 on reading. CAN payloads are stored padded to 8 bytes, without their true lengths.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path

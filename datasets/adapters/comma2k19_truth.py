@@ -1,7 +1,5 @@
 """Write the true pose of a comma2k19 segment as ``truth.json`` with a TUM trajectory."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 

@@ -15,8 +15,6 @@ All values of the box are outputs of one filter: ``ins_speed`` is not a wheel sp
 not a raw fix.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice

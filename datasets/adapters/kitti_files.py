@@ -10,8 +10,6 @@ and length, its position right, down and ahead of the camera, and its rotation. 
 DontCare mark unlabelled parts of a picture.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

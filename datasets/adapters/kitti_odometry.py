@@ -13,8 +13,6 @@ The truth is the left grey camera's trajectory. Its map has the first picture's 
 convention of REP-103: x ahead (their z), y left (their -x), z up (their -y).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final, NamedTuple
 

@@ -15,8 +15,6 @@ published schema (for the expansion nuscenes-devkit, python-sdk/nuscenes/can_bus
 implemented without access to a drive of the data set.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

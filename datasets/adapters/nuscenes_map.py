@@ -6,8 +6,6 @@ on it. The layout is that of nuscenes-devkit, python-sdk/nuscenes/map_expansion.
 without access to a map.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final

@@ -3,8 +3,6 @@
 Rows are flat objects. After a damaged row, reading continues at the next brace.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -8,8 +8,6 @@ data set's four bins, over all six cameras). ``motion`` is the attribute of vehi
 stopped or parked.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final, NamedTuple

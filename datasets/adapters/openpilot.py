@@ -9,8 +9,6 @@ REP-103's [forward, left, up] on reading. Buses from 128 on hold frames that the
 The positions of fields are those that Cap'n Proto's encoding assigns to openpilot's ``log.capnp``.
 """
 
-from __future__ import annotations
-
 import bz2
 import io
 import math

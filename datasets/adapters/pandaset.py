@@ -10,8 +10,6 @@ Topics: one per camera; ``odometry`` (forward speed and yaw rate of the vehicle 
 camera's poses, which are as accurate as the poses and not wheel speeds); ``gnss``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final

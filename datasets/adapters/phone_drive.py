@@ -6,8 +6,6 @@ clocks without a time zone, which are read as UTC. A line of the phone's file is
 topics, so a damaged line is dropped from each of them.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """What adapters of data sets share: bounded files, numbered pictures, odometry of poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final

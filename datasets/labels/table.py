@@ -5,8 +5,6 @@ folders (``labels/train``), as exported by FiftyOne and CVAT, can also be read, 
 ``obj_train_data``, CVAT's "YOLO 1.1".
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

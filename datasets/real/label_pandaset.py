@@ -11,8 +11,6 @@ the picture, and a projected box is slightly wider than its object. Scores shoul
 overlap of at most 0.5.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path

@@ -7,8 +7,6 @@ replaces the publisher, with files ``MIRROR/NAME/FILE``. ``$CROSSCUE_DATA`` name
 searched first.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Meshes of cars with a realistic side view: a nose below the tail, wheels, glass and lamps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise

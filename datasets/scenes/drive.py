@@ -3,8 +3,6 @@
 The log is written in parts of a second, so that memory holds the pictures of one second only.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace

@@ -7,8 +7,6 @@ is constant during the drive, a part that decays over a second, and a part of th
 Consecutive frames are therefore wrong together, as they are with networks.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field

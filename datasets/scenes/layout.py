@@ -8,8 +8,6 @@ approach road at the start of the intersection (stop line, and stop sign if any)
 the crossroad is at ``NEAR_KERB_M``; the intersection ends at ``end_m``, where traffic lights hang.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal, get_args

@@ -4,8 +4,6 @@ Range, field of view, miss rates and errors are plausible values that were not m
 position error of a few per cent comes from the public description of the protocol.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Conditions of a run, and the motion of the car towards an intersection and through it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, Literal
 

@@ -1,7 +1,5 @@
 """Ground truth of a picture: its cues with their visible fractions, and its objects as COCO."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path

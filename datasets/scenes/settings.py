@@ -3,8 +3,6 @@
 Curves, regions and thresholds of the file were chosen on layouts L only, without layouts A to H.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final

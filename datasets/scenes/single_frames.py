@@ -5,8 +5,6 @@ each of a hundred intersections than from a thousand pictures of one. Road pictu
 from a folder: ``images/NAME.jpg`` with ``masks/NAME.png``, white for road.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """World of one run: static scenery, labelled objects and moving cars."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Final, Literal, NamedTuple

@@ -6,8 +6,6 @@ disturbance that varies along the road). The demo therefore does not score the f
 model.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path

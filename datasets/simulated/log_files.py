@@ -1,7 +1,5 @@
 """Write a simulated drive as files: log, vehicle file, DBC file and truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final

@@ -5,8 +5,6 @@ annotated picture without the label means that the cue is absent. Other labels r
 objects.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 import re

@@ -16,8 +16,6 @@ A file without boxes means that its picture shows no objects; a picture without 
 labelled.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from collections import Counter

@@ -1,7 +1,5 @@
 """Read and write COCO annotation files: objects with boxes in pictures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Rows of tables in CSV, each with its place for messages."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterator

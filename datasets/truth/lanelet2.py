@@ -8,8 +8,6 @@ Controls are the regulatory elements ``traffic_light`` and ``all_way_stop``, and
 https://github.com/fzi-forschungszentrum-informatik/Lanelet2
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Lanes of a map as a graph of roads: those that cross, or turn off, are inside an intersection."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace

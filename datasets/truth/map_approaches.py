@@ -1,7 +1,5 @@
 """Approaches of a track to the intersections of a map, as truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -6,8 +6,6 @@ that of ``width``, else ``lanes`` of 3.25 m, else that of two lanes (one, if one
 https://wiki.openstreetmap.org/wiki/OSM_XML
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Roads of a map, their junctions, and what a vehicle that follows them comes to next."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal, NamedTuple

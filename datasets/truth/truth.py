@@ -4,8 +4,6 @@ Version 1 contains pose, approaches, cues and the names of files with objects an
 section is optional.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ Lines with ``#`` are comments. Times are decimal seconds. They are converted to 
 and back without floats, whose precision is too low for nanoseconds of this century.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from decimal import ROUND_HALF_EVEN, Decimal, InvalidOperation

@@ -1,7 +1,5 @@
 """Table of torchvision's detection networks: properties that a weights file does not record."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal

@@ -17,8 +17,6 @@ classes = ["person", "bicycle", "car"]
 architecture = "maskrcnn_resnet50_fpn"
 """
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self

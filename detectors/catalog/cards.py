@@ -1,7 +1,5 @@
 """Draft model cards from model files, and check cards by running their networks."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Class names: COCO's, those that a user gives, and the labels of cues for other vocabularies."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

@@ -7,8 +7,6 @@ threshold = 0.62
 calibration = {kind = "platt", slope = 1.4, offset = 0.3}
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 import numpy as np

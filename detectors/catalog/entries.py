@@ -1,7 +1,5 @@
 """Cards of the catalog's models, and the folders of their weights."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from crosscue.replay.errors import VehicleError

@@ -4,8 +4,6 @@
 ``MIRROR/NAME``. ``$CROSSCUE_DATA`` names a folder whose subfolder ``weights`` is searched.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The model catalog: list models, show their cards, and fetch their weights."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -165,7 +163,7 @@ def models() -> Models:
     return Models([Model(name, entry(name)) for name in names()])
 
 
-def model(name: Annotated[str | Path, Option(metavar="MODEL")]) -> Model:
+def model(name: Annotated[Path | str, Option(metavar="MODEL")]) -> Model:
     """Show a network's origin, classes and measurements.
 
     The cues' labels of its classes, and its measured performance, are part of it.

@@ -5,8 +5,6 @@ below the cache folder (``$CROSSCUE_MODELS``, else the user's cache), in a folde
 hash, so that two versions of a model can coexist.
 """
 
-from __future__ import annotations
-
 import difflib
 import os
 from functools import cache

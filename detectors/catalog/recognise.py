@@ -1,7 +1,5 @@
 """Read the interface that a model file declares, and infer the layout of its output."""
 
-from __future__ import annotations
-
 import ast
 import io
 import math

@@ -1,7 +1,5 @@
 """Recognise the torchvision network of a file of tensors by their names and shapes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final, get_args
 

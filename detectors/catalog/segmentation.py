@@ -1,7 +1,5 @@
 """Recognise networks that give each pixel a class, by the shape of their output."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final, TypeAlias
 

@@ -1,7 +1,5 @@
 """Base class of decoders, with the types of their inputs and results."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

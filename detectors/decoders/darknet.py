@@ -1,7 +1,5 @@
 """Decoder of Darknet's networks as its exporters to ONNX decode them."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

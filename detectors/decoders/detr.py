@@ -1,7 +1,5 @@
 """Decoder of the DETR family: a fixed number of queries, each with a box and class scores."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final, Literal
 

@@ -1,7 +1,5 @@
 """Decoder of networks with built-in suppression: YOLOv10, YOLO26, exports with NMS."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

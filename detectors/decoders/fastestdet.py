@@ -1,7 +1,5 @@
 """Decoder of FastestDet: one grid, whose channels are objectness, box and class scores."""
 
-from __future__ import annotations
-
 from typing import Final, Literal
 
 import numpy as np

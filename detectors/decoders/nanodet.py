@@ -1,7 +1,5 @@
 """Decoder of NanoDet-Plus: scores and distributions of distances in one table."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from typing_extensions import override

@@ -1,7 +1,5 @@
 """Decoders of exports with suppression: YOLOv7's, mmdeploy's and TensorRT's EfficientNMS."""
 
-from __future__ import annotations
-
 from typing import Final, Literal
 
 import numpy as np

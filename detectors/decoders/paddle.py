@@ -1,7 +1,5 @@
 """Decoders of PaddleDetection's exports, without and with its suppression."""
 
-from __future__ import annotations
-
 from typing import Final, Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Decoder of PicoDet and NanoDet (GFL): class scores, and a distribution of each distance."""
 
-from __future__ import annotations
-
 from typing import Final, Literal
 
 import numpy as np

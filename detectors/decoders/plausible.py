@@ -1,7 +1,5 @@
 """Tell boxes from the nonsense that a decoder makes of another layout's numbers."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

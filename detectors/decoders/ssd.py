@@ -1,7 +1,5 @@
 """Decoders of SSD: with suppression, of TensorFlow's and OpenVINO's model zoos, and without."""
 
-from __future__ import annotations
-
 from typing import Final, Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Table of all box layouts."""
 
-from __future__ import annotations
-
 from typing import Final, TypeAlias, get_args
 
 from .base import BoxOutput

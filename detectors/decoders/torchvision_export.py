@@ -1,7 +1,5 @@
 """Decoder of torchvision's detection models exported to ONNX."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, Literal
 

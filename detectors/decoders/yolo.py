@@ -1,7 +1,5 @@
 """Decoders of YOLOv5 to v11 in their projects' exports: boxes in input pixels, some with masks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, Literal
 

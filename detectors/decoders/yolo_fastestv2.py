@@ -1,7 +1,5 @@
 """Decoder of YOLO-Fastest v2: two grids with three anchors, whose class scores are shared."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Decoder of YOLO-NAS and DAMO-YOLO, exported without suppression: boxes and final scores."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from typing_extensions import override

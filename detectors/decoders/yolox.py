@@ -1,7 +1,5 @@
 """Decoder of YOLOX: boxes relative to grid cells, with objectness."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -7,8 +7,6 @@ be compressed without loss. The detectors' names are ``crosscue.detectors.label_
 ``:road``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple

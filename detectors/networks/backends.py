@@ -4,8 +4,6 @@ ONNX runs in ONNX Runtime or OpenVINO, OpenVINO IR in OpenVINO, TFLite in LiteRT
 of a verified hash and never refer to another file.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

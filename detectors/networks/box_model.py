@@ -1,7 +1,5 @@
 """Detector of boxes from a model card: batches, tiles, suppression and masks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 

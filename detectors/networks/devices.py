@@ -1,7 +1,5 @@
 """Select the device and the number of threads of a torch network."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

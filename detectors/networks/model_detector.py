@@ -3,8 +3,6 @@
 Settings: ``card``, ``backend``, ``threads``, ``score``, ``candidate_score``, ``enlarged``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

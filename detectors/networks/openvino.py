@@ -6,8 +6,6 @@ consent, and only a file in the home folder or an environment variable of CI mac
 If the telemetry package cannot be imported, OpenVINO uses a stub that sends nothing.
 """
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Convert pictures to a network's input, and boxes back to the picture."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

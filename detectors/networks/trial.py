@@ -1,7 +1,5 @@
 """Run a detector on pictures in which it must not find nonsense."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final

@@ -1,7 +1,5 @@
 """Verified weights, the input of a back end."""
 
-from __future__ import annotations
-
 from crosscue.detectors.settings import Settings
 
 

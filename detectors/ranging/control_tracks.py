@@ -11,8 +11,6 @@ evidence of a box at the detector's own threshold. Those of lights (``OF_LIGHT``
 regression of 3,907 boxes of lights on 15 drives and of 1,325 others on 31 drives without lights.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections import Counter

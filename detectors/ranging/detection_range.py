@@ -13,8 +13,6 @@ relative error by the spread of vehicles' heights is constant. The logarithms of
 weighted by their variances: the ground dominates at short range, the size at long range.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final, NamedTuple

@@ -5,8 +5,6 @@ camera ahead of the rear axle and for masks that are slightly too large. The dat
 family of curves fits best.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Final, Literal

@@ -7,8 +7,6 @@ lamps flicker and hoods hide them, so a track combines many frames to decide whe
 the car.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Final, Literal

@@ -11,8 +11,6 @@ A track is accepted by Wald's sequential probability ratio test (A. Wald, *Seque
 resemble each other, so a frame counts less the sooner it follows the last one.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

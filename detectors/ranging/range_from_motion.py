@@ -18,8 +18,6 @@ overconfidence:
 The scale of the errors is estimated with the range, from residuals and a weak prior.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from dataclasses import dataclass

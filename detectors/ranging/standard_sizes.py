@@ -6,8 +6,6 @@ around. The box's aspect shows which of them is probable: housings without a bac
 times as high as wide, those with one about twice.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Conditions under which a detection can measure the range to an intersection."""
 
-from __future__ import annotations
-
 from typing import Final, Literal
 
 import numpy as np

@@ -6,8 +6,6 @@ within the picture, or its mask is not of the picture's size. A box that exceeds
 clipped.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence

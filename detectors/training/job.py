@@ -1,7 +1,5 @@
 """Train a network from annotations to a checkpoint, with validation and resumption."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator

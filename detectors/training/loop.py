@@ -9,8 +9,6 @@ On a GPU, some operations have none, such as the gradient of RoI Align, which ad
 checkpoint records all that affects the bits, so that a difference between two can be explained.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

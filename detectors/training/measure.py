@@ -7,8 +7,6 @@ correct if it overlaps a not yet matched object of its class by 0.3. The bound i
 depends on the presence of a distant sign, and a box of ten pixels is easily off by two.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import time

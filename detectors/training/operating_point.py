@@ -1,7 +1,5 @@
 """Calibrate the scores of detections, and choose the minimum score of a sign for a precision."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

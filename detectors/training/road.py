@@ -3,8 +3,6 @@
 Pixels near the road's edge have more weight, because most of the road is near and soon learnt.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial

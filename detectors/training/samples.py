@@ -4,8 +4,6 @@ Signs and lights are small and rare. Most windows are therefore placed around an
 classes are selected more often.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

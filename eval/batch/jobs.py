@@ -8,8 +8,6 @@ however the first one ended. The reason of a failure is recorded in ``failure.lo
 run folder.
 """
 
-from __future__ import annotations
-
 import hashlib
 import time
 import traceback

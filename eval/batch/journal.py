@@ -5,8 +5,6 @@ file every few seconds, so that every machine that shares the folder can see tha
 alive. The end time of a drive is the modification time of its file; entries contain no time.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import threading

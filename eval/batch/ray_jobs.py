@@ -11,8 +11,6 @@ drive is therefore known: it is started again in a fresh process, and fails if t
 too. The standard library's pool would lose every drive in progress.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

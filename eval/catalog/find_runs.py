@@ -1,7 +1,5 @@
 """Runs that a command line names: run folders, folders of runs, patterns and lists."""
 
-from __future__ import annotations
-
 import glob
 from collections import Counter
 from collections.abc import Iterator, Sequence

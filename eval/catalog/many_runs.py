@@ -1,7 +1,5 @@
 """Comparison of two sets of runs, such as two versions over a fleet, paired by drive."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeAlias

@@ -1,7 +1,5 @@
 """The demonstration: replay, score and show a simulated or a downloaded drive."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from importlib import util

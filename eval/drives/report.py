@@ -1,7 +1,5 @@
 """Report of a run whose truth is unknown."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path

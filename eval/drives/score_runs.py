@@ -1,7 +1,5 @@
 """Score runs against their truth, each alone and all together, with gates and ablations."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

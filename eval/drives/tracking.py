@@ -5,8 +5,6 @@ MLflow is imported only here, with its telemetry turned off. For a server, its c
 stores in folders; they must be allowed with ``MLFLOW_ALLOW_FILE_STORE=true``.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

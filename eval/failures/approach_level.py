@@ -1,7 +1,5 @@
 """Failures of complete approaches: missed, late or invented features, and flipped beliefs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

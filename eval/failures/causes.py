@@ -6,8 +6,6 @@ it, and whether another cue or the gate of eq. 18 held the belief back. The cond
 are reported with the cause, because the dissertation explains its failures by them.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """All failures of one run: compared with its truth, or, without truth, flipped beliefs only."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

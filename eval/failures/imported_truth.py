@@ -1,7 +1,5 @@
 """Import annotated pictures of a log, or of an export of many drives, as truth."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections import Counter

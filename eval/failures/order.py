@@ -1,7 +1,5 @@
 """Order of failures: by severity, by cause, and with many kinds among the first few."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Fitting of a vehicle file's compass to a drive, with the GNSS course as the reference."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace

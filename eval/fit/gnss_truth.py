@@ -1,7 +1,5 @@
 """Ground truth from a drive's own GNSS, with stated quality."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final

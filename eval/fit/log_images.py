@@ -1,7 +1,5 @@
 """Times and size of the pictures of a log's camera, on the clock that runs use."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Complete signals of a drive, for fits that need all samples at once."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ground truth of intersections from a map, for a drive with positions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from crosscue.datasets.truth.lanelet2 import read_map

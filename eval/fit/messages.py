@@ -1,7 +1,5 @@
 """Fit of the reliability of each cue to annotated drives, for ``fusion.kind = "calibrated"``."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence

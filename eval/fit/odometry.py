@@ -1,7 +1,5 @@
 """Fitting of a vehicle file's odometry to one half of a drive, tested on the other half."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace

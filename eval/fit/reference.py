@@ -1,7 +1,5 @@
 """Known positions of a drive, from its GNSS or a truth file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeAlias

@@ -1,7 +1,5 @@
 """Fit of the beliefs over time to annotated drives: ``fusion.kind`` "combined" or "temporal"."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Checking a truth file against its log."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ or the section is written: to a file of its own, or into a copy of a vehicle fil
 all of it as a page.
 """
 
-from __future__ import annotations
-
 import json
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Compare two runs, or two sets of runs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated

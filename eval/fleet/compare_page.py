@@ -1,7 +1,5 @@
 """Page of a comparison: what got better, worse or stayed undecided, and where two runs differ."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Iterator, Sequence
 from pathlib import Path

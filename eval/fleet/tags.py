@@ -1,7 +1,5 @@
 """Set, remove and list tags of runs, by which they can be queried."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Convert any log to one MCAP file with standard ROS 2 types."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

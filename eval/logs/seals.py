@@ -1,7 +1,5 @@
 """Seal logs, and compare logs with their seals."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path

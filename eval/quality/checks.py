@@ -4,8 +4,6 @@ A function yields findings. A finding says for which purposes it matters, what i
 would help. ``missing`` makes a purpose impossible; every other kind leaves it usable with care.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal, TypeAlias, get_args

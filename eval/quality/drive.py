@@ -1,7 +1,5 @@
 """Everything that the checks of a drive look at, read in a few passes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final

@@ -9,8 +9,6 @@
     max_delay_s = 0.1
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The verdict on a drive, for each purpose."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

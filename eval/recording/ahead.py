@@ -4,8 +4,6 @@ The intersection is drawn across the road at its estimated range, with its 2-sig
 vehicles are the Mobileye's latest reports at that time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Final
 

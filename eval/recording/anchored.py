@@ -4,8 +4,6 @@ Both need odometry and the estimated place of the intersection. They are therefo
 frame by frame, as in the scene stage.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Recording of camera pictures: JPEG and PNG are passed through, others converted to JPEG."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Layout of a recording in the viewer."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final

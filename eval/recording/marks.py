@@ -4,8 +4,6 @@ Outlines are strips of a few points, and road is hatched every few rows. This ta
 of a mask's bytes and keeps the picture visible.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final

@@ -1,7 +1,5 @@
 """Page of text with the logs, dropped rows and the meaning of colours."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from typing import Final

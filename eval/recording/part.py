@@ -1,7 +1,5 @@
 """The part of a run that is recorded: a time span and views."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

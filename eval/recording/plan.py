@@ -1,7 +1,5 @@
 """The map view from above: x east, y north, in metres."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Final
 

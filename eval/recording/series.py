@@ -1,7 +1,5 @@
 """Time series of a recording: beliefs, ranges, cues and pose."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Final
 

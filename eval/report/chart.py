@@ -1,7 +1,5 @@
 """A chart of dots and lines, stated as values and drawn as SVG."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Final

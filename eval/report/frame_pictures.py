@@ -1,7 +1,5 @@
 """Pictures of frames with boxes, masks, road and regions, and a thumbnail of each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path

@@ -4,8 +4,6 @@ All inserted values are escaped. A page needs no network; only the first list of
 script.
 """
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Callable, Mapping

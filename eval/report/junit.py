@@ -1,7 +1,5 @@
 """Gates and comparisons as JUnit XML, which CI systems show as tests."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from typing import Final

@@ -1,7 +1,5 @@
 """First screen of a report: what happened, and pictures of the moments that matter."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Iterator, Sequence

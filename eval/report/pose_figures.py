@@ -1,7 +1,5 @@
 """Charts of a pose track: on a map, and over the distance travelled."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple

@@ -1,7 +1,5 @@
 """Charts of a scored scene for the report, after the dissertation's Fig. 29 and 31."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

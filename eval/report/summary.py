@@ -1,7 +1,5 @@
 """Text output of scores, at most 80 columns wide, coverage first."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

@@ -8,8 +8,6 @@ the page and has no tooltips. It is also twice as large (21 against 11 kB for fo
 points), and slower: twelve charts take 0.5 s of CPU, plus 0.35 s for the import, against 0.01 s.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

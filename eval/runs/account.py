@@ -10,8 +10,6 @@ camera's frames, and *estimating* the inputs of the filters. ``score`` adds *sco
 that is a bug in crosscue.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final, TypeAlias

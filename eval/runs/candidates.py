@@ -1,7 +1,5 @@
 """Counts of the candidates of cues and ranges by outcome, for the manifest and the summary."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Literal

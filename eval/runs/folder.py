@@ -3,8 +3,6 @@
 A file gets its final name only when it is complete. A lock file names the process that is writing.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -8,8 +8,6 @@ At the start of a run, ``input.json`` records what determines it: the identity o
 setting. ``--resume`` continues a run only if both are the same, because it would destroy any other.
 """
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

@@ -3,8 +3,6 @@
 Those of a run are known from its stage (``folder.own_files``); an export and a site list theirs.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Base class of the records of a run."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict

@@ -1,7 +1,5 @@
 """Text and hash of a run's settings, by which runs of the same drive are distinguished."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import marshal

@@ -1,7 +1,5 @@
 """Pictures of a run, read again from its log, on the clock of the run's tables."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ They are stored in a separate file, so that tagging does not change the bytes of
 results.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -13,8 +13,6 @@ point in at most 5 % of cases, and so does each further round of the search. Fin
 point is tested again between its neighbors, and dropped if they explain it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Quantiles of the chi-square distribution for consistency checks."""
 
-from __future__ import annotations
-
 
 def quantile(probability: float, dimensions: int) -> float:
     """Return the quantile of a chi-square variable with ``dimensions`` degrees of freedom.

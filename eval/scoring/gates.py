@@ -11,8 +11,6 @@ A gate file is TOML::
     min_count = 100  # with fewer rows than this, the gate fails; default: 1
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Mapping, Sequence

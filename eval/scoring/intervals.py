@@ -21,8 +21,6 @@ up to 0.4, and at most 98 % beyond; over six to eight, 92 to 98 %, and 89 % at w
 correlation, which so few hardly show.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final, NamedTuple

@@ -1,7 +1,5 @@
 """Numbers of a metrics tree by path, such as ``cues.stop_sign.precision``."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ one, where the drive starts), else the name of the intersection. Positions are `
 5870). Two within ``NEAR_M`` of each other are one place, and so are those that others connect.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path

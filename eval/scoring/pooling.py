@@ -1,7 +1,5 @@
 """Pool the rows of many drives."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise

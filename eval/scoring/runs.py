@@ -1,7 +1,5 @@
 """Compare run folders with their truth, and pool their scores."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass

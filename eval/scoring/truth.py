@@ -1,7 +1,5 @@
 """Truth of a drive at given times: the approach, the range, and the visible cues."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ Detectors do not run again; the caller supplies the estimates. Distances and log
 approach by approach, so their intervals are those of paired differences.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass

@@ -6,8 +6,6 @@ Techniques*, section 6.4). All others use the bootstrap, with percentiles widene
 section 4.3).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final, NamedTuple
 

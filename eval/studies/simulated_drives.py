@@ -5,8 +5,6 @@ study has about the same number of drives of each layout. A second start continu
 drives.
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 from collections.abc import Mapping, Sequence

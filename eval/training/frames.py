@@ -1,7 +1,5 @@
 """Render annotated pictures for training."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Check the inputs of a training: names of layouts, and a writable output path."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Check of a vehicle file: reads some seconds of a drive with it and reports contradictions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Draft of a first vehicle file from the contents of a drive."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, replace

@@ -1,7 +1,5 @@
 """Check of a vehicle file on a few seconds of a drive, as a table, a page or a picture."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Iterator, Sequence

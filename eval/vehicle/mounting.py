@@ -1,7 +1,5 @@
 """What a drive shows of its camera: focal length, pitch, yaw, height, and delay of its stamps."""
 
-from __future__ import annotations
-
 import math
 from typing import Final, NamedTuple
 

@@ -4,8 +4,6 @@ Everything that is learnt from pictures alone is computed from this pass: whethe
 the delay of their time stamps, and the focal length, height and direction of the camera.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass

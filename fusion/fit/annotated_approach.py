@@ -1,7 +1,5 @@
 """An approach of a run with the ground truth of its intersection."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final

@@ -5,8 +5,6 @@ method. Each drive has weight 1, whatever its number of frames. Ridge and fading
 chosen on layouts M0 to M155 of ``crosscue study layouts --perception faults``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 

@@ -8,8 +8,6 @@ integral over an approach's length. It is the scale of the single exponential th
 number of independent observations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 

@@ -11,8 +11,6 @@
   prevents a few places from disabling a feature.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple

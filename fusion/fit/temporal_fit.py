@@ -13,8 +13,6 @@
   cross-validation over two halves of the places.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

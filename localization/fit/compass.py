@@ -12,8 +12,6 @@ reported with the reason. Without a reference heading, an ellipse is fitted to t
 mounting yaw remains unknown.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple, TypeAlias

@@ -6,8 +6,6 @@ the wheelbase times the turn. The ratio of this distance to the reported one is 
 The standard deviation is that between pieces of the drive, so that it includes persistent errors.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final, NamedTuple
 

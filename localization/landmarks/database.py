@@ -11,8 +11,6 @@ A file is rejected unless it has crosscue's ``application_id``, this version as 
 the length that its header specifies, and exactly the expected tables.
 """
 
-from __future__ import annotations
-
 import errno
 import heapq
 import math

@@ -5,8 +5,6 @@ picture and scores two ``Keypoints``. ORB is built in; a learned matcher can rep
 descriptors are bytes that only their matcher interprets.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol, cast

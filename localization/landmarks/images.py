@@ -1,7 +1,5 @@
 """Read grey pictures of full size, from files and logs, for feature matching."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Final

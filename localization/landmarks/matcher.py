@@ -7,8 +7,6 @@ estimates it with a fixed seed, so the result is deterministic. The score is the
 consistent points.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A recognised landmark as a measurement of the pose filter."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from crosscue.replay.columns import Floats

@@ -10,8 +10,6 @@ current time by the estimated motion and used as measurement. A landmark's error
 time, so it is used again only after ``revisit_m``.
 """
 
-from __future__ import annotations
-
 import cmath
 import math
 from collections.abc import Callable

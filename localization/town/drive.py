@@ -8,8 +8,6 @@ All functions are plain Python on numbers and arrays, which run uncompiled in a 
 ``drive_many`` compiles them, which makes them thousands of times as fast.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import IntEnum

@@ -10,8 +10,6 @@ it. All integers are uint64 with wrapping arithmetic; outside compiled code, cal
 under ``numpy.errstate(over="ignore")``.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final, NamedTuple
 

@@ -5,8 +5,6 @@ The dissertation states the sizes of cities, the compass's uncertainty and the l
 published result (9.3 km at 30 degrees).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any, Literal, NamedTuple, Self
 

@@ -6,8 +6,6 @@ intersection can be left. One-way streets that would trap a car are opened in bo
 that every intersection of the city can be reached from every other one.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final, NamedTuple
 

@@ -3,8 +3,6 @@
 The true motion is a bicycle model (eq. 5 and 6) that PID controllers keep in its lane.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final, NamedTuple
 

@@ -5,8 +5,6 @@ Bits are counted as in DBC files. A little-endian signal starts at its least sig
 numbering, and runs down to bit 0 of a byte and on to bit 7 of the next.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

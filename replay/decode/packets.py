@@ -4,8 +4,6 @@ The row of a packet has the time of its picture. Pictures are therefore yielded 
 in display order, whatever the order of coding.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 

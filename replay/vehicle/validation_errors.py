@@ -1,7 +1,5 @@
 """One-line messages for validation errors of a settings file."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections import Counter

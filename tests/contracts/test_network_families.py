@@ -1,7 +1,5 @@
 """Every family of networks: known boxes are exact at a wide and a tall size, nonsense refused."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Final

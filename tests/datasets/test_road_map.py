@@ -1,7 +1,5 @@
 """Intersections of a map along a track, and those of a Lanelet2 map."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Cards are drafted from TFLite files: layout, names, types and quantised numbers are read."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Write OpenStreetMap extracts and Lanelet2 maps of made-up streets."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path

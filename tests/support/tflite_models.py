@@ -1,7 +1,5 @@
 """Small TFLite networks with known outputs."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ corners, with lines, crosswalks and parking lanes. Sidewalks, driveways, parking
 not road, and neither are pixels of which half or more shows an object.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Map of the ground from above: asphalt, lines, kerbs, sidewalks, driveways, lots and grass."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, TypeVar

@@ -4,8 +4,6 @@ Camera axes are x right, y down, z ahead. Objects are drawn with ``samples`` by 
 per pixel into a depth buffer of 1/z. Ground and sky have no edges and are drawn once per pixel.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import cache

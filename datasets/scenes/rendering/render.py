@@ -1,7 +1,5 @@
 """Render pictures of a world, with the object of each pixel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

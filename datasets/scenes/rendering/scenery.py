@@ -1,7 +1,5 @@
 """Meshes of buildings, trees, poles, signs and lights."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Textures of surfaces: signs, leaves and house fronts, in one buffer with all mipmap levels."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files

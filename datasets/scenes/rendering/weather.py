@@ -1,7 +1,5 @@
 """Daylight (brightness of surfaces, the sky, haze), and rain in front of the camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -3,8 +3,6 @@
 Pickles are never opened, because a pickle can run any program when it is read.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

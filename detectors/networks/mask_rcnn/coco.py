@@ -4,8 +4,6 @@ The file is verified against the hash in its name and read with ``weights_only=T
 rejects everything but tensors.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path

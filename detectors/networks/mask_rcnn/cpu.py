@@ -6,8 +6,6 @@ provides through NNPACK. It needs two to three times fewer multiplications than 
 and its errors are no larger than those of folding.
 """
 
-from __future__ import annotations
-
 import copy
 from typing import Any, Final
 

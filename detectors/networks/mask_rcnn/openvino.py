@@ -4,8 +4,6 @@ The body is compiled for one picture of a fixed size, where OpenVINO is fastest.
 any number of boxes. All compute in 32 bits, because OpenVINO would use 16 on some processors.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections import OrderedDict
 from importlib import import_module

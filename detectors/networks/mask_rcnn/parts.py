@@ -10,8 +10,6 @@ boxes. Pooling (RoIAlign; He et al. 2017) has that of ``MultiScaleRoIAlign``; th
 are adjacent in memory and interpolated together, which is several times as fast.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple, Protocol

@@ -1,7 +1,5 @@
 """Save and load a road network's weights as safetensors, with a description."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import dataclass

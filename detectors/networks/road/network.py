@@ -4,8 +4,6 @@ The embedded weights were trained on simulated scenes only (``crosscue train roa
 ``checkpoint`` selects other weights.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, Final
 

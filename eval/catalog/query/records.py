@@ -1,7 +1,5 @@
 """Rows of one run in a catalog, read from its manifest, tags and score."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta

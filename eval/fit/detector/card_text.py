@@ -1,7 +1,5 @@
 """Insertion of fitted thresholds and calibrations into a model card's text, comments kept."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final

@@ -10,8 +10,6 @@ The bound assumes independent detections. Those of neighbouring frames are not i
 bound from one short drive means little for other drives.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Final, Literal, TypeAlias

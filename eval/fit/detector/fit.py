@@ -1,7 +1,5 @@
 """Fit a detector's thresholds and calibrations to labelled boxes, and write them to its card."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field

@@ -1,7 +1,5 @@
 """Building a landmark database from a log with poses, or from pictures with coordinates."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

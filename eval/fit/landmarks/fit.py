@@ -1,7 +1,5 @@
 """Fit the threshold of landmark matches to labelled pairs of pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache

@@ -7,8 +7,6 @@ that of Clopper and Pearson (Biometrika 26, 1934), which is valid even without a
 of found places is Wilson's (JASA 22, 1927).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

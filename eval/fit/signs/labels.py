@@ -1,7 +1,5 @@
 """Labelled pictures of signs, from files of boxes or drives, and a detector scored on them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

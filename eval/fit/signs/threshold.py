@@ -1,7 +1,5 @@
 """Choice of the sign threshold for a required precision, measured on other pictures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field

@@ -6,8 +6,6 @@ motion assumed between two time segments), ``heading`` (accepted headings), ``la
 ``position`` (accepted positions of the camera, and of the antenna by GNSS).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

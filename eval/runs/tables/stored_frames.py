@@ -1,7 +1,5 @@
 """Frames of a run with their detections, read one by one from its tables."""
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ camera rate read their increments from there, so they never read the log again. 
 short gap is assumed from the last speed, and is reported as assumed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple

@@ -6,8 +6,6 @@ else by the frame number, from 0, at the end of the file name. Pictures without 
 and left out, and frames without labels are not judged.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

@@ -7,8 +7,6 @@ matched to an ignored label are neither right nor wrong. A part (a size, a range
 outside it, and unmatched detections outside it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 

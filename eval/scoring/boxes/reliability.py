@@ -4,8 +4,6 @@ The expected calibration error is the mean difference of score and fraction over
 score, weighted by detections (Naeini et al., AAAI 2015).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Final

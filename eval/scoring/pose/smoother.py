@@ -1,7 +1,5 @@
 """Compare the filter with a batch smoother, the best estimate that its measurements allow."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """The true track that a recording shows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from crosscue.replay.columns import Floats, Int64s

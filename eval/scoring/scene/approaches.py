@@ -14,8 +14,6 @@ until the car enters, one to one. A further approach of the run during the same 
 split; one without a true approach is extra.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass

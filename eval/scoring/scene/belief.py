@@ -5,8 +5,6 @@ states that there is no intersection ahead, the step is compared with its absenc
 place are correlated, so intervals are over places.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -7,8 +7,6 @@ each of them. The distance is that of the first of these frames, so both definit
 is no spurious detection.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, Literal
 

@@ -1,7 +1,5 @@
 """Errors of the range filter, and consistency of its variances (NEES)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -5,8 +5,6 @@ are absent. Beliefs are therefore compared at the same rate of false features, e
 threshold that keeps to the rate.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Pictures of the intersections study: distances (Fig. 29), beliefs (Fig. 31), a contact sheet."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """Repeat the published experiment on simulated drives, and compare with its results."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field

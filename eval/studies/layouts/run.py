@@ -1,7 +1,5 @@
 """Fit beliefs to random layouts, with and without intersections, and test them on others."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence

@@ -3,8 +3,6 @@
 Every picture counts, so that all beliefs are scored on the same pictures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial

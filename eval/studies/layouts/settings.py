@@ -1,7 +1,5 @@
 """Settings of the study of layouts, and its folds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal, get_args
 

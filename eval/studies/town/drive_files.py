@@ -5,8 +5,6 @@ also has a camera, which sees a generated wall at each passed landmark, and ther
 database. At an unnoticed landmark, the wall is not in the database. Truth is in ``truth.json``.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

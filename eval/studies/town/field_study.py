@@ -5,8 +5,6 @@ and a truth file, and the results come from the replay of the log and its score,
 runs. The goals reached are those of the simulated navigator, because a log does not contain them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Simulate a drive, write its log, and replay and score it like a real drive."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings of a study, by default those of the published one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import product
 from typing import Annotated, Final, Literal, NamedTuple, TypeVar

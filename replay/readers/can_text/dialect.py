@@ -6,8 +6,6 @@ classifies it as a frame, a line without a frame, a mark such as a header, or da
 thus used, skipped or dropped.
 """
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """B-tree pages of a SQLite file, read directly; sections 1.3, 1.5, 1.6 and 2.1 of its format."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ batches of pages. It can only confirm that a file is sound. SQLite must check a 
 check does not understand completely, because of a fault, another schema or a pointer map.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Final

@@ -1,7 +1,5 @@
 """A simulated drive as files, with its truth; traffic on the left is a mirror image."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import replace

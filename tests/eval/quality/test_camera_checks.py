@@ -1,7 +1,5 @@
 """Checks that need pictures of a scene: delay, sign, standstill, and a camera that moves."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

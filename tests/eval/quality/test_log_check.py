@@ -1,7 +1,5 @@
 """``crosscue check LOG``: awkward logs are found out, good logs are not blamed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Concatenate, Final, ParamSpec

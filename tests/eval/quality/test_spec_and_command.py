@@ -1,7 +1,5 @@
 """``crosscue check LOG`` as a command: verdict, specification, JUnit, and folders of data sets."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from xml.etree import ElementTree as ET

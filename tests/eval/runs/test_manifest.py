@@ -1,7 +1,5 @@
 """Files of a run folder: manifest, tags and what replaces them, and the columns of its tables."""
 
-from __future__ import annotations
-
 import errno
 import json
 import math
