@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 from crosscue.datasets.scenes.drive import SceneFiles, refuse_other_drive, write_scene
 from crosscue.datasets.scenes.layout import SCORED, Side
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
+from crosscue.datasets.simulated.drive import DriveSettings
+from crosscue.datasets.simulated.log_files import write_drive
 from crosscue.replay.errors import UsageError
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
@@ -183,9 +185,6 @@ def simulate_drive(
         UsageError: ``blocks`` is below 1.
         OutputError: The folder already contains a drive, or cannot be written.
     """
-    from crosscue.datasets.simulated.drive import DriveSettings
-    from crosscue.datasets.simulated.log_files import write_drive
-
     if blocks < 1:
         raise UsageError(f"blocks: {blocks}; expected 1 or more")
     settings = DriveSettings(seed=seed, blocks=blocks)

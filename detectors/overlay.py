@@ -6,6 +6,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -75,8 +76,6 @@ class Drawer:
             self._thin()
             if number % self._every:
                 return
-        import cv2
-
         pixels, _ = decode(picture)
         _, encoded = cv2.imencode(".jpg", _drawn(pixels, found, 1.0))
         path = self.folder / f"{t_ns}.jpg"
@@ -164,8 +163,6 @@ def draw_frame(
 def _line(
     canvas: Bytes, points: NDArray[np.float64], colour: tuple[int, int, int], enlarge: float
 ) -> None:
-    import cv2
-
     # A true box may reach far beyond the picture; OpenCV needs numbers that fit.
     far = 4.0 * max(canvas.shape[:2])
     whole = np.rint(np.clip(points, -far, far)).astype(np.int32).reshape(-1, 1, 2)
@@ -174,8 +171,6 @@ def _line(
 
 def encode_overlay(pixels: Bytes, found: Found) -> bytes:
     """Encode a picture as JPEG with one detector's boxes and labels, or road, drawn in."""
-    import cv2
-
     _, encoded = cv2.imencode(".jpg", _drawn(pixels, (found,), max(pixels.shape[1] / 1280, 0.6)))
     return encoded.tobytes()
 
@@ -193,8 +188,6 @@ def _drawn(pixels: Bytes, results: Sequence[Found], enlarge: float) -> Bytes:
 
 def _fitting(text: str, width_px: int, scale: float) -> float:
     """Return the scale, reduced where necessary for the text to fit into ``width_px``."""
-    import cv2
-
     # Strokes are whole pixels, so a text at half the scale is not half as wide: measure again.
     for _ in range(4):
         (wide, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, _thickness(scale))
@@ -203,8 +196,6 @@ def _fitting(text: str, width_px: int, scale: float) -> float:
 
 
 def _tint(canvas: Bytes, road: RoadMask) -> None:
-    import cv2
-
     mask = road.pixels().astype(np.uint8)
     size = (canvas.shape[1], canvas.shape[0])
     is_road = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
@@ -212,8 +203,6 @@ def _tint(canvas: Bytes, road: RoadMask) -> None:
 
 
 def _boxes(canvas: Bytes, found: Detections, enlarge: float) -> None:
-    import cv2
-
     for box, score, label in zip(found.boxes_px, found.scores, found.labels, strict=True):
         x0, y0, x1, y1 = (round(float(side)) for side in box)
         place = (x0, max(y0 - 4, round(12 * enlarge)))
@@ -226,8 +215,6 @@ def write_label(
     canvas: Bytes, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float
 ) -> None:
     """Write a text on a dark box; ``at`` is the left end of its baseline."""
-    import cv2
-
     # A box, because from OpenCV 5 on an outline of thicker letters differs in width and covers
     # the text.
     thick = _thickness(scale)

@@ -18,6 +18,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -148,8 +149,6 @@ def travel_between(
     Returns:
         The motion, or None if too few corners can be followed or they do not move.
     """
-    import cv2
-
     nothing = np.empty((0, 4))
     first, second = _followed(_View(0, before, nothing), _View(0, after, nothing))
     if len(first) < TRAVEL_CORNERS or np.median(np.hypot(*(second - first).T)) < PARALLAX_PX:
@@ -197,8 +196,6 @@ class VisualOdometry:
             grey: Shape (height, width), uint8.
             boxes_px: Shape (N, 4): x0, y0, x1, y1 of everything that may move.
         """
-        import cv2
-
         scale = 1
         size_px = (grey.shape[1], grey.shape[0])
         while size_px[0] / scale > WIDEST_PX:
@@ -295,8 +292,6 @@ class VisualOdometry:
 
 def _followed(before: _View, now: _View) -> tuple[Floats, Floats]:
     """Follow corners of the static scene to the next picture and back; shape (N, 2) each."""
-    import cv2
-
     free = np.full(before.grey.shape, 255, np.uint8)
     for x0, y0, x1, y1 in before.boxes_px.astype(np.int64).tolist():
         free[max(y0 - 2, 0) : y1 + 3, max(x0 - 2, 0) : x1 + 3] = 0
@@ -412,8 +407,6 @@ def _expansion(first: Floats, second: Floats, ahead: Floats) -> float:
 
 def _rotated(vector: Floats) -> Floats:
     """Rotation by a vector (Rodrigues)."""
-    import cv2
-
     return np.asarray(cv2.Rodrigues(vector)[0], np.float64)
 
 
@@ -499,8 +492,6 @@ def _resampled(
     view: _View, points_px: Floats, shape: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Sample a picture at ground points; cells out of view, or behind a box, are not seen."""
-    import cv2
-
     x, y = (np.nan_to_num(points_px[:, i], nan=-1.0).reshape(shape) for i in (0, 1))
     soft = cv2.GaussianBlur(view.grey, (3, 3), 0)
     sampled = cv2.remap(soft, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
@@ -515,8 +506,6 @@ def _votes(
     first: NDArray[np.float32], seen: NDArray[np.bool_], second: NDArray[np.float32]
 ) -> tuple[Floats, list[int]]:
     """Correlation of each patch by shift, less its median, NaN out of reach; and its row."""
-    import cv2
-
     back, ahead = round(BACK_M / CELL_M), round(AHEAD_M / CELL_M)
     votes, places = [], []
     for row in range(0, first.shape[0] - ROWS - back, ROWS // 2):

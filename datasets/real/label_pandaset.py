@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
+import cv2
 import numpy as np
 
 from crosscue.datasets.adapters.pandaset import FRONT, PandasetPoses, read_pandaset_poses
@@ -78,8 +79,6 @@ def write_labels(sequence: Path, output: Path) -> Path:
 
 def _visible(corners_px: Floats) -> Iterator[float]:
     """Yield the fraction of each box in the picture that no earlier, nearer box hides."""
-    import cv2
-
     hidden = np.zeros(SIZE_PX[::-1], np.uint8)
     for corners in corners_px:
         mine = np.zeros_like(hidden)

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -129,8 +130,6 @@ def picture_times(world: World, settings: SceneSettings) -> Int64s:
 
 def jpeg(rgb: NDArray[np.uint8], quality: int) -> bytes:
     """Encode a picture as JPEG."""
-    import cv2
-
     bgr = np.ascontiguousarray(rgb[..., ::-1])
     return bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
 

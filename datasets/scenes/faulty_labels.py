@@ -12,10 +12,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M, along_curve
 from crosscue.datasets.scenes.rendering.render import (
     PictureSettings,
     RenderedFrame,
@@ -272,8 +274,6 @@ def _ground_codes(
     world: World, faults: DetectorFaults, rng: Generator
 ) -> tuple[NDArray[np.uint8], dict[int, float]]:
     """Return a map of areas that may be detected as road, and rates of false areas by code."""
-    from crosscue.datasets.scenes.rendering.ground import TEXELS_PER_M, X_M, Y_M, along_curve
-
     layout, road = world.layout, world.ground.road
     codes: NDArray[np.uint8] = np.zeros(road.shape, np.uint8)
     chances: dict[int, float] = {}
@@ -343,8 +343,6 @@ def label_pictures(
 
 def png(picture: RenderedFrame, _: PictureSettings) -> bytes:
     """Encode a picture without loss."""
-    import cv2
-
     bgr = np.ascontiguousarray(picture.rgb[..., ::-1])
     return bytes(cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
 

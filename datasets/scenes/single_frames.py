@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -127,8 +128,6 @@ def render_road_frames(settings: SceneSettings, count: int, size_px: tuple[int, 
 
 def shrunk(picture: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
     """Resize a picture; each pixel is the mean of the pixels that it covers."""
-    import cv2
-
     return np.asarray(cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA), np.uint8)
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -276,8 +277,6 @@ def _mask_text(
         affine: Factor and offset for x and y: grid coordinate = factor * camera pixel + offset.
         size_px: Width and height of the camera's picture.
     """
-    import cv2
-
     low = np.clip(np.floor(box_px[:2]), 0, size_px).astype(int)
     high = np.clip(np.ceil(box_px[2:]), 0, size_px).astype(int)
     width, height = (high - low).tolist()

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,8 +71,6 @@ def prepared(pixels: NDArray[np.uint8], want: Input) -> tuple[Array, Placement]:
 
 def _fitted(pixels: NDArray[np.uint8], want: Input, placement: Placement) -> NDArray[np.uint8]:
     """Resize a picture to its size in the input."""
-    import cv2
-
     height, width = pixels.shape[:2]
     size = (want.width_px, want.height_px)
     if want.fit == "crop":
@@ -91,8 +90,6 @@ def _numbers(pixels: NDArray[np.uint8], want: Input, corner: Size, size_px: Size
         corner: Left and top of the pixels in the input.
         size_px: Width and height of the input.
     """
-    import cv2
-
     (left, top), (height, width) = corner, pixels.shape[:2]
     numbers = np.empty((3, size_px[1], size_px[0]), want.dtype)
     planes = cv2.split(pixels)

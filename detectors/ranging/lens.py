@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from typing import Final, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -60,8 +61,6 @@ def lens_of(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Lens:
     crop = pixels[max(round(y0), 0) : round(y1), left:right]
     if not crop.size:
         return "unknown"
-    import cv2
-
     hue, saturation, value = cv2.split(cv2.cvtColor(crop, cv2.COLOR_BGR2HSV))
     if not saturation.any():
         return "unknown"
@@ -76,8 +75,6 @@ def lens_of(pixels: NDArray[np.uint8], box_px: NDArray[np.float64]) -> Lens:
 
 def _spot_px(is_lit: NDArray[np.bool_], width_px: float) -> float:
     """Area of the largest spot that can be a lens; 0 without one."""
-    import cv2
-
     count, _, found, _ = cv2.connectedComponentsWithStats(is_lit.astype(np.uint8))
     best = 0.0
     for i in range(1, count):

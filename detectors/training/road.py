@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -69,8 +70,6 @@ def edge_weight(wanted: Tensor) -> Tensor:
 
 def varied(pixels: Bytes, road: Bytes, rng: np.random.Generator) -> tuple[Bytes, Bytes]:
     """Augment a picture: mirror, zoom, shift, change brightness and add noise."""
-    import cv2
-
     high, wide = road.shape
     zoom = float(rng.uniform(0.92, 1.12))
     shift = rng.uniform(-1.0, 1.0, 2) * (0.03 * wide, 0.035 * high)

@@ -7,6 +7,7 @@ classes are selected more often.
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
@@ -173,8 +174,6 @@ def _corner(
 
 
 def _warped(pixels: Bytes, warp: Floats, window: SampleSettings, border: int) -> Bytes:
-    import cv2
-
     return np.asarray(
         cv2.warpAffine(
             pixels,
@@ -197,8 +196,6 @@ def _to_middles(warp: Floats) -> Floats:
 
 def recoloured(pixels: Bytes, rng: Generator) -> Bytes:
     """Vary lighting, contrast, colour and noise."""
-    import cv2
-
     gain = rng.uniform(0.7, 1.35) * rng.uniform(0.9, 1.1, 3)
     levels = np.arange(256.0) / 255.0
     gamma, lift = np.exp(rng.uniform(-0.3, 0.3)), rng.uniform(-0.06, 0.06)

@@ -6,15 +6,15 @@ set union: the order does not matter, and a run that is found twice counts once.
 same bytes however the drives were distributed over batches.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
+
+import pyarrow as pa
 
 from crosscue.eval.runs.account import sum_accounts
 from crosscue.eval.runs.folder import (
@@ -45,10 +45,6 @@ from crosscue.results import Result, json_key
 from crosscue.verb import Option
 
 from .journal import MERGED, NO_RUN, unfinished
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
 
 FOLDER: Final = MERGED
 
@@ -116,8 +112,6 @@ def _merge_table(kind: str, drives: Sequence[_Drive], out: RunFolder) -> None:
 
 
 def _named(batch: pa.RecordBatch, drive: str, schema: pa.Schema) -> dict[str, object]:
-    import pyarrow as pa
-
     there = set(batch.schema.names)
     columns: dict[str, object] = {
         name: batch[name] if name in there else pa.nulls(batch.num_rows, schema.field(name).type)
@@ -129,8 +123,6 @@ def _named(batch: pa.RecordBatch, drive: str, schema: pa.Schema) -> dict[str, ob
 
 def _schema(kind: str, holding: Sequence[_Drive]) -> pa.Schema:
     """Return the columns of all drives, preceded by the drive's name."""
-    import pyarrow as pa
-
     whole = arrow_schema(DRIVE)
     for one in holding:
         try:

@@ -4,16 +4,15 @@ Metrics are judged drive by drive (``paired``). If a run was not scored, any dif
 counts as a change for the worse.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
+from typing import Any, ClassVar, Final, Generic, TypeVar
 
 import numpy as np
+import pyarrow as pa
 
 from crosscue.eval.runs.folder import MANIFEST, RunFolder, open_run
 from crosscue.eval.scoring.by_drive import (
@@ -34,9 +33,6 @@ from crosscue.replay.safe_text import counted, visible
 from crosscue.results import HIDDEN, Result
 
 from .paired import FALSE_ALARMS, PairedMetric, Tolerance, Verdict, compare_drives
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 T = TypeVar("T")
 # Parts of a manifest that are compared.
@@ -357,8 +353,6 @@ def _schemas(before: pa.Table, after: pa.Table) -> str:
 
 
 def _compare_column(before: pa.ChunkedArray, after: pa.ChunkedArray) -> ColumnChange | None:
-    import pyarrow as pa
-
     if before.equals(after):
         return None
     if not (pa.types.is_floating(before.type) or pa.types.is_integer(before.type)):

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, Protocol
 
+import numpy as np
+
 from crosscue.eval.logs.log import DriveGiven, opened, vehicle_of
 from crosscue.eval.pipeline.drive_time import time_segments, whole_timeline
 from crosscue.eval.pipeline.empty_result import empty_result, nothing_left
@@ -304,8 +306,6 @@ def _labelled(
     A stream's own ``t_ns`` (the Mobileye's image time) is kept. Its other fields with one of these
     names get an underscore appended.
     """
-    import numpy as np
-
     t_ns = np.asarray(columns["log_t_ns"], np.int64)
     log_t_ns = clock.log_times(t_ns)
     found: dict[str, NDArray[np.generic]] = {

@@ -1,16 +1,16 @@
 """Score a detector's boxes in a run against labelled boxes of its pictures."""
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final
+from typing import Annotated, ClassVar, Final
 
+import cv2
 import numpy as np
+import pyarrow as pa
 
 from crosscue.datasets.truth.box_labels import BoxLabels, LabelFormat, Meanings, read_box_labels
 from crosscue.detectors.base import View
@@ -35,9 +35,6 @@ from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.safe_text import counted, visible
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 FOLDER: Final = "score"
 MEASURES: Final = ("ap50", "ap", "precision", "recall")
@@ -115,15 +112,11 @@ class DetectorScore(Result):
     @property
     def parts(self) -> pa.Table:
         """Table with one row per class and part, with 95 % intervals."""
-        import pyarrow as pa
-
         return pa.Table.from_pylist(self.part_rows)
 
     @property
     def bins(self) -> pa.Table:
         """Table of detections, and of those that are correct, by class and tenth of the score."""
-        import pyarrow as pa
-
         return pa.Table.from_pylist(
             [
                 {
@@ -444,8 +437,6 @@ def _picture(camera: StoredCamera | None, t_ns: int, marks: Sequence[Drawn]) -> 
 
 
 def _drawn(picture: Encoded, marks: Sequence[Drawn]) -> str | None:
-    import cv2
-
     pixels, whole = decode(picture, View(min_width_px=WIDTH_PX))
     size = (WIDTH_PX, round(whole[1] * WIDTH_PX / whole[0]))
     canvas: Bytes = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
+
+import pyarrow as pa
 
 from crosscue.eval.failures.find import failures_beside_truth
 from crosscue.eval.failures.order import diverse
@@ -35,9 +37,6 @@ from crosscue.replay.errors import CrosscueError, UsageError
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,8 +203,6 @@ class ScoredRun(Result):
     @property
     def cues(self) -> pa.Table:
         """Precision and recall of each cue with 95 % intervals, and the rule it is judged by."""
-        import pyarrow as pa
-
         rows = []
         for name, cue in pooled_scores([self.one]).cues.items():
             row: dict[str, object] = {"cue": name}
@@ -231,8 +228,6 @@ class ScoredRun(Result):
         Raises:
             SchemaError: The truth has no positions.
         """
-        import pyarrow as pa
-
         _, track = load_truth(self.one.truth_path)
         columns = {f"{axis}_m": track.xyz_m[:, i] for i, axis in enumerate("xyz")}
         return pa.table({"t_ns": track.t_ns, **columns})

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.folder import RunFolder
@@ -95,7 +96,6 @@ def _of_frames(run: RunFolder, scene: SceneJudged, abouts: Mapping[int, About]) 
 
 def _detected(run: RunFolder, scene: SceneJudged) -> Detected:
     """Return the detections in the failing frames, by log time."""
-    import pyarrow as pa
     import pyarrow.compute as pc
 
     wanted = failing_times(scene.judged.cues)

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
+import cv2
+
 from crosscue.datasets.labels.table import LABEL_FORMATS, ToolFormat
 from crosscue.datasets.truth.annotations import Annotation, Annotations, Picture
 from crosscue.detectors.images import Encoded, check, decode
@@ -297,8 +299,6 @@ def _content(picture: Encoded) -> tuple[bytes, str, tuple[int, int]]:
     """Return a picture's file content, file ending and size in pixels."""
     if picture.coding in ENDINGS:
         return bytes(picture.content), ENDINGS[picture.coding], check(picture)
-    import cv2
-
     pixels, size = decode(picture)
     _, content = cv2.imencode(".png", pixels)
     return content.tobytes(), ".png", size

@@ -1,22 +1,19 @@
 """The record of one failure of a run, and tables of failures."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
+
+import pyarrow as pa
 
 from crosscue.eval.runs.tables.columns import INT, REAL, TEXT, TEXTS, Column, arrow_schema
 from crosscue.replay.errors import AnnotationError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree, spelled, strict_json, unspelled
 from crosscue.replay.files.whole_file import write_table, write_text
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 Kind = Literal["missed", "late", "false", "range", "flipped", "suspect"]
 Level = Literal["approach", "frames"]
@@ -130,8 +127,6 @@ def failure_schema() -> pa.Schema:
 
 def failure_table(failures: Sequence[Failure]) -> pa.Table:
     """Return failures as a table, in the same order."""
-    import pyarrow as pa
-
     return pa.Table.from_pylist([asdict(one) for one in failures], schema=failure_schema())
 
 
@@ -181,7 +176,6 @@ def read_failures(table: Path | str) -> tuple[Failure, ...]:
 
 
 def _parquet_rows(path: Path) -> list[Any]:
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:

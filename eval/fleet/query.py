@@ -1,7 +1,5 @@
 """Query runs with SQL, and print or write the rows as text, CSV, JSON or Parquet."""
 
-from __future__ import annotations
-
 import base64
 import csv
 import io
@@ -12,7 +10,9 @@ from dataclasses import dataclass
 from datetime import date, datetime
 from decimal import Decimal
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
+
+import pyarrow as pa
 
 from crosscue.eval.catalog.query.catalog import catalog
 from crosscue.replay.errors import CrosscueError, OutputError, UsageError
@@ -22,9 +22,6 @@ from crosscue.replay.progress import Notice, emit
 from crosscue.replay.safe_text import counted, table, terminal_width
 from crosscue.results import Result
 from crosscue.verb import Option
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 UNBOUNDED: Final = 1 << 30
 
@@ -116,8 +113,6 @@ def query(
 
 
 def _lines(found: pa.Table, width: int) -> Iterator[str]:
-    import pyarrow as pa
-
     rows = [[_cell(value) for value in row.values()] for row in _records(found)]
     numbers = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
     texts = [i for i, one in enumerate(found.schema) if not any(is_a(one.type) for is_a in numbers)]
@@ -126,8 +121,6 @@ def _lines(found: pa.Table, width: int) -> Iterator[str]:
 
 
 def _records(found: pa.Table) -> list[dict[str, Any]]:
-    import pyarrow as pa
-
     maps = {one.name for one in found.schema if pa.types.is_map(one.type)}
     return [
         {

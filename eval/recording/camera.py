@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Final
 
+import cv2
 import rerun as rr
 
 from crosscue.detectors.images import Encoded, check, decode
@@ -79,8 +80,6 @@ def shown(picture: Encoded) -> bytes:
         LogFormatError: The picture is damaged, truncated or of an unsupported coding.
         LogTooLargeError: The picture exceeds the maximum number of pixels.
     """
-    import cv2
-
     ok, jpeg = cv2.imencode(".jpg", decode(picture)[0], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     if not ok:
         raise LogFormatError(f"{picture.coding} picture cannot be shown as JPEG")

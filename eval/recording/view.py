@@ -1,7 +1,5 @@
 """Write a run as a Rerun recording, or show it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -10,18 +8,17 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 from crosscue.eval.pipeline.run import PicturedRun, Run, run_given
+from crosscue.eval.recording import save_rrd
+from crosscue.eval.recording.part import RecordingSpan
 from crosscue.eval.runs.moments import approach_spans, moment_ns
 from crosscue.eval.runs.tables.parquet import TableFolder
+from crosscue.eval.scoring.truth import read_scored_truth as load_truth
 from crosscue.replay.errors import CrosscueError, OutputError, UsageError
 from crosscue.results import HIDDEN, Result
 from crosscue.verb import Option, keywords
-
-if TYPE_CHECKING:
-    from crosscue.eval.recording.part import RecordingSpan
-
 
 BEFORE_NS: Final = 2_000_000_000
 # Time recorded after a moment.
@@ -58,10 +55,8 @@ def save_recording(
             view.
         RunError: The log with the pictures is missing.
     """
-    from crosscue.eval.recording import save_rrd
     from crosscue.eval.scoring.pose.score import truth_track
     from crosscue.eval.scoring.runs import remembered_truth
-    from crosscue.eval.scoring.truth import read_scored_truth as load_truth
 
     folder = run_given(run).folder
     path = folder.file("drive.rrd") if output is None else Path(output)
@@ -84,8 +79,6 @@ def _part(
     run: TableFolder, at: float | str | None, approach: int | None, only: Sequence[str]
 ) -> RecordingSpan:
     """Return the part of the run to record."""
-    from crosscue.eval.recording.part import RecordingSpan
-
     views = frozenset(only)
     if at is not None and approach is not None:
         raise UsageError("at, approach: expected one of them")

@@ -5,6 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -117,8 +118,6 @@ def _cues(run: RunFolder, wanted: frozenset[int]) -> Mapping[int, dict[str, int]
 
 def _with_plan(canvas: Bytes, plan: Bytes) -> Bytes:
     """Put the plan view beside the picture, at the same height."""
-    import cv2
-
     height = canvas.shape[0]
     size = (round(plan.shape[1] * height / plan.shape[0]), height)
     beside = cv2.resize(plan, size, interpolation=cv2.INTER_AREA)
@@ -126,8 +125,6 @@ def _with_plan(canvas: Bytes, plan: Bytes) -> Bytes:
 
 
 def _jpeg(pixels: NDArray[np.uint8], width_px: int) -> bytes:
-    import cv2
-
     if pixels.shape[1] > width_px:
         size = (width_px, max(round(pixels.shape[0] * width_px / pixels.shape[1]), 1))
         pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)

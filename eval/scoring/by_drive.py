@@ -1,17 +1,14 @@
 """Contribution of each drive to the metrics that runs are compared by: a sum and its rows."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
+
+import pyarrow as pa
 
 from crosscue.eval.runs.tables.columns import OF_SCORE, arrow_schema
 
 from .metric_values import MetricValue, metric_values
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 # Folder of a score, in a run or in a study.
 FOLDER: Final = "score"
@@ -175,7 +172,5 @@ def _of_all(part: DriveMetric, values: Mapping[str, MetricValue]) -> DriveMetric
 
 def by_drive_table(parts: Iterator[DriveMetric]) -> pa.Table:
     """Return the table ``by_drive.parquet``."""
-    import pyarrow as pa
-
     schema = arrow_schema(OF_SCORE[BY_DRIVE])
     return pa.Table.from_pylist([one._asdict() for one in parts], schema)

@@ -1,14 +1,13 @@
 """Write the files of a score: metrics as JSON, and curves, frames and drives as tables."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa
 
 from crosscue.eval.runs.tables.columns import OF_SCORE, arrow_schema
 from crosscue.replay.files.tree_text import strict_json
@@ -18,9 +17,6 @@ from .by_drive import BY_DRIVE, METRICS, DriveMetric, by_drive_table, drive_cont
 from .drives import DriveJudged, as_metrics, pool_scores
 from .runs import RunScored
 from .truth import FEATURES
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 CURVES: Final = "curves"
 CUE_FRAMES: Final = "cue_frames"
@@ -56,8 +52,6 @@ def _parts(one: RunScored) -> Iterator[DriveMetric]:
 
 def curve_table(judged: Sequence[DriveJudged]) -> pa.Table:
     """Return probabilities and true distance, one row per step of each matched approach."""
-    import pyarrow as pa
-
     curves = [
         curve for one in judged if one.approaches is not None for curve in one.approaches.curves
     ]
@@ -78,8 +72,6 @@ def curve_table(judged: Sequence[DriveJudged]) -> pa.Table:
 
 def approach_table(judged: Sequence[DriveJudged]) -> pa.Table:
     """Return each approach of the truth with its result; unknown distances are null."""
-    import pyarrow as pa
-
     schema = arrow_schema(OF_SCORE[APPROACHES])
     results = [
         one for drive in judged if drive.approaches is not None for one in drive.approaches.results
@@ -104,8 +96,6 @@ def _known(distance_m: float | None) -> float | None:
 
 def cue_frame_table(judged: Sequence[DriveJudged]) -> pa.Table:
     """Return each frame in which a cue was searched, with the truth about it."""
-    import pyarrow as pa
-
     rows = [cue for one in judged for cue in one.cues if len(cue.t_ns)]
     columns: dict[str, Any] = {
         "drive": _repeated([(c.drive, len(c.t_ns)) for c in rows]),
@@ -127,8 +117,6 @@ def cue_frame_table(judged: Sequence[DriveJudged]) -> pa.Table:
 
 
 def _repeated(names: Sequence[tuple[str, int]]) -> pa.Array:
-    import pyarrow as pa
-
     return pa.array([name for name, times in names for _ in range(times)], pa.string())
 
 

@@ -1,13 +1,12 @@
 """Read the tables of a run that are scored, from a run folder or from tables in memory."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.columns import LOG_TIME
@@ -18,9 +17,6 @@ from crosscue.replay.time.segments import Timeline
 from crosscue.replay.vehicle.fusion import NOT_FEATURES
 
 from .columns import NONE, BeliefRows, CueRows, RangeRows, RunTables
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 T = TypeVar("T")
 
@@ -135,8 +131,6 @@ def _column(table: pa.Table, name: str, where: str) -> pa.ChunkedArray:
 
 
 def _whole(table: pa.Table, name: str, where: str) -> Int64s:
-    import pyarrow as pa
-
     column = _column(table, name, where)
     if column.null_count or not pa.types.is_integer(column.type):
         raise UnreadableRunError(f"{where}: {name}: expected integers in every row; replay again")
@@ -144,7 +138,6 @@ def _whole(table: pa.Table, name: str, where: str) -> Int64s:
 
 
 def _approach(table: pa.Table, where: str) -> Int64s:
-    import pyarrow as pa
     import pyarrow.compute as pc
 
     column = _column(table, "approach", where)
@@ -155,8 +148,6 @@ def _approach(table: pa.Table, where: str) -> Int64s:
 
 
 def _numbers(table: pa.Table, name: str, where: str) -> Floats:
-    import pyarrow as pa
-
     column = _column(table, name, where)
     if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
         raise UnreadableRunError(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, overload
 
-from crosscue.detectors.training.summary import measured_text, measured_tree
+from crosscue.detectors.training.summary import draw_curve, measured_text, measured_tree
 from crosscue.eval.training.inputs import Device, check_place
 from crosscue.replay.errors import UsageError
 from crosscue.replay.files.made_of import made_of
@@ -218,7 +218,6 @@ def train_mask_rcnn(
         )
 
     from crosscue.detectors.training.job import run_job
-    from crosscue.detectors.training.summary import draw_curve
 
     facts = run_job(job, train, held_out, resume=resume, overwrite=overwrite, report=report)
     draw_curve(job.curve_path, path.with_suffix(".curve.png"))

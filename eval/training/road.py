@@ -13,6 +13,7 @@ from crosscue.datasets.scenes.settings import SceneSettings
 from crosscue.datasets.scenes.single_frames import (
     RoadFrames,
     concatenate_frames,
+    load_folder,
     render_road_frames,
 )
 from crosscue.eval.training.inputs import Device, check_place, layouts_of, training_layouts_of
@@ -204,7 +205,6 @@ def _measure(network: str, settings: RoadTrainingSettings) -> TrainedRoad:
     _check(settings)
     if (settings.data is None) == (not settings.test_layouts):
         raise UsageError("measure: expected --test-layouts with layouts, or --data with pictures")
-    from crosscue.datasets.scenes.single_frames import load_folder
     from crosscue.detectors.networks.devices import chosen_device
     from crosscue.detectors.networks.road.checkpoint import load_road
     from crosscue.detectors.networks.road.network import embedded_road

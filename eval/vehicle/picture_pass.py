@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 
 from crosscue.detectors.base import View
@@ -203,8 +204,6 @@ def _grey(
 
 def reduced(pixels: Bytes) -> Bytes:
     """Return a picture that is at most ``WIDTH_PX`` wide."""
-    import cv2
-
     if pixels.shape[1] <= WIDTH_PX:
         return pixels
     height = round(pixels.shape[0] * WIDTH_PX / pixels.shape[1])

@@ -9,6 +9,7 @@ consistent points.
 
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,8 +40,6 @@ class OrbMatcher:
 
     def describe(self, grey: Bytes, /) -> Keypoints:
         """Extract the picture's ORB features; see ``Matcher``."""
-        import cv2
-
         height, width = grey.shape
         scale = min(1.0, _SIDE_PX / max(width, height))
         if scale < 1.0:
@@ -73,8 +72,6 @@ class OrbMatcher:
         self, seen: Keypoints, known: Keypoints
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Matching points of both pictures, shape (N, 2) each."""
-        import cv2
-
         found = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(seen.descriptors, known.descriptors, k=2)
         good = [first for first, second in found if first.distance < _RATIO * second.distance]
         # If several points have the same neighbour, only the nearest is kept.
@@ -86,8 +83,6 @@ class OrbMatcher:
         return seen.points_px[pairs[:, 0]], known.points_px[pairs[:, 1]]
 
     def _agreeing(self, here: NDArray[np.float32], there: NDArray[np.float32]) -> int:
-        import cv2
-
         params = cv2.UsacParams()
         params.randomGeneratorState = 5
         params.confidence = 0.999

@@ -23,6 +23,8 @@ from crosscue.replay.clocks.findings import (
 )
 from crosscue.replay.clocks.reports import ClockReport, ClockWatch
 from crosscue.replay.columns import Block, CanFrames, Images, Messages, Topic
+from crosscue.replay.decode import decoder_for
+from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Detail, Ledger, TopicAccount
 from crosscue.replay.progress import Progress, emit
@@ -282,9 +284,6 @@ def _decoded(log: Log, blocks: Iterable[Block], ledger: Ledger) -> Iterator[Bloc
 
 def _decoder_of(topic: Topic) -> Decoder:
     """Return the topic's decoder, or one that skips every row with a reason."""
-    from crosscue.replay.decode import decoder_for
-    from crosscue.replay.decode.interfaces import why_not_decoded
-
     try:
         decoder = decoder_for(topic)
         reason, detail = f"no decoder for encoding {topic.encoding!r}", topic.type_name

@@ -20,7 +20,7 @@ import xxhash
 
 from crosscue.replay.errors import LogError, OutputError, one_line
 from crosscue.replay.files import door
-from crosscue.replay.files.tree_text import json_tree, spelled
+from crosscue.replay.files.tree_text import json_tree, spelled, strict_json
 from crosscue.replay.limits import MIB
 
 SUFFIX: Final = ".seal"
@@ -241,8 +241,6 @@ def write_seal(log: Path, seal: Seal, *, overwrite: bool) -> bool:
 
 
 def _as_text(seal: Seal) -> str:
-    from crosscue.replay.files.tree_text import strict_json
-
     tree = {
         "kind": KIND,
         "version": VERSION,

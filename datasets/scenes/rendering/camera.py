@@ -7,6 +7,7 @@ not road, and neither are pixels of which half or more shows an object.
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -119,8 +120,6 @@ def ground_seen(
         samples: Samples per pixel in each direction.
         view: View of the camera.
     """
-    import cv2
-
     high, wide = depth.shape[0] // samples, depth.shape[1] // samples
     ray = _rays(view)
     up = ray[2]

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
+import cv2
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
@@ -65,8 +66,6 @@ class _Canvas:
         self.map = np.zeros((high, wide, 4), np.uint8)
 
     def polygon(self, where: NDArray[np.generic], points: object, value: object) -> None:
-        import cv2
-
         xy = np.asarray(points, np.float64)
         texels = (xy - np.array([X_M[0], Y_M[0]])) * TEXELS_PER_M
         fixed = np.rint(texels * 16).astype(np.int32)
@@ -116,8 +115,6 @@ def paint(
     layout: Layout, patches: Sequence[Patch], rng: Generator
 ) -> tuple[Map, NDArray[np.bool_]]:
     """Return the ground in full light, and the mask of road."""
-    import cv2
-
     canvas = _Canvas()
     patchy = smooth_noise(rng, 512, 8).astype(np.float32)
     fine = smooth_noise(rng, 512, 128).astype(np.float32)
@@ -193,8 +190,6 @@ def _joints(canvas: Map, walk: NDArray[np.bool_]) -> None:
 
 
 def _wear(canvas: _Canvas, layout: Layout, rng: Generator, is_road: NDArray[np.bool_]) -> None:
-    import cv2
-
     dark: NDArray[np.uint8] = np.zeros(is_road.shape, np.uint8)
     lane = layout.half_width_m / 2
     for side in (-1, 1):
@@ -283,8 +278,6 @@ def _stalls(canvas: _Canvas, patch: Patch) -> None:
 
 def with_levels(painted: Map, road: NDArray[np.bool_]) -> Ground:
     """Return the map with its mipmap levels."""
-    import cv2
-
     parts, levels, used = [], [], 0
     level = painted
     while min(level.shape[:2]) >= 32:
@@ -326,8 +319,6 @@ def cast_shadows(
         blobs: Rows of x, y, radius along and across, and direction of trees' shadows.
         remains: Fraction of light in shadow.
     """
-    import cv2
-
     canvas = _Canvas()
     light = np.full(painted.shape[:2], 255, np.uint8)
     for outline in outlines:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +16,7 @@ from .ground import TEXELS_PER_M, X_M, Y_M
 from .kernels import Buffers, Eye, Haze, Lens, Textures, compile_kernels
 from .mesh import Mesh
 from .textures import smooth_noise
+from .weather import drops, streaks
 
 # Max distance from the picture, in picture sizes, at which an object's outline is measured.
 MAX_ABOUT: Final = 3
@@ -209,8 +211,6 @@ class Renderer:
 
     def _shadows(self, view: CameraView, t_s: float) -> NDArray[np.uint8]:
         """Return the shadows of moving cars, directly below them and away from the sun."""
-        import cv2
-
         light = self.world.light
         shade = np.full((self.camera.height_px, self.camera.width_px), 255, np.uint8)
         slide = -light.to_sun[:2] / max(float(light.to_sun[2]), 0.3) * 0.9
@@ -232,10 +232,6 @@ class Renderer:
         return shade
 
     def _finish(self, rgb: NDArray[np.uint8], view: CameraView, number: int) -> None:
-        import cv2
-
-        from .weather import drops, streaks
-
         light, wide = self.world.light, self.camera.width_px
         rng = np.random.default_rng([self.world.conditions.seed, 6, number])
         rain = self.world.conditions.rain

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.random import Generator
 
@@ -29,8 +30,6 @@ class Shadows:
 
     def outlines(self, to_sun: Floats) -> list[Floats]:
         """Return convex shadows of the solids on the ground."""
-        import cv2
-
         slide = -to_sun[:2] / max(float(to_sun[2]), 0.12)
         found = []
         for foot, high in self.solids:

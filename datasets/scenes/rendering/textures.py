@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
@@ -24,8 +25,6 @@ WIDTH_M: Final[Mapping[str, float]] = {
 
 def sign(name: str) -> Rgba:
     """Return a sign named in ``WIDTH_M``, with a width of 128 pixels."""
-    import cv2
-
     path = files("crosscue.datasets.scenes.rendering").joinpath("drawings", f"{name}.png")
     bgra = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     return np.ascontiguousarray(np.asarray(bgra, np.uint8)[..., [2, 1, 0, 3]])
@@ -56,8 +55,6 @@ class Atlas:
 
     def add(self, name: str, rgba: Rgba) -> int:
         """Add a texture, and return its number."""
-        import cv2
-
         place = np.zeros((LEVELS, 3), np.int64)
         level = rgba
         for k in range(LEVELS):
@@ -94,8 +91,6 @@ def make_atlas(rng: Generator) -> Atlas:
 
 def smooth_noise(rng: Generator, size: int, cells: int) -> Floats:
     """Return tileable noise in [0, 1], shape (size, size), with about ``cells`` blobs per side."""
-    import cv2
-
     coarse = rng.random((cells, cells)).astype(np.float32)
     wrapped = np.pad(coarse, 2, mode="wrap")
     step = size // cells
@@ -107,8 +102,6 @@ def smooth_noise(rng: Generator, size: int, cells: int) -> Floats:
 
 def leaves(rng: Generator) -> Rgba:
     """Return a bunch of leaves: many small ellipses, dark ones first, on transparency."""
-    import cv2
-
     size, count = 128, 420
     canvas = np.zeros((size, size, 4), np.uint8)
     base = np.array([74, 104, 42]) * rng.uniform(0.85, 1.1) + rng.normal(0, 6, 3)
@@ -129,8 +122,6 @@ def leaves(rng: Generator) -> Rgba:
 
 def front(rng: Generator, *, is_shop: bool) -> Rgba:
     """Return a wall of eight by six metres with two storeys of windows."""
-    import cv2
-
     size = 256
     wall = np.array(WALLS[int(rng.integers(len(WALLS)))]) * rng.uniform(0.85, 1.08)
     grain = smooth_noise(rng, size, 32)[..., None] * 0.12 + 0.94

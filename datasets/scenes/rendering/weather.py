@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
@@ -143,8 +144,6 @@ def _sky(
 
 def streaks(rgb: NDArray[np.uint8], rain: float, speed_mps: float, rng: Generator) -> None:
     """Draw falling drops as short bright lines, in place."""
-    import cv2
-
     high, wide = rgb.shape[:2]
     size = wide / 1280
     veil = np.zeros((high, wide), np.uint8)
@@ -162,8 +161,6 @@ def streaks(rgb: NDArray[np.uint8], rain: float, speed_mps: float, rng: Generato
 
 def drops(rgb: NDArray[np.uint8], rain: float, rng: Generator) -> None:
     """Draw drops on the glass, which show the scene upside down and blurred, in place."""
-    import cv2
-
     high, wide = rgb.shape[:2]
     for _ in range(round(34 * rain)):
         r = max(2, round(rng.uniform(3, 13) * wide / 1280))

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -365,8 +366,6 @@ class PlacedPicture:
 
 def place_picture(pixels: Bytes, plan: NetworkPlan) -> PlacedPicture:
     """Scale a picture to the plan's width, crop top and bottom, and pad to the stride."""
-    import cv2
-
     if pixels.ndim == 2:
         pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_GRAY2BGR), np.uint8)
     height, width = pixels.shape[:2]
@@ -413,8 +412,6 @@ def laid_in(mask: NDArray[np.float32], box_px: Floats, size_px: tuple[int, int])
         box_px: x0, y0, x1, y1.
         size_px: Width and height of the picture.
     """
-    import cv2
-
     width, height = size_px
     x0, y0 = (
         min(max(int(np.floor(v)), 0), side - 1) for v, side in zip(box_px, size_px, strict=False)

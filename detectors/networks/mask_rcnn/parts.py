@@ -14,6 +14,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
+import cv2
 import numpy as np
 import torch
 from numba import njit
@@ -380,8 +381,6 @@ def as_input(pictures: NDArray[np.uint8], device: torch.device) -> Tensor:
 
 def _looked_up(pictures: NDArray[np.uint8], table: NDArray[np.float32]) -> NDArray[np.float32]:
     """Planes of red, green and blue, with each byte replaced by its entry in the colour's row."""
-    import cv2
-
     count, height, width, _ = pictures.shape
     planes = np.empty((count, 3, height, width), np.float32)
     for picture, into in zip(pictures, planes, strict=True):

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -95,8 +96,6 @@ class RoadNetworkDetector:
 
 def resize_picture(pixels: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
     """Resize a picture to the network's size; grey pictures get three equal channels."""
-    import cv2
-
     coloured = pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
     small = cv2.resize(coloured, size_px, interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.uint8)

@@ -14,6 +14,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import pyarrow as pa
+
 from crosscue.eval.runs.tables.columns import INDEXED, QUERIED, RUN, arrow_schema
 from crosscue.replay.errors import UnreadableRunError, UsageError
 from crosscue.replay.files import door
@@ -26,7 +28,6 @@ from .local import LocalRuns
 from .remote import RemoteRuns
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     import pyarrow.dataset as ds
     import pyarrow.fs
 
@@ -156,8 +157,6 @@ class Catalog:
 
     def schema(self) -> pa.Table:
         """Return the table, name, type and meaning of every column."""
-        import pyarrow as pa
-
         listed = [
             (table, name, column.kind, column.meaning)
             for table, columns in {**INDEXED, **QUERIED}.items()
@@ -258,7 +257,6 @@ class RunsTable:
             runs: Path of each run's file in the file system, by run.
             filesystem: File system of the runs.
         """
-        import pyarrow as pa
         import pyarrow.dataset as ds
 
         self.left_out: Final[dict[str, str]] = {}
@@ -303,8 +301,6 @@ class RunsTable:
 
     def drop_damaged(self) -> int:
         """Read every file completely, leave out unreadable ones, and return their number."""
-        import pyarrow as pa
-
         damaged = {}
         for run, fragment in self._fragments.items():
             try:

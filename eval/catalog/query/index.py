@@ -19,6 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
+import pyarrow as pa
+
 from crosscue.eval.runs.tables.columns import INDEXED, arrow_schema
 from crosscue.replay.errors import OutputError, UnreadableRunError
 from crosscue.replay.files import door
@@ -31,7 +33,6 @@ from .records import RunRows, run_rows
 from .remote import RemoteRuns
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     import pyarrow.dataset as ds
 
 # Name of the folder of the index.
@@ -119,8 +120,6 @@ def _path_of(runs: Runs) -> Path:
 
 def _read_index(path: Path | None) -> _Earlier:
     """Return the content of the index; empty if it is missing, damaged or of another version."""
-    import pyarrow as pa
-
     nothing = _Earlier({}, {}, {})
     if path is None:
         return nothing
@@ -139,7 +138,6 @@ def _read_index(path: Path | None) -> _Earlier:
 
 def _opened(archive: zipfile.ZipFile, name: str) -> ds.Dataset:
     """Return a table of an index as a data set, which decodes only the columns that are used."""
-    import pyarrow as pa
     import pyarrow.dataset as ds
 
     form = ds.ParquetFileFormat()
@@ -148,8 +146,6 @@ def _opened(archive: zipfile.ZipFile, name: str) -> ds.Dataset:
 
 
 def _entries(complete: Mapping[str, FoundRun], unreadable: Mapping[str, str]) -> pa.Table:
-    import pyarrow as pa
-
     stamps = zip(*(one.stamp for one in complete.values()), strict=True) if complete else [()] * 4
     columns: dict[str, Any] = {"run": pa.array(complete.keys(), pa.string())}
     for name, values in zip(_STAMP, stamps, strict=True):
@@ -176,7 +172,6 @@ def _why(error: Exception) -> str:
 
 def _updated(earlier: Any, name: str, stale: set[str], rows: list[RunRows]) -> pa.Table:
     """Return a table without the rows of stale runs and with the new rows."""
-    import pyarrow as pa
     import pyarrow.compute as pc
 
     schema = arrow_schema(INDEXED[name])
@@ -188,8 +183,6 @@ def _updated(earlier: Any, name: str, stale: set[str], rows: list[RunRows]) -> p
 
 
 def _index(tables: Mapping[str, Any], left_out: Mapping[str, str], notice: str) -> Index:
-    import pyarrow as pa
-
     schema = arrow_schema(INDEXED["left_out"])
     listed = pa.table([[*left_out.keys()], [*left_out.values()]], schema=schema)
     return Index({**tables, "left_out": listed}, left_out, notice)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any, Final, Literal, TypeAlias
 
+import pyarrow as pa
 from pydantic import BaseModel, Field, ValidationError
 
 from crosscue.eval.runs.account import Account
@@ -137,7 +138,6 @@ def _check_other(head: bytes, error: ValidationError) -> None:
 
 def _results(content: bytes) -> list[Row]:
     """Return the results of the approaches in the truth, from a score's ``approaches.parquet``."""
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:

@@ -10,6 +10,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+import pyarrow as pa
+
 from crosscue.eval.runs.folder import FAILURE, MANIFEST
 from crosscue.replay.errors import LogError, UnreadableRunError, UsageError
 from crosscue.replay.remote.logs import guarded, opened_store
@@ -112,7 +114,6 @@ class RemoteRuns:
     @property
     def filesystem(self) -> pyarrow.fs.FileSystem:
         """Arrow's view of the store, which reads only the requested bytes, without read-ahead."""
-        import pyarrow as pa
         import pyarrow.fs
 
         class Ranged(pyarrow.fs.FSSpecHandler):  # type: ignore[misc]

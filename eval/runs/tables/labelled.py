@@ -1,25 +1,18 @@
 """The two columns that every table of a run has: ``segment`` and ``log_t_ns``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from crosscue.replay.time.segments import LogClock, Timeline
 
 from .columns import LOG_TIME, OF_RUN, Columns, arrow_schema
 from .parquet import TableFolder, TableSink, arrow_column
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-
 
 def with_labels(table: pa.Table, timeline: Timeline, clock: LogClock) -> pa.Table:
     """Return a table in memory with the two columns appended."""
-    import pyarrow as pa
-
     times = table["t_ns"].to_numpy()
     numbers = arrow_column(timeline.numbers(times), pa.int32())
     original = arrow_column(clock.log_times(times), pa.int64())

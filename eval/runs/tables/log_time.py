@@ -5,21 +5,16 @@ some moments of the log's clock occur twice. It is unknown which of the two a tr
 rows of both are left out and counted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Int64s
 from crosscue.replay.time.segments import Cause, Timeline
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +68,6 @@ def table_in_log_time(table: pa.Table, timeline: Timeline) -> pa.Table:
     """Return a run's table with recorded ``t_ns``, sorted, without rows whose time occurs twice."""
     if not timeline.was_set_back or not table.num_rows:
         return table
-    import pyarrow as pa
-
     log_ns = table["log_t_ns"].to_numpy()
     keep = ~ambiguous(timeline, log_ns, table["segment"].to_numpy().astype(np.int64))
     moved = table.set_column(table.schema.get_field_index("t_ns"), "t_ns", pa.array(log_ns))

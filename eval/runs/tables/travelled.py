@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from crosscue.fusion.intersection_range import range_noise_m2
 
@@ -113,7 +114,6 @@ def odometer_of(run: TableFolder) -> Odometer:
 
 
 def _rows(run: TableFolder) -> Iterator[OdometryRow]:
-    import pyarrow as pa
     import pyarrow.compute as pc
 
     kinds, gap = (arrow_column(some, pa.string()) for some in (("odometry", "gap"), ("gap",)))

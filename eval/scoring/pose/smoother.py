@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from crosscue.datasets.truth.tum import Trajectory, heading_rad, planar
@@ -208,7 +209,6 @@ def read_measured(run: RunFolder) -> RunMeasurements:
     Raises:
         RunError: The table is missing (a run of an older crosscue), damaged, or empty.
     """
-    import pyarrow as pa
     import pyarrow.compute as pc
 
     table = run.table(TABLE)

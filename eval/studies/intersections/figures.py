@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
+import cv2
 import numpy as np
 
 from crosscue.detectors.cues.observed import FrameDetections
@@ -149,8 +150,6 @@ def write_sheet(
         RunError: A table is damaged.
         OutputError: The file cannot be written.
     """
-    import cv2
-
     tiles = [_tile(one) for one in drives]
     blank = np.zeros((TILE_PX[1], TILE_PX[0], 3), np.uint8)
     columns = min(columns, len(tiles))
@@ -161,8 +160,6 @@ def write_sheet(
 
 
 def _tile(one: RunScored) -> Bytes:
-    import cv2
-
     camera = run_camera(one.run)
     frame = _frame_near(one)
     picture = None if camera is None or frame is None else _picture(camera, frame, one.run)

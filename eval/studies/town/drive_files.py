@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import cv2
 import numpy as np
 
 from crosscue.datasets.simulated.drive import FIELD_T, FILES_OF_DRIVE, START_NS
@@ -222,8 +223,6 @@ def _compass_block(traced: Traced, t_ns: Int64s) -> Block:
 
 def _frames_block(row: Floats, t_ns: Int64s, number: int, seed: int) -> Block:
     """Return frames of the wall at a landmark, and after it, when the replay uses the match."""
-    import cv2
-
     first = int(row[0]) - 1
     at_ns = t_ns[first : first + 2]
     is_known = row[1] != LANDMARK_MISSED
@@ -239,8 +238,6 @@ def _frames_block(row: Floats, t_ns: Int64s, number: int, seed: int) -> Block:
 
 def _wall(seed: int, number: int) -> Bytes:
     """Generate a wall with enough corners; negative numbers are walls without a landmark."""
-    import cv2
-
     rng = np.random.default_rng(key_of(seed, number & 0xFFFF_FFFF, int(number < 0)))
     picture = np.full((HEIGHT_PX, WIDTH_PX), 128, np.uint8)
     for _ in range(300):
@@ -252,8 +249,6 @@ def _wall(seed: int, number: int) -> Bytes:
 
 def _seen(wall: Bytes, seed: int) -> Bytes:
     """Return the wall from a slightly different position, darker and with noise."""
-    import cv2
-
     rng = np.random.default_rng(key_of(seed))
     centre = (WIDTH_PX / 2.0, HEIGHT_PX / 2.0)
     turn = cv2.getRotationMatrix2D(centre, rng.uniform(-4.0, 4.0), rng.uniform(0.9, 1.1))

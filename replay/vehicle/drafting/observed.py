@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from crosscue.replay.base import Log, Selection, name_of
-from crosscue.replay.columns import Block, CanFrames, Floats, Int64s, Table
+from crosscue.replay.columns import LENGTH_UNKNOWN, Block, CanFrames, Floats, Int64s, Table
 from crosscue.replay.decode import decoder_for
 from crosscue.replay.ledger import Ledger, warn_of
 from crosscue.replay.vehicle.roles import Role, is_table, role_of
@@ -49,7 +49,6 @@ class Bus:
     @property
     def mobileye(self) -> tuple[str, ...]:
         """Names of a Mobileye's messages on the bus; empty if it is not a Mobileye's bus."""
-        from crosscue.replay.columns import LENGTH_UNKNOWN
         from crosscue.replay.mobileye.layout import layout
 
         found = []
