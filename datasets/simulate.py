@@ -1,26 +1,21 @@
 """Simulate drives with truth from a seed; nothing is downloaded."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final
+from typing import Annotated, ClassVar, Final
 
 from crosscue.datasets.scenes.drive import SceneFiles, refuse_other_drive, write_scene
 from crosscue.datasets.scenes.layout import SCORED, Side
 from crosscue.datasets.scenes.settings import SceneSettings, camera_of_width
 from crosscue.datasets.simulated.drive import DriveSettings
-from crosscue.datasets.simulated.log_files import write_drive
+from crosscue.datasets.simulated.log_files import DriveFiles, write_drive
 from crosscue.replay.errors import UsageError
 from crosscue.replay.processes import in_processes
 from crosscue.replay.progress import Progress, emit
 from crosscue.results import Listing
 from crosscue.verb import Option
-
-if TYPE_CHECKING:
-    from crosscue.datasets.simulated.log_files import DriveFiles
 
 PUBLISHED_RUNS: Final = 10
 

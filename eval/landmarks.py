@@ -1,7 +1,5 @@
 """Landmark databases: add, list and match landmarks."""
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections.abc import Callable, Iterator
@@ -9,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, TypeAlias
+from typing import Annotated, ClassVar, TypeAlias
 
 from crosscue.eval.fit.landmarks.database import (
     AddCounts,
@@ -27,6 +25,7 @@ from crosscue.localization.landmarks.database import (
     LandmarkPosition,
     LandmarkWriter,
 )
+from crosscue.localization.landmarks.features import Match, Matcher
 from crosscue.localization.landmarks.images import grey_of, read_encoded
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import EmptyResultError, UsageError
@@ -34,9 +33,6 @@ from crosscue.replay.safe_text import counted, visible
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.results import HIDDEN, Result, json_key
 from crosscue.verb import Option, keywords
-
-if TYPE_CHECKING:
-    from crosscue.localization.landmarks.features import Match, Matcher
 
 NearGiven: TypeAlias = Annotated[
     tuple[float, float, float] | str | None,

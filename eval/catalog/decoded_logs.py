@@ -1,14 +1,13 @@
 """Decoding of all streams of a drive to Parquet, one file for each topic or CAN message."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Final, Protocol
+from typing import ClassVar, Final, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crosscue.eval.logs.log import DriveGiven, opened, vehicle_of
 from crosscue.eval.pipeline.drive_time import time_segments, whole_timeline
@@ -38,10 +37,6 @@ from crosscue.replay.vehicle.roles import Role, role_of
 from crosscue.replay.vehicle.vehicle import Vehicle
 from crosscue.replay.versions import versions
 from crosscue.results import HIDDEN, Result, json_key
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 # Min rows of a row group; rows of a table are buffered until then.
 ROWS_HELD: Final = 8192

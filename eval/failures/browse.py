@@ -16,10 +16,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 from urllib.parse import quote
 
 import numpy as np
+import pyarrow as pa
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from crosscue.datasets.truth.truth import FILE
@@ -44,11 +46,6 @@ from crosscue.verb import Option, keywords
 
 from .record import Failure, distance_bin, read_failures
 from .search import ENDINGS, Failures, FailureSettings, search
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-    from markupsafe import Markup
-
 
 MARKER: Final = "crosscue_site.json"
 PER_PAGE: Final = 100

@@ -1,11 +1,11 @@
 """Find the failures of runs, worst first, by cause."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
+
+import pyarrow as pa
 
 from crosscue.eval.catalog.find_runs import runs_of
 from crosscue.eval.catalog.query.catalog import catalog
@@ -24,9 +24,6 @@ from crosscue.replay.progress import Progress, emit
 from crosscue.replay.safe_text import counted, visible
 from crosscue.results import HIDDEN, Result, json_key, listing
 from crosscue.verb import Option, keywords
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 THRESHOLD: Final = 0.9
 PRINTED: Final = 20

@@ -5,15 +5,14 @@ at, what other cues and other detectors say of the same place. Each rule compare
 that it needs no label. A moment is worth looking at; it need not be an error.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
+import pyarrow as pa
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.scoring.columns import NONE, BeliefRows, RangeRows
@@ -27,9 +26,6 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 from .approach_level import EVEN, bits
 from .order import ranked
 from .record import APART_NS, Failure
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 # Cues at which a car slows down, unless a light is green.
 SLOWING: Final = ("stop_sign", "traffic_light")

@@ -7,16 +7,15 @@ drive is divided into one part before each intersection of the truth, and parts 
 ahead. Both exclude frames in an intersection or outside the truth's time.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from crosscue.datasets.truth.truth import Truth
@@ -36,9 +35,6 @@ from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import RunError, UsageError
 from crosscue.replay.progress import Progress, emit
 from crosscue.replay.vehicle.vehicle import RangeCurve, Vehicle
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 # Min fraction of the time between two frames that odometry must cover.
 COVERED: Final = 0.9

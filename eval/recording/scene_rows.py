@@ -1,17 +1,12 @@
 """Cues, ranges and beliefs of a run for a recording; missing tables are None."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from crosscue.eval.runs.tables.parquet import TableFolder
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 @dataclass(frozen=True, slots=True, eq=False)

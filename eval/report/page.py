@@ -3,15 +3,14 @@
 All text from logs, truth or settings is escaped. The same runs and scores yield the same bytes.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from markupsafe import Markup
 
 from crosscue.eval.runs.candidates import CandidateRow, candidate_lines, not_looked_lines
 from crosscue.eval.runs.folder import RunFolder
@@ -30,9 +29,6 @@ from .frame_pictures import draw_pictures
 from .html import number, write_page
 from .opening import Mistake, Opening, curves_of, opening_of
 from .pose_figures import Figure, pose_figures, track_figures
-
-if TYPE_CHECKING:
-    from markupsafe import Markup
 
 REPORT: Final = "report.html"
 TEMPLATE: Final = "page.html.j2"

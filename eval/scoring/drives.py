@@ -4,14 +4,14 @@
 ``pool_scores`` pools any number of compared drives.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa
 
+from crosscue.datasets.truth.truth import Truth
 from crosscue.eval.scoring.scene import approaches as score_approaches
 from crosscue.eval.scoring.scene import belief as score_belief
 from crosscue.eval.scoring.scene.approaches import ApproachesJudged, ApproachScore, judge_approaches
@@ -34,11 +34,6 @@ from .columns import RunTables
 from .pooling import BINS_M
 from .run_tables import run_tables
 from .truth import DriveTruth
-
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-    from crosscue.datasets.truth.truth import Truth
 
 FORMAT: Final = 1
 SECTIONS: Final = ("cues", "approaches", "belief", "range")

@@ -3,12 +3,10 @@
 ``summarise_log`` reads the log. ``crosscue info --json`` prints the fields of ``LogSummary``.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +21,7 @@ from crosscue.replay.clocks.findings import (
 )
 from crosscue.replay.clocks.reports import ClockReport, ClockWatch
 from crosscue.replay.columns import Block, CanFrames, Images, Messages, Topic
-from crosscue.replay.decode import decoder_for
+from crosscue.replay.decode import Decoder, decoder_for
 from crosscue.replay.decode.interfaces import why_not_decoded
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.ledger import Detail, Ledger, TopicAccount
@@ -31,9 +29,6 @@ from crosscue.replay.progress import Progress, emit
 from crosscue.replay.safe_text import counted
 from crosscue.replay.seal.log import sealed_sentence
 from crosscue.replay.vehicle.roles import Role, role_of
-
-if TYPE_CHECKING:
-    from crosscue.replay.decode import Decoder
 
 
 def copies(block: Block) -> int:

@@ -1,11 +1,11 @@
 """The table ``skipped.parquet``: skipped and dropped rows of the logs, with reasons."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import pyarrow as pa
 
 from crosscue.eval.runs.account import UNATTRIBUTED, LogAccount, TopicLine
 from crosscue.replay.ledger import Ledger
@@ -13,9 +13,6 @@ from crosscue.replay.time.segments import ONE_SEGMENT, Timeline
 
 from .columns import LOG_TIME, OF_RUN, arrow_schema
 from .parquet import TableFolder, TableSink
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 def write_skipped(

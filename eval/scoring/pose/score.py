@@ -5,13 +5,12 @@ compared at the body whose track the truth contains, and written as TUM files, f
 the same numbers.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from crosscue.datasets.geodesy import geodetic_to_enu
@@ -43,9 +42,6 @@ from .errors import (
     summarise_nees,
 )
 from .truth_track import TruthTrack
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 MAX_DIFFERENCE_NS: Final = 100_000_000
 COVARIANCES: Final = ("xx_m2", "xy_m2", "xh_mrad", "yy_m2", "yh_mrad", "hh_rad2")

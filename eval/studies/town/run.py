@@ -1,12 +1,12 @@
 """Run a study from its settings: drives, summary, pictures, page."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, overload
+from typing import Annotated, Any, ClassVar, Final, Literal, overload
+
+import pyarrow as pa
 
 from crosscue.eval.runs.folder import RunFolder, locked
 from crosscue.eval.studies.intervals import km, percent
@@ -19,9 +19,6 @@ from crosscue.verb import Option
 from . import drive_figure, landmark_study, range_study
 from .settings import LandmarkStudy, RangeStudy, drives_of
 from .work import DRIVES, chunks_of, run, split, workers_of
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 SUMMARY: Final = "summary.json"
 OURS: Final = (

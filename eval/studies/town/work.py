@@ -3,17 +3,16 @@
 Chunks are written in order, so the result has the same bytes on any number of workers.
 """
 
-from __future__ import annotations
-
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+import pyarrow as pa
 
 from crosscue.eval.runs.folder import RunFolder
 from crosscue.eval.runs.tables.columns import REAL, SMALL, TEXT, Column, arrow_schema
@@ -25,9 +24,6 @@ from crosscue.replay.columns import Floats
 from crosscue.replay.errors import UsageError, WorkerError
 
 from .settings import Case
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 CHUNK_DRIVES: Final = 100
 DRIVES: Final = "drives"

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import crosscue
-from crosscue.eval import cli, recording
+from crosscue.eval import cli
 from crosscue.eval.recording import view
 from crosscue.eval.report.junit import junit_text
 from crosscue.eval.runs.folder import RunFolder
@@ -389,7 +389,7 @@ def test_recording_draws_the_truth_of_the_last_score(
     scored: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[object] = []
-    monkeypatch.setattr(recording, "save_rrd", lambda *given: drawn.append(given[3]))
+    monkeypatch.setattr(view, "save_rrd", lambda *given: drawn.append(given[3]))
     run, truth = scored
 
     view.save_recording(run, run / "told.rrd", truth)
