@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from crosscue.replay.vehicle.temporal import Combined
+from crosscue.replay.vehicle.fusion import Combined
 
 from .factor_graph import FactorGraph
 from .temporal import FLOOR, PRESENCE, MeasuredRange, TemporalFilter, TemporalModel

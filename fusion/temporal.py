@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.fusion.situation import Situation
-from crosscue.replay.vehicle.temporal import CueChain, Temporal
+from crosscue.replay.vehicle.fusion import CueChain, Temporal
 
 from .factor_graph import CueNode, FactorGraph, log_odds
 from .independence import effective_sample_fraction

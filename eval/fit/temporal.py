@@ -20,7 +20,7 @@ from crosscue.fusion.fit.temporal_fit import fit_temporal as fit_drives
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import EmptyResultError, UsageError
 from crosscue.replay.files.whole_file import write_text
-from crosscue.replay.vehicle.temporal import Combined
+from crosscue.replay.vehicle.fusion import Combined
 from crosscue.results import HIDDEN
 from crosscue.verb import Option
 

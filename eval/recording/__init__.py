@@ -18,12 +18,12 @@ from crosscue.eval.runs.moments import run_between
 from crosscue.eval.runs.stored_images import StoredCamera, run_camera
 from crosscue.eval.scoring.pose.truth_track import TruthTrack
 from crosscue.eval.scoring.truth import TrueRanges, true_marks
+from crosscue.replay.clocks.findings import is_date
 from crosscue.replay.columns import Floats
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import spelled
 from crosscue.replay.files.whole_file import write_whole
 from crosscue.replay.safe_text import counted
-from crosscue.replay.time.dates import is_date
 
 from .part import WHOLE, RecordingSpan
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from crosscue.fusion.combined import CombinedModel
 from crosscue.fusion.factor_graph import FactorGraph
-from crosscue.replay.vehicle.temporal import Combined
+from crosscue.replay.vehicle.fusion import Combined
 
 from .temporal_fit import AnnotatedDrive, TemporalFit, filtered, frames_of
 

@@ -30,7 +30,7 @@ from crosscue.fusion.temporal import (
     TemporalModel,
     temporal_model,
 )
-from crosscue.replay.vehicle.temporal import CueChain, Temporal
+from crosscue.replay.vehicle.fusion import CueChain, Temporal
 
 from .annotated_approach import NOT_EVALUATED, Bools
 

@@ -30,6 +30,11 @@ _KNOWN_OFFSETS_S: Final[Mapping[int, str]] = {
 }
 
 
+def is_date(t_ns: int) -> bool:
+    """Return whether a log's time is a date; a clock that starts at boot counts from 0."""
+    return t_ns > _FIRST_UTC_NS
+
+
 def findings(reports: Mapping[str, ClockReport]) -> tuple[str, ...]:
     """Return one sentence for each fault, topic by topic.
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crosscue.replay.columns import Block, Table
-from crosscue.replay.decode.ros.paths import quat, xyz
 from crosscue.replay.decode.ros.plan import ParsingPlan
+from crosscue.replay.decode.ros.standard import quat, xyz
 from crosscue.replay.ledger import Ledger
 
 from .outgoing import Outgoing, Ros2Type, own_type, stamps, standard_type, with_rows

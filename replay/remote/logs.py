@@ -47,8 +47,7 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.limits import Limits
 
 from .address import LogAddress
-from .ranges import RangedFile, Spool
-from .waiting import answered
+from .ranges import RangedFile, Spool, answered
 
 CHUNK_BYTES: Final = 4 << 20
 # Keys under which stores report the version of an object; the first one present is used.

@@ -11,17 +11,53 @@ an object whose size or version has changed, is an error.
 import os
 import tempfile
 import time
+import warnings
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from threading import Lock
+from threading import Lock, Thread
 from typing import BinaryIO, Final, TypeVar
 
 from crosscue.replay.errors import CrosscueError, LogError, one_line
 
 from .address import LogAddress
-from .waiting import answered
+
+NOTICE_S: Final = 5.0
+# Longest time for one request, of at most 4 MiB: 70 kB/s suffice.
+LIMIT_S: Final = 60.0
+
+T = TypeVar("T")
+
+
+def answered(url: str, ask: Callable[[], T]) -> T:
+    """Return ``ask()``, a request to a store, run in a thread because not all have a time limit.
+
+    Raises:
+        LogError: There is no result after ``LIMIT_S``.
+    """
+    results: list[T] = []
+    errors: list[BaseException] = []
+
+    def request() -> None:
+        try:
+            results.append(ask())
+        except BaseException as error:
+            errors.append(error)
+
+    thread = Thread(target=request, name="crosscue store request", daemon=True)
+    thread.start()
+    thread.join(NOTICE_S)
+    if thread.is_alive():
+        waiting = f"no answer to a request for {NOTICE_S:g} s; it ends after {LIMIT_S:g} s"
+        warnings.warn(f"{url}: {waiting}", RuntimeWarning, stacklevel=2)
+        thread.join(LIMIT_S - NOTICE_S)
+    for error in errors:
+        raise error
+    if not results:
+        raise LogError(f"{url}: no answer to a request for {LIMIT_S:g} s; check the connection")
+    return results[0]
+
 
 PIECE: Final = 4 << 20
 AHEAD: Final = 8 << 10

@@ -15,8 +15,16 @@ from crosscue.fusion.evidence import FrameEvidence, RangePosterior, SignRange
 from crosscue.fusion.factor_graph import graph_of
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.vehicle.cue_table import CUES
-from crosscue.replay.vehicle.fusion import Calibrated, Fade, Fusion, RangeFilter, Rates
-from crosscue.replay.vehicle.temporal import Combined, CueChain, Temporal
+from crosscue.replay.vehicle.fusion import (
+    Calibrated,
+    Combined,
+    CueChain,
+    Fade,
+    Fusion,
+    RangeFilter,
+    Rates,
+    Temporal,
+)
 from support.fusion import SECOND_NS, other_side
 
 SOURCE = Fusion()

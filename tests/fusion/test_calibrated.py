@@ -17,8 +17,7 @@ from crosscue.fusion.fit.message_fit import fit_messages, log_odds_of
 from crosscue.fusion.fit.temporal_fit import AnnotatedDrive, fit_temporal
 from crosscue.fusion.situation import Situation
 from crosscue.replay.errors import VehicleError
-from crosscue.replay.vehicle.fusion import Calibrated, Fade, Fusion, RangeFilter, Rates
-from crosscue.replay.vehicle.temporal import Combined
+from crosscue.replay.vehicle.fusion import Calibrated, Combined, Fade, Fusion, RangeFilter, Rates
 from crosscue.replay.vehicle.vehicle import parse
 from support.fusion import FADE_M, RATES, annotated, drive, situation
 

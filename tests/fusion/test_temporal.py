@@ -24,8 +24,7 @@ from crosscue.fusion.temporal import (
     ways_of,
 )
 from crosscue.replay.columns import Floats
-from crosscue.replay.vehicle.fusion import Fade, Fusion, RangeFilter
-from crosscue.replay.vehicle.temporal import CueChain, Temporal
+from crosscue.replay.vehicle.fusion import CueChain, Fade, Fusion, RangeFilter, Temporal
 
 FILTER: Final = RangeFilter()
 TEMPORAL: Final[dict[str, object]] = {"kind": "temporal"}

@@ -16,7 +16,7 @@ from crosscue.fusion.fit.temporal_fit import (
     log_loss,
 )
 from crosscue.fusion.temporal import MeasuredRange, TemporalFilter, temporal_model
-from crosscue.replay.vehicle.temporal import CueChain, Temporal
+from crosscue.replay.vehicle.fusion import CueChain, Temporal
 
 GRAPH: Final = FactorGraph(
     (Feature("intersection", establishes=True), Feature("left", establishes=True)),

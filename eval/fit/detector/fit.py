@@ -30,12 +30,12 @@ from crosscue.eval.report.chart import Chart, precision_and_recall
 from crosscue.eval.runs.manifest import DetectorRow
 from crosscue.eval.scoring.boxes.labelled_run import LabelledRun, labelled_run
 from crosscue.eval.scoring.boxes.matching import match
+from crosscue.replay.clocks.findings import is_date
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import FitError, UsageError
 from crosscue.replay.files.whole_file import write_text
 from crosscue.replay.limits import DEFAULT_LIMITS, LimitsGiven
 from crosscue.replay.safe_text import counted, visible
-from crosscue.replay.time.dates import is_date
 from crosscue.results import HIDDEN, json_key
 from crosscue.verb import Option, keywords
 

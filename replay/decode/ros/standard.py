@@ -31,10 +31,20 @@ from crosscue.replay.decode.refuse import (
     VIDEO_CODING,
 )
 from crosscue.replay.decode.ros.fields import FieldColumns
-from crosscue.replay.decode.ros.paths import quat, xyz
 from crosscue.replay.decode.ros.plan import ParsingPlan
 from crosscue.replay.decode.ros.walk import Bools, gather
 from crosscue.replay.errors import SchemaError
+
+
+def xyz(columns: str, path: str) -> dict[str, str]:
+    """Map columns to the fields of a vector's components; ``columns`` has {} for the axis."""
+    return {columns.format(axis): f"{path}.{axis}" for axis in "xyz"}
+
+
+def quat(path: str) -> dict[str, str]:
+    """Map columns to the fields of a quaternion's components."""
+    return {f"quat_{axis}": f"{path}.{axis}" for axis in "xyzw"}
+
 
 Decoded: TypeAlias = CanFrames | Table | Images
 # Messages that fit their definition but cannot be used, and the reason for the ledger.

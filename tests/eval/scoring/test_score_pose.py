@@ -20,7 +20,7 @@ from crosscue.eval.runs.tables.log_time import ambiguous
 from crosscue.eval.scoring.columns import AMBIGUOUS
 from crosscue.eval.scoring.pose.score import PoseScore, load_truth, truth_track
 from crosscue.eval.scoring.runs import pooled_scores
-from crosscue.eval.studies.town.replayed import score_pose
+from crosscue.eval.studies.town.field_study import score_pose
 from crosscue.replay.errors import SchemaError
 from crosscue.replay.vehicle.pose import Start
 from crosscue.replay.vehicle.vehicle import Camera, Vehicle

@@ -15,7 +15,7 @@ from crosscue.eval.scoring.columns import RangeRows
 from crosscue.eval.scoring.consistency import mean_band
 from crosscue.eval.scoring.intervals import TOO_FEW
 from crosscue.eval.scoring.scene.ranges import smoothed_rows
-from crosscue.eval.studies.town.replayed import score_pose
+from crosscue.eval.studies.town.field_study import score_pose
 from crosscue.fusion.intersection_range import RangeBelief, initialise, predict, update
 from crosscue.replay.columns import Floats
 from crosscue.replay.logs.opening import open_log

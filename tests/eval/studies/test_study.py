@@ -13,10 +13,9 @@ from crosscue.eval.studies.intervals import (
     ratio_of_means,
 )
 from crosscue.eval.studies.town import work
-from crosscue.eval.studies.town.field_study import drive_field, finish_field
+from crosscue.eval.studies.town.field_study import drive_field, finish_field, through_log
 from crosscue.eval.studies.town.landmark_study import summarise_landmarks
 from crosscue.eval.studies.town.range_study import calibrate, drive_choices, summarise_ranges
-from crosscue.eval.studies.town.replayed import through_log
 from crosscue.eval.studies.town.run import drive_study, finish_landmarks, finish_range
 from crosscue.eval.studies.town.settings import FieldStudy, LandmarkStudy, RangeStudy
 from crosscue.eval.studies.town.work import chunks_of, run, split
