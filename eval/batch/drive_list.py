@@ -108,35 +108,33 @@ class _Found(NamedTuple):
     beside: Path | None
 
 
-def drives_of(
-    arguments: Sequence[str], *, each: bool = False, shard: str | None = None
-) -> DriveList:
-    """Return the drives that LOG arguments name, by the rules of the module docstring.
+def find_drives(*logs: Path | str, each: bool = False, shard: str | None = None) -> DriveList:
+    """Find one drive, whose logs are merged by time, or many, by the rules of the module docstring.
 
     Args:
-        arguments: At least one.
-        each: Every argument is a drive, or a folder of drives.
-        shard: The shard to return, such as ``2/4``; None for all drives.
+        logs: Paths or URLs.
+        each: Treat each path as a separate drive, or as a folder of drives.
+        shard: ``2/4`` selects the second of four parts, divided by a hash of each drive's identity.
+
+    Returns:
+        ``drives``, each with its logs and the vehicle file and truth next to them; and ``is_many``.
 
     Raises:
-        UsageError: Nothing matches, a list cannot be read, a drive is named twice, or a folder
-            may be one drive or several.
-        LogError: A location does not exist or cannot be read.
+        UsageError: Nothing matches, a list cannot be read, a drive is named twice, a folder may be
+            one drive or several, or ``shard`` is not valid or set for one drive.
+        LogError: A path does not exist, or may not be read.
     """
     part = None if shard is None else read_shard(shard)
-    found = _all_of(arguments, each=each)
-    return found if part is None else found.part(part)
-
-
-def _all_of(arguments: Sequence[str], *, each: bool) -> DriveList:
-    arguments = [LogAddress(text) if is_remote(text) else text for text in arguments]
+    arguments = [LogAddress(log) if is_remote(log) else log for log in map(str, logs)]
     is_many = each or any(_is_plural(text) for text in arguments)
     if not is_many and len(arguments) > 1:
-        return DriveList(tuple(_named([_Found(tuple(arguments), None)])), False)
-    found = [one for text in arguments for one in _expanded(text, each=each)]
-    if not is_many and not Path(arguments[0]).is_dir():
-        found = [found[0]._replace(beside=None)]
-    return DriveList(tuple(_named(found)), is_many)
+        found = [_Found(tuple(arguments), None)]
+    else:
+        found = [one for text in arguments for one in _expanded(text, each=each)]
+        if not is_many and not Path(arguments[0]).is_dir():
+            found = [found[0]._replace(beside=None)]
+    drives = DriveList(tuple(_named(found)), is_many)
+    return drives if part is None else drives.part(part)
 
 
 def _is_plural(text: str) -> bool:

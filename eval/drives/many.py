@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from crosscue.eval.batch.drive_list import DriveInput, DriveList, drives_of
+from crosscue.eval.batch.drive_list import DriveInput, DriveList, find_drives
 from crosscue.eval.logs.log import UnopenedLog
 from crosscue.eval.pipeline.outcome import MAX_LINES, Outcome
 from crosscue.eval.pipeline.run import Run
@@ -160,28 +160,6 @@ class _Work:
         run = replay_with(log, job.run, ours)
         assert isinstance(run.outcome, Outcome)
         return run.outcome
-
-
-def find_drives(*logs: Path | str, each: bool = False, shard: str | None = None) -> DriveList:
-    """Find one drive, whose logs are merged by time, or many drives.
-
-    Many drives are a folder of drives, a pattern (``drives/*/drive.mcap``), or ``@drives.txt``, a
-    list with one drive per line.
-
-    Args:
-        logs: Paths or URLs.
-        each: Treat each path as a separate drive, or as a folder of drives.
-        shard: ``2/4`` selects the second of four parts, divided by a hash of each drive's identity.
-
-    Returns:
-        ``drives``, each with its logs and the vehicle file and truth next to them; and ``is_many``.
-
-    Raises:
-        UsageError: Nothing matches, a list cannot be read, a drive is named twice, or ``shard`` is
-            not valid or set for one drive.
-        LogError: A path does not exist, or may not be read.
-    """
-    return drives_of([str(log) for log in logs], each=each, shard=shard)
 
 
 @keywords(BatchSettings, 2)

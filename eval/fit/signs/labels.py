@@ -16,7 +16,7 @@ from crosscue.datasets.truth.csv_rows import csv_rows
 from crosscue.detectors.base import Detections, Detector, Frame
 from crosscue.detectors.images import Encoded, decode, encoded, lose, read_file
 from crosscue.detectors.training.operating_point import Verdicts, concatenate_verdicts, match_boxes
-from crosscue.eval.batch.drive_list import DriveInput, drives_of
+from crosscue.eval.batch.drive_list import DriveInput, find_drives
 from crosscue.replay.base import EVERYTHING
 from crosscue.replay.columns import Floats
 from crosscue.replay.errors import (
@@ -118,7 +118,7 @@ def drive_pictures(folder: Path, limits: Limits = DEFAULT_LIMITS) -> Iterator[Si
         LogError: The log cannot be read, or is damaged and has no camera.
         VehicleError: The log has no camera, or several.
     """
-    drives = drives_of([str(folder)])
+    drives = find_drives(folder)
     if len(drives.drives) != 1 or len(drives.drives[0].logs) != 1:
         raise AnnotationError(f"{folder}: expected exactly one log; give the folder of one drive")
     return _pictures(drives.drives[0], _boxes(folder / OBJECTS_FILE), limits)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from crosscue.eval.batch.drive_list import DriveInput, drives_of
+from crosscue.eval.batch.drive_list import DriveInput, find_drives
 from crosscue.replay.errors import CrosscueError, LogError, UsageError
 
 
@@ -72,7 +72,7 @@ def test_drives_of_a_layout_are_found_and_named(tmp_path: Path, layout: str) -> 
     _simulated(tmp_path, *simulated)
     each = "--each" in arguments
 
-    found = drives_of([f"{tmp_path}/{one}" for one in arguments if one != "--each"], each=each)
+    found = find_drives(*[f"{tmp_path}/{one}" for one in arguments if one != "--each"], each=each)
 
     assert _names(found.drives) == names
     assert len({one.name for one in found.drives}) == len(names)
@@ -88,22 +88,22 @@ def test_several_log_arguments_or_parts_of_a_bag_are_one_drive(tmp_path: Path) -
     _touch(tmp_path, "monday.mcap", "tuesday.blf", "vehicle.toml", "bag/b_0.mcap", "bag/b_1.mcap")
     logs = (str(tmp_path / "monday.mcap"), str(tmp_path / "tuesday.blf"))
 
-    found = drives_of(logs)
+    found = find_drives(*logs)
 
     assert not found.is_many
     assert found.drives == (DriveInput(found.drives[0].name, logs),)
-    assert drives_of(logs[::-1]) == found
-    assert drives_of([str(tmp_path / "bag")]).drives[0].logs == (str(tmp_path / "bag"),)
+    assert find_drives(*logs[::-1]) == found
+    assert find_drives(str(tmp_path / "bag")).drives[0].logs == (str(tmp_path / "bag"),)
 
 
 def test_folder_of_mixed_formats_needs_a_vehicle_file(tmp_path: Path) -> None:
     _touch(tmp_path, "camera.bag", "can.blf")
 
     with pytest.raises(UsageError, match=r"several formats \(blf, rosbag1\): one drive or many"):
-        drives_of([str(tmp_path)])
+        find_drives(tmp_path)
 
     _touch(tmp_path, "vehicle.toml")
-    assert len(drives_of([str(tmp_path)]).drives[0].logs) == 2
+    assert len(find_drives(tmp_path).drives[0].logs) == 2
 
 
 def test_list_file_names_drives_line_by_line(tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_list_file_names_drives_line_by_line(tmp_path: Path) -> None:
     text = "# day one\n'a b.mcap' can.blf\n\nc.bag  # alone\nsim\nmemory://bucket/x.mcap\n"
     (tmp_path / "drives.txt").write_text(text)
 
-    found = drives_of([f"@{tmp_path / 'drives.txt'}"])
+    found = find_drives(f"@{tmp_path / 'drives.txt'}")
 
     assert found.is_many
     assert _names(found.drives) == ["a_b", "c", "A-01", "A-02", "x"]
@@ -126,26 +126,26 @@ def test_remote_patterns_are_expanded() -> None:
     for name in ("a/drive.mcap", "b/drive.mcap"):
         system.pipe(f"/{bucket}/{name}", b"")
 
-    found = drives_of([f"memory://{bucket}/*/drive.mcap"])
+    found = find_drives(f"memory://{bucket}/*/drive.mcap")
     system.rm(f"/{bucket}", recursive=True)
 
     assert _names(found.drives) == ["a", "b"]
     assert found.drives[0].logs == (f"memory://{bucket}/a/drive.mcap",)
-    assert not drives_of([f"memory://{bucket}/a/drive.mcap"]).is_many
+    assert not find_drives(f"memory://{bucket}/a/drive.mcap").is_many
 
 
 def test_drive_name_depends_only_on_its_logs(tmp_path: Path) -> None:
     _touch(tmp_path, "x/drive.mcap", "y/drive.mcap", "route/40/drive.mcap", "mon.bag", "tue.bag")
     logs = [str(path) for path in sorted(tmp_path.rglob("*.*"))]
-    together = {one.logs: one.name for one in drives_of(logs, each=True).drives}
+    together = {one.logs: one.name for one in find_drives(*logs, each=True).drives}
 
     assert len(together) == len(logs)
     for log in logs:
-        (alone,) = drives_of([log]).drives
+        (alone,) = find_drives(log).drives
         assert together[alone.logs] == alone.name
-    before = drives_of([logs[0]]).drives[0].name
+    before = find_drives(logs[0]).drives[0].name
     Path(logs[0]).write_text("recorded again")
-    assert drives_of([logs[0]]).drives[0].name != before
+    assert find_drives(logs[0]).drives[0].name != before
 
 
 def test_copy_of_a_recording_is_refused(tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_copy_of_a_recording_is_refused(tmp_path: Path) -> None:
         (tmp_path / folder / "monday.bag").write_text("the same")
 
     with pytest.raises(UsageError, match="the same recording as"):
-        drives_of([str(tmp_path)])
+        find_drives(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def test_invalid_drive_arguments_are_refused_in_one_line(
     tmp_path.joinpath("twice.txt").write_text("a.mcap\na.mcap\n")
 
     with pytest.raises(CrosscueError, match=message) as caught:
-        drives_of([argument.format(tmp_path)])
+        find_drives(argument.format(tmp_path))
 
     assert "\n" not in str(caught.value)
 
@@ -186,7 +186,7 @@ def test_cyclic_symbolic_link_is_not_followed(tmp_path: Path) -> None:
     _simulated(tmp_path, "A-01")
     (tmp_path / "again").symlink_to(tmp_path)
 
-    assert _names(drives_of([str(tmp_path)]).drives) == ["A-01"]
+    assert _names(find_drives(tmp_path).drives) == ["A-01"]
 
 
 @given(st.lists(st.text(min_size=1, max_size=300), min_size=1, max_size=6, unique=True))
@@ -197,7 +197,7 @@ def test_drive_names_are_unique_and_safe_file_names(texts: list[str]) -> None:
     ]
     logs = list(dict.fromkeys(logs))
 
-    names = [one.name for one in drives_of(logs, each=True).drives]
+    names = [one.name for one in find_drives(*logs, each=True).drives]
 
     assert len(set(names)) == len(logs)
     for name in names:
@@ -213,4 +213,4 @@ def test_unreadable_folder_is_reported(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(Path, "iterdir", refuse)
 
     with pytest.raises(LogError, match="Permission denied"):
-        drives_of([str(tmp_path)])
+        find_drives(tmp_path)
