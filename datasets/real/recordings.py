@@ -18,9 +18,9 @@ from pydantic import Field
 
 from crosscue.detectors.catalog.card import Hash
 from crosscue.detectors.catalog.fetch import DATA
-from crosscue.detectors.catalog.places import user_cache
 from crosscue.detectors.settings import Settings
 from crosscue.replay.errors import LogError, OutputError, UsageError, VehicleError
+from crosscue.replay.files.door import user_cache
 from crosscue.replay.files.transfer import Progress, download, is_there, take
 from crosscue.replay.limits import MIB
 from crosscue.replay.progress import Progress as ShownProgress

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.replay.errors import UsageError
+from crosscue.replay.files.door import user_cache
 
 FOLDER: Final = Path(__file__).parent / "models"
 VARIABLE: Final = "CROSSCUE_MODELS"
@@ -25,25 +26,6 @@ def model_folder() -> Path:
     """
     asked = os.environ.get(VARIABLE)
     return Path(asked) if asked else user_cache(VARIABLE) / "models"
-
-
-def user_cache(variable: str) -> Path:
-    """The user's cache folder for crosscue, below ``$XDG_CACHE_HOME``.
-
-    Args:
-        variable: Environment variable that can name another folder, for the error message.
-
-    Raises:
-        UsageError: The user has no home folder.
-    """
-    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    try:
-        base = base if base.is_absolute() else Path.home() / ".cache"
-    except RuntimeError:
-        raise UsageError(
-            f"no home folder for the cache; name another folder in the variable {variable}"
-        ) from None
-    return base / "crosscue"
 
 
 @cache

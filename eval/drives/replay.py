@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import KW_ONLY, dataclass, field
@@ -14,6 +13,7 @@ from crosscue.eval.pipeline.run import Run, RunGiven, run_given
 from crosscue.eval.runs.drive import Drive
 from crosscue.eval.runs.folder import RunFolder, copy_files, created
 from crosscue.replay.errors import OutputError, UsageError
+from crosscue.replay.files.door import user_cache
 from crosscue.replay.vehicle.pose import GnssUse
 from crosscue.replay.vehicle.vehicle import Vehicle, vehicle_given
 from crosscue.verb import HIDDEN, Option, keywords
@@ -31,8 +31,7 @@ def cache_file(*, cache: Path | None = None, no_cache: bool = False) -> Path | N
     """
     if no_cache:
         return None
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "crosscue" / "detections.sqlite" if cache is None else cache
+    return user_cache("XDG_CACHE_HOME") / "detections.sqlite" if cache is None else cache
 
 
 Cache: TypeAlias = Annotated[Path | str | None, Option(made_by=cache_file)]

@@ -21,7 +21,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, overload
 
-from crosscue.replay.errors import OutputError
+from crosscue.replay.errors import OutputError, UsageError
 from crosscue.replay.files import door
 from crosscue.replay.files.tree_text import json_tree
 from crosscue.replay.files.whole_file import write_bytes
@@ -38,18 +38,14 @@ _HEAD_FIELDS: Final = tuple(one.name for one in fields(CanMessage) if one.name !
 _MADE_BY: Final = ("database.py", "dbc_text.py", "layout.py", "layout_cache.py", "sources.py")
 
 
-def layout_cache_folder(environment: Mapping[str, str] = os.environ) -> Path | None:
-    """Return the folder of the cache, or None if it is disabled."""
-    asked = environment.get(VARIABLE)
+def layout_cache_folder() -> Path | None:
+    """Return the folder of the cache, or None if it is disabled or there is no home folder."""
+    asked = os.environ.get(VARIABLE)
     if asked is not None:
         return None if asked.strip().lower() in ("", "off", "0", "no") else Path(asked)
-    base = Path(environment.get("XDG_CACHE_HOME", ""))
-    if not base.is_absolute():  # the XDG specification requires that relative paths are ignored
-        try:
-            base = Path.home() / ".cache"
-        except RuntimeError:
-            return None
-    return base / "crosscue" / "can_layouts" if base.is_absolute() else None
+    with suppress(UsageError):
+        return door.user_cache(VARIABLE) / "can_layouts"
+    return None
 
 
 class LayoutEntry:
@@ -91,7 +87,7 @@ class LayoutEntry:
         """Store a layout if the folder is writable."""
         if self._path is None:
             return
-        heads = [_head(message) for message in messages]
+        heads = [[getattr(message, name) for name in _HEAD_FIELDS] for message in messages]
         parts = [{"notices": notices, "messages": heads}, *map(_signals, messages)]
         body = "\n".join(json.dumps(one, separators=(",", ":")) for one in parts).encode()
         with suppress(OSError, OutputError):
@@ -165,10 +161,6 @@ class _StoredSignals(Sequence[CanSignal]):
 
     def __repr__(self) -> str:
         return repr(self._parsed)
-
-
-def _head(message: CanMessage) -> list[Any]:
-    return [getattr(message, name) for name in _HEAD_FIELDS]
 
 
 def _signals(message: CanMessage) -> list[Any]:

@@ -14,6 +14,8 @@ import stat
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final
 
+from crosscue.replay.errors import UsageError
+
 from .bounded import read_pieces, too_large
 
 if TYPE_CHECKING:
@@ -23,6 +25,25 @@ if TYPE_CHECKING:
 SMALL_BYTES: Final = 16 << 20
 _LINK: Final = "a link, which is not followed here; delete it, or put the file in its place"
 _SPECIAL: Final = "not a regular file; delete it"
+
+
+def user_cache(variable: str) -> Path:
+    """The user's cache folder for crosscue, below ``$XDG_CACHE_HOME``.
+
+    Args:
+        variable: Environment variable that can name another folder, for the error message.
+
+    Raises:
+        UsageError: The user has no home folder.
+    """
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    try:
+        base = base if base.is_absolute() else Path.home() / ".cache"
+    except RuntimeError:
+        raise UsageError(
+            f"no home folder for the cache; name another folder in the variable {variable}"
+        ) from None
+    return base / "crosscue"
 
 
 def inside(folder: Path, name: str) -> Path:

@@ -106,8 +106,7 @@ def default_store() -> Store:
     Raises:
         UsageError: The limit is not a positive number.
     """
-    home = os.environ.get("XDG_CACHE_HOME") or str(Path("~/.cache").expanduser())
-    folder = os.environ.get(STORE_VARIABLE) or str(Path(home, "crosscue", "logs"))
+    folder = os.environ.get(STORE_VARIABLE) or door.user_cache(STORE_VARIABLE) / "logs"
     text = os.environ.get(LIMIT_VARIABLE) or str(LIMIT_GIB)
     try:
         limit = round(float(text) * (1 << 30))

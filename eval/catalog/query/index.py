@@ -112,10 +112,9 @@ def open_index(runs: Runs) -> Index:
 def _path_of(runs: Runs) -> Path:
     if runs.home is not None:
         return runs.home / NAME
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     address = runs.name if is_remote(runs.name) else str(Path(runs.name).resolve())
     key = hashlib.sha256(os.fsencode(address)).hexdigest()[:32]
-    return Path(base, "crosscue", "catalogs", key)
+    return door.user_cache("XDG_CACHE_HOME") / "catalogs" / key
 
 
 def _read_index(path: Path | None) -> _Earlier:

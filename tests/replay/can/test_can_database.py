@@ -348,13 +348,15 @@ def test_damaged_cache_entry_is_parsed_again(
     assert len(parsed) == len(copies)
 
 
-def test_cache_folder_follows_environment() -> None:
-    assert layout_cache_folder({VARIABLE: "/a"}) == Path("/a")
-    assert layout_cache_folder({VARIABLE: "off"}) is None
-    assert layout_cache_folder({"XDG_CACHE_HOME": "/b"}) == Path("/b/crosscue/can_layouts")
-    home = Path.home() / ".cache/crosscue/can_layouts"
-    assert layout_cache_folder({}) == home
-    assert layout_cache_folder({"XDG_CACHE_HOME": "relative"}) == home
+def test_cache_folder_follows_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for text, folder in (("/a", Path("/a")), ("off", None)):
+        monkeypatch.setenv(VARIABLE, text)
+        assert layout_cache_folder() == folder
+    monkeypatch.delenv(VARIABLE)
+    # The XDG specification requires that relative paths are ignored.
+    for base, home in (("/b", Path("/b")), ("relative", Path.home() / ".cache")):
+        monkeypatch.setenv("XDG_CACHE_HOME", base)
+        assert layout_cache_folder() == home / "crosscue" / "can_layouts"
 
 
 _LOAD_OFTEN = """
