@@ -1,5 +1,7 @@
 """The record of one failure of a run, and tables of failures."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
