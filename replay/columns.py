@@ -175,15 +175,9 @@ class CanFrames:
                 _take_flags(self.is_fd, index),
                 None if self.is_tx is None else _take_flags(self.is_tx, index),
             )
-        return CanFrames(
-            self.arbitration_id[index],
-            self.is_extended[index],
-            self.kind[index],
-            self.length[index],
-            self.data[index],
-            self.is_fd[index],
-            None if self.is_tx is None else self.is_tx[index],
-        )
+        columns: list[Any] = [getattr(self, column.name) for column in fields(self)]
+        picked: list[Any] = [None if one is None else one[index] for one in columns]
+        return CanFrames(*picked)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

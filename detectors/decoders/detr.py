@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
@@ -12,6 +11,7 @@ from .base import (
     MAX_QUERIES,
     BoxCandidates,
     BoxOutput,
+    Floats,
     Guess,
     Interface,
     Outputs,
@@ -66,7 +66,7 @@ class DetrOutput(BoxOutput):
         best, classes = best_class(scores)
         return BoxCandidates(_in_pixels(boxes, size_px), best, classes)
 
-    def _scores(self, logits: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _scores(self, logits: Floats) -> Floats:
         if self.activation == "none":
             return logits
         if self.activation == "sigmoid":
@@ -140,8 +140,8 @@ def with_no_object(guess: Guess) -> Guess:
     )
 
 
-def _in_pixels(boxes: NDArray[np.float64], size_px: Size) -> NDArray[np.float64]:
-    pixels: NDArray[np.float64] = from_centers(boxes) * np.tile(size_px, 2)
+def _in_pixels(boxes: Floats, size_px: Size) -> Floats:
+    pixels: Floats = from_centers(boxes) * np.tile(size_px, 2)
     return pixels
 
 

@@ -3,7 +3,6 @@
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
@@ -35,21 +34,15 @@ class EndToEndOutput(BoxOutput):
 
     @override
     def candidates(self, outputs: Outputs, size_px: Size, /) -> BoxCandidates:
+        masks, rows = None, named(outputs, self.name)
         if self.prototypes is None:
-            table = output_rows(named(outputs, self.name), 6, "x0, y0, x1, y1, score, class")
-            return self._of(table, None, size_px)
-        prototypes = prototypes_of(named(outputs, self.prototypes, "prototypes"))
-        table = output_rows(
-            named(outputs, self.name), 6 + len(prototypes), "boxes and mask weights"
-        )
-        return self._of(table, PrototypeMasks(table[:, 6:], prototypes), size_px)
-
-    def _of(
-        self, table: NDArray[np.float64], masks: PrototypeMasks | None, size_px: Size
-    ) -> BoxCandidates:
-        if masks is None:
+            table = output_rows(rows, 6, "x0, y0, x1, y1, score, class")
             # Some exporters pad with a class of -1.
             table = table[~(table[:, 5] < 0.0)]
+        else:
+            prototypes = prototypes_of(named(outputs, self.prototypes, "prototypes"))
+            table = output_rows(rows, 6 + len(prototypes), "boxes and mask weights")
+            masks = PrototypeMasks(table[:, 6:], prototypes)
         boxes = table[:, :4] * (np.tile(size_px, 2) if self.is_fraction else 1.0)
         numbers = class_numbers(table[:, 5], len(self.classes))
         return BoxCandidates(boxes, table[:, 4], numbers, masks)

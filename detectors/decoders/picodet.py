@@ -3,7 +3,6 @@
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
@@ -120,7 +119,7 @@ def distance_boxes(
     return BoxCandidates(np.hstack([middle - sides[:, :2], middle + sides[:, 2:]]), best, numbers)
 
 
-def _expected(logits: NDArray[np.float64]) -> NDArray[np.float64]:
+def _expected(logits: Floats) -> Floats:
     """Mean of each distribution: shape (N, 4, bins) to (N, 4)."""
     weights = np.exp(logits - logits.max(axis=2, keepdims=True))
     bins = np.arange(logits.shape[2], dtype=np.float64)

@@ -1,15 +1,12 @@
 """Decoder of torchvision's detection models exported to ONNX."""
 
-from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
     PICTURE_SIZE_INPUT,
-    Array,
     BoxCandidates,
     BoxOutput,
     Guess,
@@ -59,7 +56,10 @@ class TorchvisionOutput(BoxOutput):
         masks = named(outputs, self.masks, "masks")
         if masks.ndim != 4 or masks.shape[:2] != (n, 1):
             raise ValueError(f"masks: expected ({n}, 1, H, W), got {masks.shape}")
-        return BoxCandidates(boxes, scores, numbers, _WholeMasks(masks))
+        # Masks over the whole input.
+        return BoxCandidates(
+            boxes, scores, numbers, lambda kept: np.asarray(masks[kept, 0], np.float64)
+        )
 
     @override
     @classmethod
@@ -122,14 +122,3 @@ def _by_shape(model: Interface) -> dict[str, Tensor] | None:
     found = {key: outputs[0] for key, outputs in kinds.items() if outputs}
     is_whole = len(found) == len(model.outputs) and {"boxes", "labels", "scores"} <= {*found}
     return found if is_whole else None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _WholeMasks:
-    """Masks over the whole input, shape (N, 1, H, W)."""
-
-    masks: Array
-
-    def __call__(self, kept: NDArray[np.int64], /) -> NDArray[np.float64]:
-        """Return the selected masks, shape (len(kept), H, W)."""
-        return np.asarray(self.masks[kept, 0], np.float64)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
@@ -14,7 +13,9 @@ from .base import (
     Array,
     BoxCandidates,
     BoxOutput,
+    Floats,
     Guess,
+    Int64s,
     Interface,
     Outputs,
     Size,
@@ -44,7 +45,7 @@ class _CentersOutput(BoxOutput):
     are_corners: bool = False
     """True if boxes are x0, y0, x1, y1 instead of center and size."""
 
-    def _corners(self, table: NDArray[np.float64], size_px: Size) -> NDArray[np.float64]:
+    def _corners(self, table: Floats, size_px: Size) -> Floats:
         corners = table[:, :4] if self.are_corners else from_centers(table)
         return corners * np.tile(size_px, 2) if self.is_fraction else corners
 
@@ -194,10 +195,10 @@ class YoloV8SegOutput(_CentersOutput):
 class PrototypeMasks:
     """Masks as weighted sums of prototypes: weights (N, K), prototypes (K, h, w)."""
 
-    weights: NDArray[np.float64]
-    prototypes: NDArray[np.float64]
+    weights: Floats
+    prototypes: Floats
 
-    def __call__(self, kept: NDArray[np.int64], /) -> NDArray[np.float64]:
+    def __call__(self, kept: Int64s, /) -> Floats:
         """Return the selected masks, shape (len(kept), h, w)."""
         return sigmoid(np.tensordot(self.weights[kept], self.prototypes, axes=1))
 
@@ -211,7 +212,7 @@ def prototype_output(model: Interface) -> tuple[str, int] | None:
     return None
 
 
-def prototypes_of(output: Array) -> NDArray[np.float64]:
+def prototypes_of(output: Array) -> Floats:
     """Remove the batch axis of prototype masks (1, K, h, w), or (1, h, w, K) in TFLite files.
 
     Raises:
@@ -223,7 +224,7 @@ def prototypes_of(output: Array) -> NDArray[np.float64]:
     return np.asarray(output[0].transpose(2, 0, 1) if is_last else output[0], np.float64)
 
 
-def _columns(output: Array, rows: int) -> NDArray[np.float64]:
+def _columns(output: Array, rows: int) -> Floats:
     if output.ndim == 3 and output.shape[1] != rows:
         output = output.transpose(0, 2, 1)
     if output.ndim != 3 or output.shape[:2] != (1, rows):

@@ -3,13 +3,13 @@
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
 from .base import (
     GRID_STRIDES,
     BoxCandidates,
     BoxOutput,
+    Floats,
     Guess,
     Interface,
     Outputs,
@@ -43,7 +43,7 @@ class YoloxOutput(BoxOutput):
         # Most cells are empty. No class score is above 1, so a low objectness excludes a cell.
         is_able = ~(np.asarray(rows[0, :, 4], np.float64) < self.score)
         able = rows[0, is_able]
-        table: NDArray[np.float64] = np.asarray(able[:, :5], np.float64)
+        table: Floats = np.asarray(able[:, :5], np.float64)
         corner, stride = (cell[is_able] for cell in cell_grid(size_px, self.strides))
         center = (table[:, :2] + corner) * stride
         # A width of e^20 cells exceeds any picture; more would overflow.

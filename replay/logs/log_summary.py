@@ -5,7 +5,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -307,9 +307,12 @@ def _summary(
 ) -> LogSummary:
     reports = clocks.reports()
     topics = tuple(
-        replace(
-            _topic_summary(topic, ledger.topic(topic.name), reports.get(topic.name), can_ids),
-            duplicates=duplicates.get(topic.name, 0),
+        _topic_summary(
+            topic,
+            ledger.topic(topic.name),
+            reports.get(topic.name),
+            can_ids.get(topic.name, _CanIds()),
+            duplicates.get(topic.name, 0),
         )
         for topic in sorted(log.topics, key=lambda t: t.name)
     )
@@ -339,10 +342,9 @@ def _summary(
 
 
 def _topic_summary(
-    topic: Topic, account: TopicAccount, report: ClockReport | None, can_ids: Mapping[str, _CanIds]
+    topic: Topic, account: TopicAccount, report: ClockReport | None, seen: _CanIds, duplicates: int
 ) -> TopicSummary:
     role = role_of(topic)
-    seen = can_ids.get(topic.name, _CanIds())
     return TopicSummary(
         name=topic.name,
         type_name=topic.type_name,
@@ -358,6 +360,7 @@ def _topic_summary(
         clocks=report,
         can_ids=seen.top(0.0 if report is None else report.duration_ns * 1e-9),
         can_id_count=len(seen.counts),
+        duplicates=duplicates,
     )
 
 

@@ -67,8 +67,6 @@ KEPT_BYTES: Final = 32 << 20
 # Waiting times before each retry of a failed request.
 WAITS_S: Final = (0.1, 0.5, 2.0)
 
-T = TypeVar("T")
-
 
 class Spool:
     """A cache of byte ranges in a sparse temporary file, which is deleted when closed."""
