@@ -39,25 +39,20 @@ def plugins() -> Plugins:
     Examples:
         crosscue plugins
     """
-    taken: dict[Kind, Collection[str]] = {
-        "detector": BUILTIN,
-        "cue": BUILTIN_CUES,
-        "reader": FORMATS,
-        "dataset": FORMATS,
-    }
-    wanted: dict[Kind, type[object]] = {
-        "detector": object,
-        "cue": CueSpec,
-        "reader": Format,
-        "dataset": DataSet,
+    built_in: dict[Kind, tuple[type[object], Collection[str]]] = {
+        "detector": (object, BUILTIN),
+        "cue": (CueSpec, BUILTIN_CUES),
+        "reader": (Format, FORMATS),
+        "dataset": (DataSet, FORMATS),
     }
     found: list[Plugin] = []
     for kind in GROUPS:
-        seen = {*taken[kind]}
+        wanted, taken = built_in[kind]
+        seen = {*taken}
         for point in offered(kind):
             problem = ""
             try:
-                made = load_entry_point(point, wanted[kind])
+                made = load_entry_point(point, wanted)
                 if kind == "detector" and not callable(made):
                     problem = f"{point.value} cannot be called; expected a factory"
             except ImportError as error:

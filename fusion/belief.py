@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from .factor_graph import FactorGraph, log_odds, probability
+from .factor_graph import FactorGraph, Messages, cue_messages, log_odds, probability
 from .situation import Situation
 
 
@@ -73,8 +73,8 @@ class _Line(NamedTuple):
     cue: str
     can_start: bool
     is_per_detection: bool
-    detected: tuple[tuple[int, float], ...]
-    absent: tuple[tuple[int, float], ...]
+    detected: Messages
+    absent: Messages
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,15 +107,8 @@ class PublishedMessageModel:
 
 def published_message_model(graph: FactorGraph, dissent: float) -> PublishedMessageModel:
     """Precompute the graph's messages; ``dissent`` is the message of an absent cue when near."""
-    place = {name: i for i, name in enumerate(graph.feature_names)}
-    against = log_odds(dissent)
-    lines = []
-    for cue in graph.cues:
-        edges = [edge for edge in graph.edges if edge.cue == cue.name]
-        says = log_odds(cue.precision)
-        detected = tuple((place[e.feature], says if e.is_direct else -says) for e in edges)
-        absent = tuple(
-            (place[e.feature], against) for e in edges if cue.absence_counts and e.is_direct
-        )
-        lines.append(_Line(cue.name, cue.can_start, cue.per_detection, detected, absent))
-    return PublishedMessageModel(len(place), tuple(lines))
+    lines = tuple(
+        _Line(cue.name, cue.can_start, cue.per_detection, detected, absent)
+        for cue, detected, absent in cue_messages(graph, dissent)
+    )
+    return PublishedMessageModel(len(graph.features), lines)

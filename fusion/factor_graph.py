@@ -5,8 +5,9 @@ messages into it; in log odds, it is their sum.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Final, Self
+from typing import Final, Self, TypeAlias
 
 from crosscue.replay.vehicle.fusion import Fade, Fusion
 
@@ -15,6 +16,8 @@ USUAL_FADE: Final = Fade(way_m=10.0)
 # Limit of log odds in the conversion to a probability, which stays 1e-13 away from 0 and 1. Sums of
 # log odds are not limited, so that evidence can reverse a belief and its order does not matter.
 LOG_ODDS_LIMIT: Final = 30.0
+# Messages of a cue: the place of each feature that it affects, and the message, in log odds.
+Messages: TypeAlias = tuple[tuple[int, float], ...]
 
 
 def log_odds(probability: float) -> float:
@@ -118,6 +121,25 @@ class FactorGraph:
             cues=tuple(node for node in self.cues if node.name != cue),
             edges=tuple(edge for edge in self.edges if edge.cue != cue),
         )
+
+
+def cue_messages(
+    graph: FactorGraph, dissent: float
+) -> Iterator[tuple[CueNode, Messages, Messages]]:
+    """Yield each cue with its messages while present, and those while absent near the intersection.
+
+    Args:
+        graph: The graph.
+        dissent: Message of an absent cue.
+    """
+    place = {name: i for i, name in enumerate(graph.feature_names)}
+    against = log_odds(dissent)
+    for cue in graph.cues:
+        edges = [edge for edge in graph.edges if edge.cue == cue.name]
+        says = log_odds(cue.precision)
+        detected = tuple((place[e.feature], says if e.is_direct else -says) for e in edges)
+        absent = (e for e in edges if cue.absence_counts and e.is_direct)
+        yield cue, detected, tuple((place[e.feature], against) for e in absent)
 
 
 def graph_of(fusion: Fusion) -> FactorGraph:

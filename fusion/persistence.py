@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 from crosscue.fusion.situation import Situation
 
-from .factor_graph import CueNode, FactorGraph, log_odds
+from .factor_graph import CueNode, FactorGraph, Messages, cue_messages, log_odds
 from .independence import effective_sample_fraction
 
 
@@ -90,8 +90,8 @@ class _Line:
     """One cue, precomputed: the features that it affects, and its full message."""
 
     cue: CueNode
-    detected: tuple[tuple[int, float], ...]
-    absent: tuple[tuple[int, float], ...]
+    detected: Messages
+    absent: Messages
     sent: _Sent = field(default_factory=_Sent)
 
 
@@ -105,7 +105,7 @@ class PersistentMessageModel:
     def __init__(self, graph: FactorGraph, dissent: float) -> None:
         self.silent: dict[str, str] = {}
         self._size = len(graph.features)
-        self._lines = _lines_of(graph, dissent)
+        self._lines = [_Line(*one) for one in cue_messages(graph, dissent)]
         self._way_m = 0.0
         self._time_s = 0.0
         self._speaking: set[str] = set()
@@ -182,18 +182,3 @@ def _why_silent(cue: CueNode, situation: Situation) -> str | None:
     if not (cue.can_start or situation.is_established):
         return "no intersection established"
     return None
-
-
-def _lines_of(graph: FactorGraph, dissent: float) -> list[_Line]:
-    place = {name: i for i, name in enumerate(graph.feature_names)}
-    against = log_odds(dissent)
-    lines = []
-    for cue in graph.cues:
-        edges = [edge for edge in graph.edges if edge.cue == cue.name]
-        says = log_odds(cue.precision)
-        detected = tuple((place[e.feature], says if e.is_direct else -says) for e in edges)
-        absent = tuple(
-            (place[e.feature], against) for e in edges if cue.absence_counts and e.is_direct
-        )
-        lines.append(_Line(cue, detected, absent))
-    return lines

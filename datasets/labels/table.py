@@ -21,8 +21,7 @@ from crosscue.datasets.truth.box_labels import read_box_labels
 from crosscue.datasets.truth.coco import read_coco, write_coco
 from crosscue.datasets.truth.label_xml import read_cvat, write_cvat
 from crosscue.replay.errors import AnnotationError, UsageError
-from crosscue.replay.files.bounded import read_whole
-from crosscue.replay.files.tree_text import json_tree, strict_json
+from crosscue.replay.files.tree_text import read_json, strict_json
 from crosscue.replay.files.whole_file import write_text
 
 YOLO_FILE = "data.yaml"
@@ -116,7 +115,7 @@ def read_fiftyone(path: Path, sizes: Sizes) -> Annotations:
         AnnotationError: The file cannot be read, or the size of a picture is unknown.
     """
     file = path / FIFTYONE_FILE if path.is_dir() else path
-    tree = _tree(file)
+    tree = read_json(file, MAX_BYTES, AnnotationError, "expected labels")
     by_picture = tree.get("labels") if isinstance(tree, dict) else None
     classes = (tree.get("classes") or []) if isinstance(tree, dict) else []
     if not isinstance(by_picture, dict) or not isinstance(classes, list):
@@ -193,15 +192,6 @@ def read_tool_labels(path: Path, sizes: Sizes, kind: ToolFormat | None = None) -
     return LABEL_FORMATS[kind or _recognised(path)].read(path, sizes)
 
 
-def _tree(path: Path) -> Any:
-    try:
-        return json_tree(read_whole(path, MAX_BYTES))
-    except OSError as error:
-        raise AnnotationError(f"{path}: {error.strerror}; expected labels") from None
-    except ValueError as error:
-        raise AnnotationError(f"{path}: not readable as JSON ({error}); expected labels") from None
-
-
 def _recognised(path: Path) -> ToolFormat:
     suffix = path.suffix.lower()
     if path.is_dir():
@@ -210,5 +200,5 @@ def _recognised(path: Path) -> ToolFormat:
         return "cvat" if suffix == ".xml" else "yolo"
     if suffix != ".json":
         raise UsageError(f"{path}: expected COCO or FiftyOne (.json), CVAT (.xml), or a folder")
-    tree = _tree(path)
+    tree = read_json(path, MAX_BYTES, AnnotationError, "expected labels")
     return "fiftyone" if isinstance(tree, dict) and "labels" in tree else "coco"

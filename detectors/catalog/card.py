@@ -19,26 +19,23 @@ architecture = "maskrcnn_resnet50_fpn"
 
 import hashlib
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from crosscue.detectors.decoders.table import AnyBoxOutput
 from crosscue.detectors.networks.weights import Weights
 from crosscue.detectors.settings import Proportion, Settings
 from crosscue.replay.errors import UsageError, VehicleError
 from crosscue.replay.files.bounded import read_whole
-from crosscue.replay.files.tree_text import toml_tree
 from crosscue.replay.limits import MIB
-from crosscue.replay.vehicle.section import tuples
-from crosscue.replay.vehicle.validation_errors import explain
+from crosscue.replay.vehicle.validation_errors import read_model
 
 from .architectures import WEIGHTS_SUFFIXES, ArchitectureName
 from .class_scores import ClassScores
 
 # Maximum size of a weights file.
 MAX_BYTES: Final = 2048 * MIB
-MAX_CARD_BYTES: Final = 1 * MIB
 Side = Annotated[int, Field(gt=0, le=8192)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Colour = tuple[Finite, Finite, Finite]
@@ -214,18 +211,7 @@ def read_card(path: Path) -> ModelCard:
     Raises:
         VehicleError: The file is missing or not TOML, or a key or value is invalid.
     """
-    try:
-        text = read_whole(path, MAX_CARD_BYTES).decode("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise VehicleError(f"{path}: {why}; expected a model card") from None
-    try:
-        tree: dict[str, Any] = tuples(toml_tree(text))
-        return ModelCard.model_validate(tree)
-    except ValidationError as error:
-        raise VehicleError(explain(error, text, str(path), ModelCard)) from None
-    except ValueError as error:
-        raise VehicleError(f"{path}: not TOML: {error}; correct that line") from None
+    return read_model(path, ModelCard, VehicleError, "expected a model card")
 
 
 def read_weights(card: ModelCard, folder: Path) -> Weights:

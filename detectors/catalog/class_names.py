@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from crosscue.replay.errors import UsageError
-from crosscue.replay.files.bounded import read_whole
+from crosscue.replay.files.bounded import read_text
 from crosscue.replay.files.tree_text import yaml_tree
 from crosscue.replay.limits import MIB
 
@@ -82,11 +82,7 @@ def class_names_given(given: Sequence[str] | Path | str) -> tuple[str, ...]:
     if not isinstance(given, Path | str):
         return tuple(given)
     path = Path(given)
-    try:
-        text = read_whole(path, MIB).decode("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise UsageError(f"{path}: {why}; expected class names, one per line") from None
+    text = read_text(path, MIB, UsageError, "expected class names, one per line")
     if path.suffix in (".yaml", ".yml"):
         return _yaml_names(path, text)
     names = tuple(line.strip() for line in text.splitlines() if line.strip())

@@ -16,9 +16,12 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from json.encoder import encode_basestring_ascii as _quoted
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
+
+from .bounded import read_whole
 
 if TYPE_CHECKING:
     from tomlkit import TOMLDocument
@@ -63,6 +66,16 @@ def json_tree(
         return json.loads(text, object_pairs_hook=object_pairs_hook, parse_constant=parse_constant)
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
+
+
+def read_json(path: Path, max_bytes: int, refused: type[Exception], remedy: str) -> Any:
+    """Return the tree of a JSON file; the arguments are those of ``bounded.read_text``."""
+    try:
+        return json_tree(read_whole(path, max_bytes))
+    except OSError as error:
+        raise refused(f"{path}: {error.strerror}; {remedy}") from None
+    except ValueError as error:
+        raise refused(f"{path}: not readable as JSON ({error}); {remedy}") from None
 
 
 def toml_tree(text: str) -> dict[str, Any]:

@@ -26,8 +26,7 @@ from crosscue.eval.runs.folder import RunFolder
 from crosscue.replay.columns import Floats, Int64s
 from crosscue.replay.errors import AnnotationError, EmptyResultError, SchemaError, UsageError
 from crosscue.replay.files import door
-from crosscue.replay.files.bounded import read_whole
-from crosscue.replay.files.tree_text import json_tree
+from crosscue.replay.files.tree_text import read_json
 from crosscue.replay.limits import MIB
 from crosscue.replay.safe_text import counted
 from crosscue.results import HIDDEN
@@ -343,13 +342,7 @@ def _objects(truth: Path) -> Any:
     name = read_truth(truth).objects
     if name is None:
         raise SchemaError(f"{truth}: has no objects; name a COCO file with them as objects")
-    path = _folder(truth) / name
-    try:
-        return json_tree(read_whole(path, MAX_BYTES))
-    except OSError as error:
-        raise AnnotationError(f"{path}: {error.strerror}; repair it") from None
-    except ValueError as error:
-        raise AnnotationError(f"{path}: not readable as JSON ({error}); repair it") from None
+    return read_json(_folder(truth) / name, MAX_BYTES, AnnotationError, "repair it")
 
 
 def _folder(truth: Path) -> Path:
