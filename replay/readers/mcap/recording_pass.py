@@ -25,7 +25,7 @@ from crosscue.replay.readers.mcap.chunks.rows import (
 from crosscue.replay.readers.mcap.damage.resync import McapResync, Plausible
 
 from .bytes import ByteFile
-from .channels import TopicBook
+from .channels import Declarations, TopicBook
 from .checks import Checks
 from .records import PREFIX, BrokenRecordError
 from .segments import RecordingSegment, Summary
@@ -88,8 +88,9 @@ def read_segments(
     for segment in segments:
         where = "" if len(segments) == 1 else f"recording at byte {segment.base}: "
         with Loader(file, limits) as loader:
+            known = segment.declarations(book)
             part = SegmentPass(
-                file, segment, book, limits, ledger, selection, checks, loader, where
+                file, segment, known, limits, ledger, selection, checks, loader, where
             )
             yield from part.blocks()
             counts = part.settle()
@@ -105,42 +106,34 @@ def read_segments(
     checks.report(ledger)
 
 
+@dataclass(eq=False)
 class SegmentPass:
     """One pass over a recording of a file."""
 
-    def __init__(
-        self,
-        file: ByteFile,
-        segment: RecordingSegment,
-        book: TopicBook,
-        limits: Limits,
-        ledger: Ledger,
-        selection: Selection,
-        checks: Checks,
-        loader: Loader,
-        where: str,
-    ) -> None:
-        self._file = file
-        self._segment = segment
+    _file: ByteFile
+    _segment: RecordingSegment
+    _declarations: Declarations
+    _limits: Limits
+    _ledger: Ledger
+    _selection: Selection
+    _checks: Checks
+    _loader: Loader
+    _where: str
+    _inside: ChunkWindow | None = None
+    _doubt: str = ""
+    _damages: list[DamagedPart] = field(default_factory=list)
+    _rows_doubted: int = 0
+    _is_short: bool | None = None
+    _section: Callable[[], int | None] | None = None
+    _attachments: list[tuple[int, int, Callable[[], int | None]]] = field(default_factory=list)
+    _waiting: list[tuple[UnreadChunk, ChunkRecords]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        segment, selection = self._segment, self._selection
         self._summary = segment.summary or Summary()
-        self._limits = limits
-        self._ledger = ledger
-        self._selection = selection
         self._may_skip = selection != EVERYTHING
-        self._inside: ChunkWindow | None = None
-        self._doubt = ""
-        self._checks = checks
-        self._loader = loader
-        self._where = where
-        self._damages: list[DamagedPart] = []
-        self._rows_doubted = 0
-        self._is_short: bool | None = None
-        self._section: Callable[[], int | None] | None = None
-        self._attachments: list[tuple[int, int, Callable[[], int | None]]] = []
-        self._waiting: list[tuple[UnreadChunk, ChunkRecords]] = []
-        self._declarations = segment.declarations(book)
-        self._builder = BlockBuilder(ledger, selection, limits, self._declarations)
-        self._search = McapResync(file, segment.end, segment.has_end, (), self._plausible())
+        self._builder = BlockBuilder(self._ledger, selection, self._limits, self._declarations)
+        self._search = McapResync(self._file, segment.end, segment.has_end, (), self._plausible())
 
     def blocks(self) -> Iterator[Block]:
         """Yield the blocks of the recording."""

@@ -266,17 +266,14 @@ class Mf4Log(Closing):
             yield _Source(k, group, master, can, topic, refusal, declared)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _Pass:
     """One pass over the records of all groups."""
 
-    def __init__(
-        self,
-        log: Mf4Log,
-        accounts: Mapping[_Source, _Account],
-        ledger: Ledger,
-        selection: Selection,
-    ) -> None:
-        self._log, self._accounts, self._ledger, self._selection = log, accounts, ledger, selection
+    _log: Mf4Log
+    _accounts: Mapping[_Source, _Account]
+    _ledger: Ledger
+    _selection: Selection
 
     def blocks(self, groups: Sequence[_Stored]) -> Iterator[Block]:
         """Yield the rows of unsorted data, then all other frames by time, then other rows."""

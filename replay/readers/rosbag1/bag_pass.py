@@ -160,24 +160,24 @@ class _Batch:
         self.count += len(rows.conn)
 
 
+@dataclass(eq=False)
 class Pass:
     """The state of one ``read``."""
 
-    def __init__(
-        self, file: BagFile, roster: Roster, limits: Limits, ledger: Ledger, selection: Selection
-    ) -> None:
-        self._inside: BagWindow | None = None
-        self._doubt = ""
-        self._file = file
-        self._contents = roster.contents
-        self._roster = roster
-        self._limits = limits
-        self._ledger = ledger
-        self._selection = selection
-        self._batch = _Batch()
-        self._owed = Counter[int]()
-        self._owed_by: tuple[int, int] | None = None
-        self._checked = _Checked()
+    _file: BagFile
+    _roster: Roster
+    _limits: Limits
+    _ledger: Ledger
+    _selection: Selection
+    _inside: BagWindow | None = None
+    _doubt: str = ""
+    _batch: _Batch = field(default_factory=_Batch)
+    _owed: Counter[int] = field(default_factory=Counter)
+    _owed_by: tuple[int, int] | None = None
+    _checked: _Checked = field(default_factory=_Checked)
+
+    def __post_init__(self) -> None:
+        self._contents = self._roster.contents
 
     def blocks(self) -> Iterator[Block]:
         """Yield all blocks in stored order."""

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -25,6 +26,7 @@ LATEST: Final = np.uint64((1 << 63) - 1)
 Uint64s: TypeAlias = NDArray[np.uint64]
 
 
+@dataclass(eq=False)
 class BlockBuilder:
     """Converts the messages of one recording to blocks.
 
@@ -33,16 +35,15 @@ class BlockBuilder:
         dropped: Number of messages known to be dropped, by channel number.
     """
 
-    def __init__(
-        self, ledger: Ledger, selection: Selection, limits: Limits, declarations: Declarations
-    ) -> None:
-        self.met: Counter[int] = Counter()
-        self.dropped: Counter[int] = Counter()
-        self.declarations = declarations
-        self._ledger = ledger
-        self._selection = selection
-        self._limits = limits
-        self._is_timeless = not selection.is_timed
+    _ledger: Ledger
+    _selection: Selection
+    _limits: Limits
+    declarations: Declarations
+    met: Counter[int] = field(default_factory=Counter)
+    dropped: Counter[int] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self._is_timeless = not self._selection.is_timed
 
     def build(self, rows: Rows, checks: Checks, at: int) -> Iterator[Block]:
         """Yield the messages of ``rows``, one block per topic, by the channels valid there.
