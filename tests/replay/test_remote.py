@@ -31,7 +31,6 @@ from crosscue.replay.ledger import Ledger
 from crosscue.replay.logs.opening import open_log
 from crosscue.replay.remote import logs as remote
 from crosscue.replay.remote import ranges as remote_ranges
-from crosscue.replay.remote import waiting
 from crosscue.replay.remote.address import LogAddress, is_remote
 from crosscue.replay.remote.logs import Store, fetch_log
 from crosscue.replay.write.convert import LogWriter
@@ -309,8 +308,8 @@ def test_stalled_server_is_reported_then_given_up(
     code = (
         "import sys\n"
         "from crosscue.eval.cli import main\n"
-        "from crosscue.replay.remote import waiting\n"
-        "waiting.NOTICE_S, waiting.LIMIT_S = 1.0, 3.0\n"
+        "from crosscue.replay.remote import ranges\n"
+        "ranges.NOTICE_S, ranges.LIMIT_S = 1.0, 3.0\n"
         "main(sys.argv[1:])\n"
     )
 
@@ -329,9 +328,9 @@ def test_stalled_server_is_reported_then_given_up(
 def test_limits_are_those_that_the_page_states() -> None:
     page = (Path(__file__).parents[2] / "docs" / "howto" / "many_drives.md").read_text()
 
-    assert waiting.NOTICE_S <= 10.0
-    assert f"after {waiting.NOTICE_S:g} s" in page
-    assert f"after {waiting.LIMIT_S:g} s" in page
+    assert remote_ranges.NOTICE_S <= 10.0
+    assert f"after {remote_ranges.NOTICE_S:g} s" in page
+    assert f"after {remote_ranges.LIMIT_S:g} s" in page
     assert remote.CHUNK_BYTES == remote_ranges.PIECE == 4 << 20
 
 
