@@ -36,6 +36,14 @@ def test_a_side_street_is_seen_on_its_side_whatever_the_camera(
     assert after([ROAD, LEFT, RIGHT], camera=camera) == (True, True)
 
 
+def test_ground_far_away_that_is_taken_for_road_is_no_road_to_a_side_of_a_motorway() -> None:
+    motorway = [(3.0 * x, z) for x, z in ROAD]
+    for first_m, last_m in ((55.0, 90.0), (60.0, 110.0)):
+        far = [(0.0, first_m), (400.0, first_m), (400.0, last_m), (0.0, last_m)]
+        assert after([motorway, far]) == (False, False)
+        assert after([motorway, [(-x, z) for x, z in far]]) == (False, False)
+
+
 def test_the_road_ahead_is_seen_only_behind_an_intersection() -> None:
     crossing, straight = RoadLayout(), RoadLayout()
     for t_ns in range(0, 10**9, 10**8):
