@@ -144,10 +144,11 @@ class ControlTracks:
             is_new=is_new,
         )
         for (k, i), track in zip(rows, tracks.of_boxes, strict=True):
-            for look in found[k].looks[i : i + 1] if track is not None else ():
+            if track is not None:
                 x0, y0, x1, y1 = found[k].boxes_px[i].tolist()
-                # Twice the size shows four times as much.
-                track.looks[look] += round((x1 - x0) * (y1 - y0))
+                for look in found[k].looks[i : i + 1]:
+                    # Twice the size shows four times as much.
+                    track.looks[look] += round((x1 - x0) * (y1 - y0))
         kept = [one for one in tracks.tracks if one.is_accepted and not _other(one)]
         if is_tracked and not any(one.lit + one.yellow for one in kept):
             kept = [one for one in kept if one.dark < MIN_DARK]
