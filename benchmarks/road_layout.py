@@ -26,8 +26,9 @@ No help: weights of the last layer fitted to real masks (at places left out the 
 to 0.83 or less), and the mean over crops of the mask. By the whole estimate on 41 of these drives
 (legs there of 121, not there of 116, intersections of 58, false ones):
 
-    before 85, 5, 49, 10   with kerbs 86, 1, 49, 6
-    now    81, 1, 49, 5    with kerbs 79, 1, 48, 5   limit 1.0: 85, 2, 50, 6
+    before, above 1.25: 85, 5, 49, 10   with kerbs 86, 1, 49, 6
+    now, above 1.25:    81, 1, 49, 5    with kerbs 79, 1, 48, 5
+    now, above 1.0:     85, 2, 50, 6    with kerbs 85, 2, 50, 6
 
 With kerbs, roads to the sides lose 1.25 where the road network shows none, as on motorways, and
 gain up to 0.25 where it shows many: that told what these weights tell. To open an approach by log
