@@ -46,11 +46,6 @@ OF_LENS: Final = {"red": 0.6, "green": 0.6, "dark": -0.6}
 # Evidence of a second look that shows a stop sign: 33 of 38 stop signs look like one, and 1 of 40
 # other boxes. 24 of these look like other signs and no stop sign does, which rules a track out.
 OF_LOOK: Final = {"stop": 2.0}
-# Frames without a lit lens after which a light counts only while a lit one is beside it. At a
-# crossing, lights seen from behind or from the side have such a neighbour; windows, chimneys and
-# shop signs have none.
-MIN_DARK: Final = 3
-ONLY_DARK: Final = "no lit lens, and no lit light beside it"
 # Maximum tangent of an angle below the horizon: a head lower than the camera, as one for cyclists,
 # is not seen so steeply before it is passed. Flares and the dashboard are.
 MAX_BELOW: Final = 0.2
@@ -149,17 +144,14 @@ class ControlTracks:
                 for look in found[k].looks[i : i + 1]:
                     # Twice the size shows four times as much.
                     track.looks[look] += round((x1 - x0) * (y1 - y0))
-        kept = [one for one in tracks.tracks if one.is_accepted and not _other(one)]
-        if is_tracked and not any(one.lit + one.yellow for one in kept):
-            kept = [one for one in kept if one.dark < MIN_DARK]
         for (k, i), track in zip(rows, tracks.of_boxes, strict=True):
             if track is not None:
-                decisions[k][i] = (
-                    ACCEPTED
-                    if any(one is track for one in kept)
-                    else _other(track) or (ONLY_DARK if track.is_accepted else TOO_LITTLE_EVIDENCE)
+                decisions[k][i] = _other(track) or (
+                    ACCEPTED if track.is_accepted else TOO_LITTLE_EVIDENCE
                 )
-        self.tracks[cue.name] = kept
+        self.tracks[cue.name] = [
+            one for one in tracks.tracks if one.is_accepted and not _other(one)
+        ]
 
     def _new(self, cue: CueSpec, found: Sequence[Detections]) -> ObjectTracks:
         camera, size_px = self.vehicle.camera, found[0].size_px

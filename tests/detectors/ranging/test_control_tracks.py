@@ -13,7 +13,6 @@ from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections
 from crosscue.detectors.ranging.control_tracks import (
     BELOW_HORIZON,
-    ONLY_DARK,
     ControlTracks,
 )
 from crosscue.detectors.ranging.lens import Lens, lens_of
@@ -189,21 +188,9 @@ def test_dark_housing_needs_more_frames_than_a_lit_one() -> None:
     assert first["red"] < first["unknown"] < first["dark"]
 
 
-@pytest.mark.parametrize("lit", ["red", "yellow", "green"])
-def test_dark_light_counts_only_while_a_lit_one_is_beside_it(lit: str) -> None:
-    dark, beside = (600.0, 140.0, 0.9, "dark"), (900.0, 140.0, 0.9, lit)
-    flare = (900.0, 700.0, 0.9, lit)
-
-    assert set(decided([[dark]] * 40)[3:]) == {(ONLY_DARK,)}
-    assert decided([[dark, flare]] * 40)[-1] == (ONLY_DARK, BELOW_HORIZON)
-    # What was lit once, or is too small or grey to tell, needs no other.
-    assert decided([[(600.0, 140.0, 0.9, lit)], *[[dark]] * 40])[-1] == (ACCEPTED,)
-    assert decided([[(600.0, 140.0, 0.9, "unknown")]] * 40)[-1] == (ACCEPTED,)
-
-    found = decided([*[[dark, beside]] * 10, *[[dark]] * 30])
-
-    assert found[9] == (ACCEPTED, ACCEPTED)
-    assert found[-1] == (ONLY_DARK,)
+def test_dark_light_needs_no_lit_one_beside_it() -> None:
+    # In shade and from afar, lenses are dark in most pictures: of a queue, in all.
+    assert decided([[(600.0, 140.0, 0.9, "dark")]] * 40)[-1] == (ACCEPTED,)
 
 
 def test_at_one_score_small_and_long_boxes_are_more_evidence_whichever_way_they_lie() -> None:
