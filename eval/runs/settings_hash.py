@@ -1,12 +1,19 @@
 """Text and hash of a run's settings, by which runs of the same drive are distinguished."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 import marshal
 from collections.abc import Mapping
-from functools import lru_cache
+from typing import Final
 
 from crosscue.replay.files.tree_text import json_tree
+
+# Number of results that are kept, because most runs share their settings.
+KEPT: Final = 256
+# Results by a key that is made ten times as fast as JSON, and only compared.
+_kept: Final[dict[bytes, tuple[str, str]]] = {}
 
 
 def text_and_sha256(settings: object, detectors: object, selection: object) -> tuple[str, str]:
@@ -15,15 +22,15 @@ def text_and_sha256(settings: object, detectors: object, selection: object) -> t
     All are JSON values. Only the names of files are hashed, without their folders, so that a drive
     replayed elsewhere yields the same hash.
     """
-    # Most runs share their settings. This key is made ten times as fast as JSON.
-    return _text_and_sha256(marshal.dumps([settings, detectors, selection], 2))
-
-
-@lru_cache(maxsize=256)
-def _text_and_sha256(made_with: bytes) -> tuple[str, str]:
-    given = marshal.loads(made_with)  # noqa: S302 (our own bytes)
-    plain = json.dumps(_without_places(json_tree(json.dumps(given))), sort_keys=True)
-    return json.dumps(given[0], sort_keys=True), hashlib.sha256(plain.encode()).hexdigest()
+    key = marshal.dumps([settings, detectors, selection], 2)
+    if key not in _kept:
+        if len(_kept) >= KEPT:
+            _kept.clear()
+        made_with = json.dumps([settings, detectors, selection], sort_keys=True)
+        plain = json.dumps(_without_places(json_tree(made_with)), sort_keys=True)
+        text = json.dumps(settings, sort_keys=True)
+        _kept[key] = text, hashlib.sha256(plain.encode()).hexdigest()
+    return _kept[key]
 
 
 def _without_places(value: object) -> object:
