@@ -148,8 +148,10 @@ def recorded_drives() -> Iterator[tuple[str, Drive]]:
         )
 
 
-# Cameras of KITTI by the month and day of their calibration.
+# Cameras of KITTI by the month and day of their calibration; raw is before rectification.
 _CAMERAS: Final = {
+    "kitti_360": "focal_px = 552.55\ncenter_px = [682.05, 238.77]\nx_m = 1.6\nz_m = 1.55\n",
+    "kitti_0926_raw": f"focal_px = 984.2\ncenter_px = [690.0, 233.2]\n{KITTI}",
     "kitti_0926": f"focal_px = 721.5\ncenter_px = [609.6, 172.9]\n{KITTI}",
     "kitti_0930": f"focal_px = 707.0912\ncenter_px = [601.8873, 183.1104]\n{KITTI}",
     "kitti_1003": f"focal_px = 718.856\ncenter_px = [607.1928, 185.2157]\n{KITTI}",
