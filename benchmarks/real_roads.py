@@ -13,11 +13,12 @@ the pictures that ``cut`` takes (first, last, step); null is uncertain and not s
 A leg counts by the highest belief within the annotated frames: above 0.9 it is believed, and wrong
 where there is none. At its prior it is not seen; below, a missing leg is right. Anything else is
 undecided. Beside it stand the messages: the legs that are there, and those that are not, that a
-road cue shows in any of the frames. Below, each cue and leg has a line with the numbers of drives
-and places it stands on, apart for drives of development (``*``), and so have the messages, by the
-openings of calibrated cameras and by the mask's shape for others; then the sums of legs and
-intersections. Times, frames and distances are those of the annotations; ranges are scored only
-where a track gives the true distance.
+road cue shows in any of the frames. ``OUT/wrong`` has a picture of each missed or false cue, and of
+each wrong leg and intersection, named after drive and frame. Below, each cue and leg has a line
+with the numbers of drives and places it stands on, apart for drives of development (``*``), and so
+have the messages, by the openings of calibrated cameras and by the mask's shape for others; then
+the sums of legs and intersections. Times, frames and distances are those of the annotations; ranges
+are scored only where a track gives the true distance.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from numpy.typing import NDArray
 from crosscue.detectors.catalog.fetch import fetch_weights
 from crosscue.eval.drives.replay import replay_drive
 from crosscue.eval.pipeline.run import Run
+from crosscue.eval.report.frame_pictures import draw_pictures
 from crosscue.replay.columns import Floats
 
 DATA: Final = Path(os.environ.get("CROSSCUE_DATA", "../shared/data"))
@@ -219,6 +221,8 @@ class Score:
         false_intersections: Believed approaches to none.
         ranges: Numbers of ranges inside their interval, and of all.
         minutes: Duration.
+        brier: Error of each feature of an approach.
+        wrong: Time of a frame, and what is wrong in it.
     """
 
     cues: dict[str, Counter[str]] = field(default_factory=dict)
@@ -230,6 +234,7 @@ class Score:
     ranges: tuple[int, int] = (0, 0)
     minutes: float = 0.0
     brier: list[float] = field(default_factory=list)
+    wrong: list[tuple[int, str]] = field(default_factory=list)
 
 
 def pictures_of(source: Path, pattern: str) -> Iterator[Path | NDArray[np.uint8]]:
@@ -316,6 +321,8 @@ def scored(run: Run, drive: Drive) -> Score:
         if is_found is not None:
             kind = "right" if is_found == is_there else "missed" if is_there else "false"
             score.cues[cue][kind] += 1
+            if kind != "right":
+                score.wrong.append((int(times[frame]), f"{kind} {cue}"))
     beliefs = run["belief"].to_pylist()
     frame_of = {int(t_ns): i for i, t_ns in enumerate(times)}
     believed: dict[int, list[int]] = {}
@@ -355,7 +362,9 @@ def scored(run: Run, drive: Drive) -> Score:
             score.first = f"frame {min(frames)}"
             if travelled is not None and drive.mouth_m is not None:
                 score.first = f"{drive.mouth_m[0] - travelled[min(frames)]:.1f} m"
-    score.false_intersections = len(believed.keys() - claimed)
+    false = sorted(believed.keys() - claimed)
+    score.false_intersections = len(false)
+    score.wrong += [(int(times[min(believed[one])]), "false intersection") for one in false]
     if travelled is not None and drive.mouth_m is not None:
         score.ranges = _ranges(run, drive, frame_of, travelled)
     return score
@@ -372,6 +381,9 @@ def _legs(
         is_seen = any(row[name] != 0.5 for row in rows)
         if best > BELIEVED:
             score.legs[prefix + name] = "right" if truth else "WRONG"
+            if not truth:
+                surest = max(rows, key=lambda row: row[name])
+                score.wrong.append((int(surest["t_ns"]), f"false {name}"))
         elif not is_seen:
             score.legs[prefix + name] = "not seen"
         elif not truth and rows[-1][name] < 0.5:
@@ -396,6 +408,26 @@ def _ranges(
         error_m = row["range_m"] - (place_m - travelled[frame] + x_m)
         inside += abs(error_m) <= 1.96 * row["var_m2"] ** 0.5
     return inside, total
+
+
+def draw_wrong(name: str, run: Run, score: Score, folder: Path) -> str:
+    """Draw what was found in each frame where something is wrong; return why pictures are missing.
+
+    Pictures of an earlier run of the drive are removed.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in folder.glob(f"{name} frame *.jpg"):
+        old.unlink()
+    frame_of = {t_ns: i for i, t_ns in enumerate(sorted(run["frames"]["t_ns"].to_pylist()))}
+    whats: dict[int, list[str]] = {}
+    for t_ns, what in score.wrong:
+        whats.setdefault(t_ns, []).append(what)
+
+    def keep(t_ns: int, picture: bytes, _: bytes) -> None:
+        what = ", ".join(whats[t_ns])
+        (folder / f"{name} frame {frame_of[t_ns]:04} {what}.jpg").write_bytes(picture)
+
+    return draw_pictures(run.folder, whats, keep, has_candidates=False) if whats else ""
 
 
 def evidence(scores: Mapping[str, Score], drives: Mapping[str, Drive] = DRIVES) -> Iterator[str]:
@@ -519,7 +551,9 @@ def main(arguments: Sequence[str]) -> None:
         if not any((DATA / "sequences" / drive.folder).glob(drive.pictures)):
             print(f"{name:24} no {drive.folder}/{drive.pictures} in sequences")
             continue
-        score = scores[name] = scored(replayed(name, drive, out, fusion), drive)
+        run = replayed(name, drive, out, fusion)
+        score = scores[name] = scored(run, drive)
+        missing = draw_wrong(name, run, score, out / "wrong")
         lights, stops = (
             "/".join(str(score.cues[cue][kind]) for kind in ("right", "missed", "false"))
             for cue in CUES
@@ -530,7 +564,7 @@ def main(arguments: Sequence[str]) -> None:
             f"{name + ('*' if drive.is_development else ''):24} {lights:>9} {stops:>10} "
             f"{'':20} {legs:52} {_shown(score.messages):>26} "
             f"{score.first:>9} {sum(score.pieces):6} {score.false_intersections:6} "
-            f"{f'{inside}/{total}' if total else '-':>8}",
+            f"{f'{inside}/{total}' if total else '-':>8}{missing and f' no pictures: {missing}'}",
             flush=True,
         )
     print(*evidence(scores), *sums(scores), sep="\n")

@@ -120,6 +120,7 @@ def draw_frame(
     regions: Callable[[tuple[int, int]], Iterable[NDArray[np.float64]]],
     width_px: int,
     truth: TrueMarks = NOTHING_TRUE,
+    lines: Sequence[str] = (),
 ) -> Bytes:
     """Draw all results of one frame: road, masks, boxes, regions and cues, and what is true.
 
@@ -131,6 +132,7 @@ def draw_frame(
             and height. They are drawn only if a detector found road.
         width_px: Displayed width of the picture; lines and text are sized to be legible there.
         truth: Drawn in the colour of the truth.
+        lines: Text at the top.
 
     Raises:
         LogError: The picture cannot be decoded.
@@ -138,7 +140,7 @@ def draw_frame(
     pixels, _ = decode(picture)
     size = (pixels.shape[1], pixels.shape[0])
     enlarge = max(size[0] / width_px, 0.5)
-    if not found and truth == NOTHING_TRUE:
+    if not found and truth == NOTHING_TRUE and not lines:
         return np.asarray(pixels, np.uint8)
     canvas = draw_detections(pixels, found, counts, 0.8 * enlarge)
     for one in found:
@@ -157,6 +159,8 @@ def draw_frame(
     if truth.counts:
         text = "true: " + "  ".join(f"{cue} {count}" for cue, count in truth.counts.items())
         _line_of_text(canvas, text, round(14 + 26 * enlarge), TRUE, 0.8 * enlarge)
+    for number, text in enumerate(lines, 1):
+        _line_of_text(canvas, text, size[1] - round(22 * enlarge * number), PALE, 0.8 * enlarge)
     return canvas
 
 

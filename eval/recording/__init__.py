@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.legs import leg_texts
 from crosscue.eval.runs.manifest import DriveManifest
 from crosscue.eval.runs.moments import run_between
 from crosscue.eval.runs.stored_images import StoredCamera, run_camera
@@ -154,7 +155,7 @@ def _log_marks(
     if detected is None:
         return
     log_styles(recording)
-    marks = Overlays(manifest.settings)
+    marks = Overlays(manifest.settings, leg_texts(run))
     has_odometry = run.file("measurements.parquet").exists()
     anchored = Anchored(run, manifest, marks) if has_odometry else None
     cues = CuePass(manifest.settings)

@@ -109,9 +109,11 @@ class Overlays:
 
     Attributes:
         vehicle: Settings with labels, thresholds and regions.
+        texts: Lines on the roads of the intersection, by time of the frame.
     """
 
     vehicle: Vehicle
+    texts: Mapping[int, Sequence[str]] = field(default_factory=dict)
     objects: Shapes = field(default_factory=lambda: Shapes("camera/objects", boxes))
     far: Shapes = field(default_factory=lambda: Shapes("camera/far_objects", boxes))
     outlines: Shapes = field(default_factory=lambda: Shapes("camera/outlines", strips))
@@ -119,6 +121,7 @@ class Overlays:
     road: Shapes = field(default_factory=lambda: Shapes("camera/road", strips))
     regions: Shapes = field(default_factory=lambda: Shapes("camera/regions", labelled_strips))
     cars: Shapes = field(default_factory=lambda: Shapes("camera/cars", arrows))
+    legs: Shapes = field(default_factory=lambda: Shapes("camera/legs", boxes))
     area: Shapes = field(default_factory=lambda: Shapes("ahead/road", strips))
     openings: Shapes = field(default_factory=lambda: Shapes("ahead/openings", labelled_strips))
     _before: CarShapes | None = None
@@ -133,6 +136,10 @@ class Overlays:
         for shapes in self.all():
             shapes.begin(frame.t_ns)
         self._boxes(objects, frame.signs, frame.size_px)
+        if lines := self.texts.get(frame.t_ns):
+            # The viewer writes the label of a box below it.
+            top = np.array([0.0, 0.0, frame.size_px[0], 0.0])
+            self.legs.add(top, FOUND, "\n".join(lines))
         if isinstance(frame.road, RoadMask):
             for line in road_lines(frame.road):
                 self.road.add(line, ROAD)
@@ -145,7 +152,7 @@ class Overlays:
     def all(self) -> Iterator[Shapes]:
         """Yield all shapes."""
         yield from (self.objects, self.far, self.outlines, self.signs)
-        yield from (self.road, self.regions, self.cars, self.area, self.openings)
+        yield from (self.road, self.regions, self.cars, self.legs, self.area, self.openings)
 
     def send(self, recording: rr.RecordingStream, time: DriveTime) -> None:
         """Send the frames collected so far."""
@@ -306,6 +313,7 @@ def log_true_boxes(
 def log_styles(recording: rr.RecordingStream) -> None:
     """Log line widths in screen points, and labels where there is enough room."""
     boxes_style = rr.Boxes2D.from_fields(radii=[_points(1.0)], show_labels=True)
+    recording.log("camera/legs", boxes_style, static=True)
     recording.log("camera/objects", boxes_style, static=True)
     recording.log("camera/sign_windows", boxes_style, static=True)
     far_style = rr.Boxes2D.from_fields(radii=[_points(1.0)], show_labels=False)

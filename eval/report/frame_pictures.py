@@ -16,6 +16,7 @@ from crosscue.detectors.images import Encoded
 from crosscue.detectors.overlay import NOTHING_TRUE, draw_frame
 from crosscue.eval.pipeline.scene.road_picture import plans_of
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.legs import leg_texts
 from crosscue.eval.runs.stored_images import pictures_at, run_camera
 from crosscue.eval.runs.tables.stored_frames import stored_frames
 from crosscue.eval.scoring.truth import true_marks
@@ -62,7 +63,7 @@ def draw_pictures(
         if camera is None:
             return "the run has no camera, or several"
         found, vehicle = _found(run, wanted), run.drive_manifest().settings
-        cues, plans = _cues(run, wanted), plans_of(run, wanted)
+        cues, plans, legs = _cues(run, wanted), plans_of(run, wanted), leg_texts(run)
         regions = partial(outlines, vehicle.regions)
         true = {} if truth is None else true_marks(truth, run, wanted)
 
@@ -74,7 +75,8 @@ def draw_pictures(
                 counted = _labels(vehicle, counts)
                 results = tuple(_likely(one, counted) for one in results)
             marks = true.get(t_ns, NOTHING_TRUE)
-            canvas = draw_frame(picture, results, counts, regions, WIDTH_PX, marks)
+            lines = legs.get(t_ns, ())
+            canvas = draw_frame(picture, results, counts, regions, WIDTH_PX, marks, lines)
             if t_ns in plans:
                 canvas = _with_plan(canvas, plans[t_ns])
             keep(t_ns, _jpeg(canvas, WIDTH_PX), _jpeg(canvas, SMALL_PX))

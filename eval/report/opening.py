@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from crosscue.eval.runs.folder import RunFolder
+from crosscue.eval.runs.legs import leg_texts
 from crosscue.eval.runs.moments import frame_times, seconds_into, span_ns
 from crosscue.eval.scoring.columns import NONE, CueRows, RangeRows, RunTables
 from crosscue.eval.scoring.pose.score import PoseScore
@@ -61,6 +62,7 @@ class Moment:
         is_wrong: True if the run was wrong.
         distance: Where the intersection is; empty if unknown.
         belief: Probability of each feature.
+        not_seen: Lines on roads that no cue shows, with the reasons.
         picture: JPEG in base64; empty if it cannot be read.
     """
 
@@ -70,6 +72,7 @@ class Moment:
     is_wrong: bool
     distance: str
     belief: tuple[tuple[str, float], ...]
+    not_seen: tuple[str, ...] = ()
     picture: str = ""
 
 
@@ -132,6 +135,7 @@ def opening_of(
         by_frame.setdefault(_frame(frames, event), []).append(event)
     shown_ns = {at: moved.get(at, at) for at in by_frame}
     pictures: dict[int, str] = {}
+    legs = leg_texts(run)
 
     def keep(t_ns: int, picture: bytes, _: bytes) -> None:
         pictures[t_ns] = base64.b64encode(picture).decode()
@@ -148,6 +152,7 @@ def opening_of(
             is_wrong=any(one.rank == MISTAKE for one in some),
             distance=_distance(tables, scored, at),
             belief=_belief_at(tables, at),
+            not_seen=legs.get(t_ns, ())[1:],
             picture=pictures.get(t_ns, ""),
         )
         for at, some in by_frame.items()

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+import crosscue
 from crosscue.datasets.real import recordings
 from crosscue.datasets.real.recordings import FOLDER
 from crosscue.datasets.truth.truth import read_truth as load_truth
@@ -19,6 +20,7 @@ from crosscue.eval.cli import run
 from crosscue.replay.errors import CrosscueError
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
 from support.data import shared
+from support.scene_run import scene_run
 
 DRIVES = ("comma2k19", "pandaset_002", "us_dashcam")
 
@@ -215,6 +217,47 @@ def test_belief_is_judged_in_each_annotated_frame_and_outside_approaches_by_its_
     score = NAMES["scored"](run, Drive("one", "*.jpg", 10.0, approaches=(approach,)))
 
     assert score.brier == [pytest.approx((0.5**2 + 0.1**2) / 2.0)]
+
+
+def test_frames_with_something_wrong_are_drawn(tmp_path: Path) -> None:
+    folder = scene_run(tmp_path / "drive")
+    times = folder.table("frames")["t_ns"].to_pylist()
+    there = {"intersection": True, "left": False, "right": True}
+    tables = {name: folder.table(name) for name in ("frames", "cues", "belief", "range")}
+    drive = Drive(
+        "none",
+        "*.jpg",
+        10.0,
+        approaches=(Approach(15, 49, there),),
+        in_view={"stop_sign": [(5, 10, True), (15, 15, False)], "traffic_light": []},
+    )
+
+    score = NAMES["scored"](tables, drive)
+
+    # The sign is found from frame 10 on, the left believed from frame 20 on.
+    assert score.wrong == [
+        (times[5], "missed stop_sign"),
+        (times[15], "false stop_sign"),
+        (times[20], "false left"),
+    ]
+    for approaches, others in (
+        ((Approach(0, 9, there),), ["false intersection"]),
+        ((), ["false intersection"]),
+    ):
+        alone = NAMES["scored"](tables, Drive("none", "*.jpg", 10.0, approaches=approaches))
+        assert [what for _, what in alone.wrong] == others
+
+    wrong = tmp_path / "wrong"
+    wrong.mkdir()
+    for name in ("made up frame 0001 false left.jpg", "other frame 0001 false left.jpg"):
+        (wrong / name).write_text("of an earlier run")
+    assert NAMES["draw_wrong"]("made up", crosscue.open_run(folder.path), score, wrong) == ""
+    assert sorted(path.name for path in wrong.iterdir()) == [
+        "made up frame 0005 missed stop_sign.jpg",
+        "made up frame 0015 false stop_sign.jpg",
+        "made up frame 0020 false left.jpg",
+        "other frame 0001 false left.jpg",
+    ]
 
 
 def test_annotations_of_recorded_drives_lie_within_the_pictures_of_their_cut() -> None:
