@@ -78,6 +78,7 @@ class Detections:
             lights, empty for other objects; an empty tuple where there was none.
         spans_px: Shape (N,): number of rows that each mask spans, or the height of a box without
             mask; None where masks were not measured.
+        evidence: Evidence of one box by label, as in a model card's ``scores``.
         decisions: N decisions by tracks over frames: ``ACCEPTED``, or why the detection is no cue;
             empty for objects that are decided by their score. An empty tuple without tracks.
     """
@@ -93,6 +94,7 @@ class Detections:
     looks: tuple[str, ...] = ()
     decisions: tuple[str, ...] = ()
     spans_px: NDArray[np.float64] | None = None
+    evidence: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Reject columns of unequal length and values that are not finite.
@@ -168,12 +170,15 @@ class Detections:
         both = zip(self.decisions, are_sure.tolist(), strict=True)
         return np.array([one == ACCEPTED if one else is_sure for one, is_sure in both], np.bool_)
 
-    def with_min_scores(self, by_label: Mapping[str, float]) -> Self:
-        """The same detections with their detector's thresholds, by label."""
+    def with_min_scores(
+        self, by_label: Mapping[str, float], evidence: Mapping[str, tuple[float, ...]] = {}
+    ) -> Self:
+        """The same detections with their detector's thresholds and evidence, by label."""
+        found = replace(self, evidence=evidence) if evidence else self
         if not by_label:
-            return self
+            return found
         min_score = [by_label.get(label, MIN_SCORE) for label in self.labels]
-        return replace(self, min_scores=np.array(min_score, np.float64))
+        return replace(found, min_scores=np.array(min_score, np.float64))
 
     def taken(self, is_taken: NDArray[np.bool_]) -> Self:
         """The detections that the mask ``is_taken``, shape (N,), selects, in the same order."""
@@ -190,6 +195,7 @@ class Detections:
             tuple(self.looks[i] for i in keep) if self.looks else (),
             tuple(self.decisions[i] for i in keep) if self.decisions else (),
             None if self.spans_px is None else self.spans_px[keep],
+            self.evidence,
         )
 
 
@@ -286,6 +292,11 @@ def min_scores_of(detector: Detector) -> dict[str, float]:
     """Map each label to the score above which it is a cue; only labels with a threshold."""
     found: Mapping[str, float] = getattr(detector, "min_scores", {})
     return dict(found)
+
+
+def evidence_of(detector: Detector) -> dict[str, tuple[float, ...]]:
+    """Map each label to the evidence of one box (``Detections.evidence``), where it is stated."""
+    return dict(getattr(detector, "evidence", {}))
 
 
 def calibrated_labels(detector: Detector) -> tuple[str, ...]:

@@ -15,13 +15,15 @@ from pydantic import Field
 
 from crosscue.detectors.settings import Proportion, Settings
 
+Weight = Annotated[float, Field(ge=-100.0, le=100.0)]
+
 
 class Platt(Settings):
     """Platt scaling (1999): the correct fraction's logit is ``slope * logit(score) + offset``."""
 
     kind: Literal["platt"]
     slope: Annotated[float, Field(gt=0.0, le=100.0)]
-    offset: Annotated[float, Field(ge=-100.0, le=100.0)]
+    offset: Weight
 
     def probabilities(self, scores: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the fraction of detections with each score that are correct, shape (N,)."""
@@ -37,3 +39,7 @@ class ClassScores(Settings):
     """Calibrated score above which a detection is a cue; the vehicle file can override it."""
     calibration: Platt | None = None
     """Maps the network's score to the fraction of such detections that are correct."""
+    evidence: tuple[Weight, Weight, Weight, Weight] | None = None
+    """Log likelihood ratio of one box, for decisions over frames: factors of its score's log odds
+    less those of the threshold, of the logarithms of its longer side over the shorter one and over
+    the picture's, and a constant. By default only the score counts."""

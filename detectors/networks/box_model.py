@@ -113,6 +113,12 @@ class BoxModel:
         return {label: score for label, score in known.items() if score is not None}
 
     @property
+    def evidence(self) -> dict[str, tuple[float, ...]]:
+        """The card's evidence of one box by label."""
+        known = {label: one.evidence for label, one in self.card.scores.items()}
+        return {label: one for label, one in known.items() if one is not None}
+
+    @property
     def calibrated_labels(self) -> tuple[str, ...]:
         """Labels with a calibration in the card."""
         return tuple(label for label, one in self.card.scores.items() if one.calibration)

@@ -94,7 +94,7 @@ def stored_frames(
     """
     detectors, meanings = detected.detectors, label_meanings(vehicle)
     is_changed = meanings != label_meanings(detected.settings)
-    scores_of = {d.name: d.min_scores for d in detectors}
+    scores_of = {d.name: (d.min_scores, d.evidence) for d in detectors}
     objects = [d.name for d in detectors if d.role == DetectorRole.OBJECTS]
     signs = [d.name for d in detectors if d.role == DetectorRole.SIGNS]
     labels = all_labels(
@@ -119,7 +119,7 @@ def stored_frames(
             fractions = road.of(frame) if has_road else []
             some, others = (
                 tuple(
-                    _detections(t_ns, size, by_name.get(name, [])).with_min_scores(scores_of[name])
+                    _detections(t_ns, size, by_name.get(name, [])).with_min_scores(*scores_of[name])
                     for name in names
                 )
                 for names in (objects, signs)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from crosscue.detectors.base import ACCEPTED, Detections
+from crosscue.detectors.catalog import entries
 from crosscue.detectors.cues.candidates import TOO_LITTLE_EVIDENCE
 from crosscue.detectors.cues.frame import CuePass
 from crosscue.detectors.cues.observed import FrameDetections
@@ -26,6 +27,7 @@ STEP = CarStep(None, 0.0, 0.0, 0.1)
 # Place (x, y), score, and what the pixels show.
 Seen = tuple[float, float, float, str]
 LIGHT, SIGN = "traffic light", "stop sign"
+NANO = entries.entry("yolox-nano").scores[LIGHT].evidence or ()
 CORNERS = np.array([[-1.0, -1.0, 1.0, 1.0]])
 
 
@@ -33,7 +35,9 @@ def car(text: str = "") -> Vehicle:
     return parse("version = 1\n" + text, "v.toml")
 
 
-def frame(seen: Sequence[Seen], label: str = LIGHT, jitter: float = 0.0) -> Detections:
+def frame(
+    seen: Sequence[Seen], label: str = LIGHT, jitter: float = 0.0, *, is_nano: bool = True
+) -> Detections:
     n = len(seen)
     boxes = np.array([[x - 6, y - 15, x + 6, y + 15] for x, y, *_ in seen]).reshape(-1, 4)
     shown = tuple(one[3] for one in seen)
@@ -46,6 +50,7 @@ def frame(seen: Sequence[Seen], label: str = LIGHT, jitter: float = 0.0) -> Dete
         (b"",) * n,
         lenses=shown if label == LIGHT else (),
         looks=shown if label == SIGN else (),
+        evidence={LIGHT: NANO} if is_nano else {},
     )
 
 
@@ -60,6 +65,20 @@ def decided(
     return [
         tracks([frame(seen, label, 0.01 * i)], step)[0].decisions for i, seen in enumerate(frames)
     ]
+
+
+def test_another_network_is_not_judged_by_the_boxes_of_yolox_nano() -> None:
+    """At 0.5, yolox-nano's large boxes are mostly no lights; a coarse network sees no others."""
+    decisions = []
+    for is_nano in (True, False):
+        tracks = ControlTracks(car())
+        for i in range(20):
+            one = frame([(600.0, 140.0, 0.5, "unknown")], jitter=0.01 * i, is_nano=is_nano)
+            near = replace(one, boxes_px=one.boxes_px + np.array([-18.0, -45.0, 18.0, 45.0]))
+            (said,) = tracks([near], STEP)
+        decisions.append(said.decisions)
+
+    assert decisions == [(TOO_LITTLE_EVIDENCE,), (ACCEPTED,)]
 
 
 def test_fifty_weak_consistent_frames_are_accepted() -> None:
