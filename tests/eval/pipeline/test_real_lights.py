@@ -17,10 +17,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from crosscue.detectors.base import Detections, Detector, DetectorChoice, Frame
+from crosscue.detectors.catalog import entries
 from crosscue.detectors.registry import make
 from crosscue.detectors.signs.second_look import OTHER_SIGNS, with_looks
 from crosscue.eval.cli import run
 from crosscue.eval.runs.folder import RunFolder, open_run
+from crosscue.eval.runs.manifest import EstimateManifest
+from crosscue.eval.runs.tables.stored_frames import stored_frames
 from support.data import fetch_networks, shared
 from support.pictures import picture_log
 
@@ -62,6 +65,13 @@ def test_dark_lights_of_a_queue_are_found_though_one_box_of_78_frames_is_sure(
     assert sum(row["label"] == "traffic light" and row["score"] > 0.5 for row in rows) == 1
     assert positive(drive, "traffic_light") >= 30
     assert positive(drive, "stop_sign") == 0
+    manifest = drive.drive_manifest()
+    assert isinstance(manifest, EstimateManifest)
+    assert manifest.detect is not None
+    (found,) = next(stored_frames(drive, manifest.detect, manifest.settings)).objects
+    assert found.evidence == {
+        "traffic light": entries.entry("yolox-nano").scores["traffic light"].evidence
+    }
 
 
 @pytest.mark.slow
