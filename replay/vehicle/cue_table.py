@@ -12,8 +12,8 @@ from crosscue.replay.plugins import loaded
 
 from .cue_spec import CueSpec
 
-# Assumed proportion of lights that are at an intersection; the others are at pedestrian crossings,
-# railways and exits. No count is available.
+# Proportion of lights that are at an intersection; the others are at pedestrian crossings, railways
+# and exits. Of the annotated approaches with lights in benchmarks/real_roads.json, 42 of 44.
 AT_INTERSECTIONS: Final = 0.95
 
 

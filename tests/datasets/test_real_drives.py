@@ -18,6 +18,7 @@ from crosscue.detectors.catalog import fetch as weights
 from crosscue.detectors.catalog import places
 from crosscue.eval.cli import run
 from crosscue.replay.errors import CrosscueError
+from crosscue.replay.vehicle.cue_table import AT_INTERSECTIONS
 from crosscue.replay.vehicle.vehicle import load as load_vehicle
 from support.data import shared
 from support.scene_run import scene_run
@@ -258,6 +259,20 @@ def test_frames_with_something_wrong_are_drawn(tmp_path: Path) -> None:
         "made up frame 0020 false left.jpg",
         "other frame 0001 false left.jpg",
     ]
+
+
+def test_lights_of_annotated_approaches_are_at_intersections_as_often_as_the_message_says() -> None:
+    lit = []
+    for _, drive in NAMES["recorded_drives"]():
+        shown = [
+            (first, last) for first, last, is_there in drive.in_view["traffic_light"] if is_there
+        ]
+        for one in drive.approaches:
+            if any(first <= one.last and one.first <= last for first, last in shown):
+                lit.append(one.features["intersection"])
+
+    assert (sum(lit), len(lit)) == (42, 44)
+    assert sum(lit) / len(lit) == pytest.approx(AT_INTERSECTIONS, abs=0.01)
 
 
 def test_annotations_of_recorded_drives_lie_within_the_pictures_of_their_cut() -> None:
