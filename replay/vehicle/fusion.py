@@ -113,8 +113,8 @@ class Combined(Section):
     """Distance that counts as one step."""
 
 
-# Precision of roads that the road area shows: a round number. Of the drives used in development
-# (``benchmarks/real_roads.py``) 13 of 15 openings are right, too few for a measurement.
+# Precision of roads that the road area shows: a round number below what it is in the frames of the
+# drives used in development (``benchmarks/real_roads.py``), which are too few for a measurement.
 OPENING_PRECISION: Final = 0.9
 # Columns of ``belief.parquet``, which cannot be names of features.
 NOT_FEATURES: Final = ("t_ns", "approach", "established", "not_believed")
