@@ -248,9 +248,6 @@ class Approaches:
                 undone = current.model.withdraw(current.roads | evidence.weights.keys())
                 current.belief = multiply(current.belief, undone)
                 current.roads = frozenset()
-                if not (evidence.weights or evidence.signs or evidence.posteriors):
-                    # Openings, unlike the mask's shape, gave the range, too.
-                    current.start = current.end = NOTHING
             return None
         if any(is_ahead and cue not in current.roads for cue, is_ahead in ahead.items()):
             return "another ahead"

@@ -50,10 +50,6 @@ RESTS_M: Final = 25.0
 SAME_M: Final = 4.0
 CONFIRMED: Final = 3
 FORGOTTEN: Final = 5
-# Distance of a street's far kerb ahead of the rear axle within which a car can no longer turn in:
-# the radius of the outer front wheel in the tightest turn of AASHTO's passenger car, whose centre
-# is beside the rear axle.
-PASSED_M: Final = 7.3
 # S.d. of an opening's corners, which are round, and of the pitch of a frame.
 CORNER_SD_M: Final = 2.5
 PITCH_SD_RAD: Final = 0.004
@@ -85,12 +81,11 @@ class Seen(NamedTuple):
     """Result of one frame.
 
     Attributes:
-        openings: Confirmed openings that are not passed.
+        openings: Confirmed openings whose end is ahead.
         legs: Roads to the left, straight and to the right.
         start_m: Start of the intersection: the nearest near kerb; NaN without an opening.
         end_m: End of the intersection: the furthest far kerb.
         sd_m: Standard deviation of either.
-        is_passed: True once the intersection that was seen last is passed, until another is seen.
     """
 
     openings: tuple[Opening, ...]
@@ -98,7 +93,6 @@ class Seen(NamedTuple):
     start_m: float = math.nan
     end_m: float = math.nan
     sd_m: float = math.nan
-    is_passed: bool = False
 
 
 class _Edge(NamedTuple):
@@ -121,7 +115,6 @@ class _Candidate:
     hits: int = 1
     missed: int = 0
     turned_rad: float = 0.0
-    is_passed: bool = False
 
 
 @dataclass(slots=True)
@@ -138,7 +131,6 @@ class RoadOpenings:
     nearest_m: float = NEAREST_M
     _candidates: list[_Candidate] = field(default_factory=list)
     _rests_m: float = 0.0
-    _end_m: float = math.nan
 
     def __call__(self, plan: RoadPlan, moved_m: float, turned_rad: float = 0.0) -> Seen:
         """Process the next frame's plan view, after ``moved_m`` of travel and a turn."""
@@ -154,20 +146,12 @@ class RoadOpenings:
             bend = None if other is None else edges[-side].out_m - _at(other, plan.ahead_m)
             found += _openings(plan, side, edges[side], _at(line, plan.ahead_m), bend)
         confirmed = self._followed(found, moved_m, turned_rad)
-        seen, before_m = self._seen(plan, confirmed, known), self._end_m
-        self._end_m -= moved_m
-        if self._end_m <= PASSED_M < before_m:
-            # What is seen further on is another intersection: from the next frame on.
-            return Seen(confirmed, Legs(math.nan, math.nan, math.nan), is_passed=True)
-        if confirmed:
-            self._end_m = seen.end_m
-        return seen._replace(is_passed=self._end_m <= PASSED_M)
+        return self._seen(plan, confirmed, known)
 
     def restart(self) -> None:
         """Forget all openings."""
         self._candidates.clear()
         self._rests_m = 0.0
-        self._end_m = math.nan
 
     def _followed(
         self, found: list[Opening], moved_m: float, turned_rad: float
@@ -183,13 +167,12 @@ class RoadOpenings:
             old = one.opening
             one.opening = old._replace(start_m=old.start_m - moved_m, end_m=old.end_m - moved_m)
             one.missed += 1
-            one.is_passed |= one.opening.end_m <= PASSED_M
         for opening in found if self._rests_m <= 0.0 else ():
             same = [
                 one
                 for one in self._candidates
                 if one.opening.side == opening.side
-                and opening.start_m < one.opening.end_m + (0.0 if one.is_passed else SAME_M)
+                and opening.start_m < one.opening.end_m + SAME_M
                 and one.opening.start_m < opening.end_m + SAME_M
             ]
             if same:
@@ -210,9 +193,7 @@ class RoadOpenings:
             for one in self._candidates
             if one.opening.end_m > 0.0 and (one.missed <= FORGOTTEN or one.hits >= 2 * CONFIRMED)
         ]
-        return tuple(
-            one.opening for one in self._candidates if one.hits >= CONFIRMED and not one.is_passed
-        )
+        return tuple(one.opening for one in self._candidates if one.hits >= CONFIRMED)
 
     def _seen(self, plan: RoadPlan, openings: tuple[Opening, ...], known: dict[int, bool]) -> Seen:
         if not openings:

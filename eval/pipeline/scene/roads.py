@@ -106,13 +106,9 @@ class Roads:
             for away_m in (TOGETHER_M + 2.0 * math.sqrt(one.var_m2 + seen.sd_m**2),)
         )
 
-    def with_roads_ahead(self, evidence: FrameEvidence) -> FrameEvidence:
-        """Add which roads begin ahead or are passed, and how sure the mask's shape is of each."""
+    def with_shape(self, evidence: FrameEvidence) -> FrameEvidence:
+        """Add how sure the mask's shape is of each road, and which ones begin ahead."""
         mean = self._shape
-        if self.seen is not None:
-            legs, is_passed = self.seen.legs._asdict().items(), self.seen.is_passed
-            ahead = {f"road_{leg}": not is_passed for leg, n in legs if is_passed or n == 1.0}
-            return replace(evidence, roads_ahead=ahead)
         if mean is None:
             return evidence
         sides = {"road_left": mean.left, "road_right": mean.right}

@@ -224,13 +224,12 @@ class Scene:
             # From an assumed size alone, without any motion, a range would be a guess.
             posteriors = ()
         if self._roads is not None and not without >= ROADS:
-            evidence = self._roads.with_roads_ahead(evidence)
+            evidence = self._roads.with_shape(evidence)
             if not posteriors:
                 posteriors = self._roads.ranges()
             elif not self._roads.fits(posteriors):
                 # A side street before the intersection that is ranged.
                 counts = {cue: count for cue, count in counts.items() if cue not in ROADS}
-                evidence = replace(evidence, roads_ahead={})
         return replace(
             evidence,
             counts=counts,

@@ -21,13 +21,12 @@ from crosscue.detectors.cues.road_openings import Legs, Seen
 from crosscue.eval import cli
 from crosscue.eval.fit.annotated_runs import read_annotated
 from crosscue.eval.pipeline.scene.roads import BY_SHAPE, Roads
-from crosscue.fusion.approaches import Approaches
 from crosscue.fusion.evidence import FrameEvidence, RangePosterior
-from crosscue.fusion.factor_graph import graph_of, log_odds
+from crosscue.fusion.factor_graph import log_odds
 from crosscue.fusion.intersection_range import Reference
 from crosscue.replay.errors import UsageError
 from crosscue.replay.vehicle.camera import Camera
-from crosscue.replay.vehicle.fusion import OPENING_PRECISION, RangeFilter
+from crosscue.replay.vehicle.fusion import OPENING_PRECISION
 from crosscue.replay.vehicle.vehicle import SIMULATED_CAR, Vehicle, parse
 from support.kitti_drive import raw_drive
 from support.pictures import picture_log
@@ -74,29 +73,6 @@ def test_openings_mark_start_and_end_while_the_end_is_ahead() -> None:
     assert not roads().ranges()
 
 
-SEEN = opening(12.0, 20.0)
-PASSED = Seen((), Legs(math.nan, math.nan, math.nan), is_passed=True)
-
-
-@pytest.mark.parametrize(("has_light", "number"), [(False, None), (True, 1)])
-def test_a_passed_opening_says_nothing_more_of_what_is_ahead(
-    has_light: bool, number: int | None
-) -> None:
-    """Also while the car stands behind it. A light in view is at another intersection."""
-    fusion = Vehicle(version=1).fusion
-    loop, made, steps = Approaches(graph_of(fusion), fusion, RangeFilter()), roads(), []
-    for i, made.seen in enumerate([*[SEEN] * 6, *[PASSED] * 6]):
-        counts = {f"road_{leg}": int(n == 1.0) for leg, n in made.seen.legs._asdict().items()}
-        frame = replace(evidence(1.0 if i < 10 else 0.0), t_ns=i * 10**8, posteriors=made.ranges())
-        counts["traffic_light"] = int(has_light)
-        steps.append(loop(replace(made.with_roads_ahead(frame), counts=counts)))
-
-    assert min(steps[5].probabilities[leg] for leg in ("right", "straight")) > 0.9
-    assert [one.approach for one in steps[6:]] == [number] * 6
-    assert all(one.probabilities.get("right", 0.5) == pytest.approx(0.5) for one in steps[6:])
-    assert [len(one.ranges) for one in steps[5:7]] == [2, 0]
-
-
 @pytest.mark.parametrize(("range_m", "fits"), [(12.0, True), (25.0, True), (80.0, False)])
 def test_openings_fit_lights_and_signs_at_their_place_alone(range_m: float, fits: bool) -> None:
     other = RangePosterior(Reference.END, range_m, 4.0, range_m)
@@ -123,13 +99,13 @@ def test_without_a_focal_length_the_mask_alone_shows_roads_and_gives_no_range() 
     assert not uncalibrated.ranges()
     assert uncalibrated.plan() is None
     assert uncalibrated.notes() == {BY_SHAPE: 10}
-    assert uncalibrated.with_roads_ahead(evidence(None)).roads_ahead == {
+    assert uncalibrated.with_shape(evidence(None)).roads_ahead == {
         "road_left": False,
         "road_right": True,
     }
-    assert uncalibrated.with_roads_ahead(evidence(None)).weights["road_right"] > 1.0
+    assert uncalibrated.with_shape(evidence(None)).weights["road_right"] > 1.0
     uncalibrated.restart()
-    assert uncalibrated.with_roads_ahead(evidence(None)) == evidence(None)
+    assert uncalibrated.with_shape(evidence(None)) == evidence(None)
 
 
 @pytest.mark.parametrize(("odds", "is_seen"), [(0.95, False), (1.05, True), (5.0, True)])
@@ -137,7 +113,7 @@ def test_a_road_that_the_shape_shows_is_believed(odds: float, is_seen: bool) -> 
     """Also just above the least log odds: a message is worth what such messages proved to be."""
     seen = roads(camera=Camera())
     seen._shape = LogOdds(odds, -1.0, odds + 1.0, odds)
-    found = seen.with_roads_ahead(evidence(None))
+    found = seen.with_shape(evidence(None))
 
     believed = {cue: log_odds(OPENING_PRECISION) * one for cue, one in found.weights.items()}
     assert (found.roads_ahead.get("road_left") is True) is is_seen
