@@ -16,7 +16,7 @@ undecided. Beside it stand the messages: the legs that are there, and those that
 road cue shows in any of the frames. ``OUT/wrong`` has a picture of each missed or false cue, and of
 each wrong leg and intersection, named after drive and frame. Below, each cue and leg has a line
 with the numbers of drives and places it stands on, apart for drives of development (``*``), and so
-have the messages, by the openings of calibrated cameras and by the mask's shape for others; then
+have the messages; then
 the sums of legs and intersections. Times, frames and distances are those of the annotations; ranges
 are scored only where a track gives the true distance.
 """
@@ -457,22 +457,19 @@ def evidence(scores: Mapping[str, Score], drives: Mapping[str, Drive] = DRIVES) 
                 f"{name:24} {len({folder for folder, _ in found}):6} {len(found):6} "
                 f"{numbers or '-'}"
             )
-    for rule, is_calibrated in (("openings", True), ("shape", False)):
-        for is_development in (True, False):
-            shown = {
-                name: scores[name].messages
-                for name in once
-                if scores[name].messages
-                and drives[name].is_development is is_development
-                and bool(drives[name].camera) is is_calibrated
-            }
-            by_drive = [f"{name} {_shown(legs)}" for name, legs in shown.items()]
-            every = {(name, leg): one for name, legs in shown.items() for leg, one in legs.items()}
-            name = f"{rule}{'*' if is_development else ''}"
-            yield (
-                f"{name:24} {len({drives[one].folder for one in shown}):6} {len(shown):6} "
-                f"{_shown(every)} ({', '.join(by_drive) or '-'})"
-            )
+    for is_development in (True, False):
+        shown = {
+            name: scores[name].messages
+            for name in once
+            if scores[name].messages and drives[name].is_development is is_development
+        }
+        by_drive = [f"{name} {_shown(legs)}" for name, legs in shown.items()]
+        every = {(name, leg): one for name, legs in shown.items() for leg, one in legs.items()}
+        yield (
+            f"{'messages*' if is_development else 'messages':24} "
+            f"{len({drives[one].folder for one in shown}):6} {len(shown):6} "
+            f"{_shown(every)} ({', '.join(by_drive) or '-'})"
+        )
 
 
 def sums(scores: Mapping[str, Score], drives: Mapping[str, Drive] = DRIVES) -> Iterator[str]:

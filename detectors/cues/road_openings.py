@@ -10,6 +10,7 @@ An edge that is hidden, out of view or out of reach is not seen, which says noth
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -132,8 +133,17 @@ class RoadOpenings:
     _candidates: list[_Candidate] = field(default_factory=list)
     _rests_m: float = 0.0
 
-    def __call__(self, plan: RoadPlan, moved_m: float, turned_rad: float = 0.0) -> Seen:
-        """Process the next frame's plan view, after ``moved_m`` of travel and a turn."""
+    def __call__(
+        self,
+        plan: RoadPlan,
+        moved_m: float,
+        turned_rad: float = 0.0,
+        sides: Collection[int] = (1, -1),
+    ) -> Seen:
+        """Process the next frame's plan view, after ``moved_m`` of travel and a turn.
+
+        Openings to other sides than ``sides`` are followed, but neither seen nor missing.
+        """
         edges = {side: _edge(plan, side) for side in (1, -1)}
         own = {side: _own_edge(plan, edges[side]) for side in (1, -1)}
         found: list[Opening] = []
@@ -146,7 +156,9 @@ class RoadOpenings:
             bend = None if other is None else edges[-side].out_m - _at(other, plan.ahead_m)
             found += _openings(plan, side, edges[side], _at(line, plan.ahead_m), bend)
         confirmed = self._followed(found, moved_m, turned_rad)
-        return self._seen(plan, confirmed, known)
+        for one in confirmed:
+            known[one.side] &= one.side in sides
+        return self._seen(plan, tuple(one for one in confirmed if one.side in sides), known)
 
     def restart(self) -> None:
         """Forget all openings."""

@@ -133,7 +133,7 @@ def test_messages_of_roads_are_counted_apart_from_the_beliefs_they_lead_to() -> 
     drives = {
         "a": Drive("one", "*.jpg", 10.0, is_development=False),
         "b": Drive("two", "*.jpg", 10.0, is_development=False),
-        "kitti": Drive("three", "*.jpg", 10.0, "focal_px = 700.0"),
+        "kitti": Drive("three", "*.jpg", 10.0),
     }
     scores = {
         "a": Score(messages={"1 left": (True, True), "2 left": (True, False)}),
@@ -144,9 +144,8 @@ def test_messages_of_roads_are_counted_apart_from_the_beliefs_they_lead_to() -> 
     lines = {line.split()[0]: " ".join(line.split()[1:]) for line in EVIDENCE(scores, drives)}
 
     each = "a 1 of 2 true, 0 of 0 absent, b 0 of 0 true, 1 of 2 absent"
-    assert lines["shape"] == f"2 2 1 of 2 true, 1 of 2 absent ({each})"
-    assert lines["shape*"] == "0 0 0 of 0 true, 0 of 0 absent (-)"
-    assert lines["openings*"].startswith("1 1 1 of 1 true, 0 of 0 absent (kitti")
+    assert lines["messages"] == f"2 2 1 of 2 true, 1 of 2 absent ({each})"
+    assert lines["messages*"].startswith("1 1 1 of 1 true, 0 of 0 absent (kitti")
 
 
 def test_sums_of_legs_and_intersections_are_apart_for_drives_of_development() -> None:

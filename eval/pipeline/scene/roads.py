@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from crosscue.detectors.base import RoadMask
-from crosscue.detectors.cues.observed import NOT_SEEN, FrameDetections, RoadFractions
+from crosscue.detectors.cues.observed import FrameDetections, RoadFractions
 from crosscue.detectors.cues.road_area import NEAREST_M, RoadArea, RoadPlan, reach_of
 from crosscue.detectors.cues.road_layout import SEEN, LogOdds, RoadLayout
 from crosscue.detectors.cues.road_openings import RoadOpenings, Seen
@@ -41,7 +41,7 @@ class Roads:
         pitches_rad: Pitch of the camera by the time of a frame, where the pictures tell it.
         area: The accumulated road; None before the first mask.
         seen: Openings in the newest frame.
-        by_shape: Number of frames without a focal length, in which the mask's shape shows roads.
+        by_shape: Number of frames without a focal length or motion, in which nothing is ranged.
     """
 
     vehicle: Vehicle
@@ -66,23 +66,26 @@ class Roads:
             return frame.road
         camera = self.vehicle.camera
         labels = {*self.vehicle.cars.labels, *MOVING}
+        legs = self._layout(frame.t_ns, frame.road, moving_boxes(frame.objects, labels, HIDES))
+        self._shape = self._layout.mean
         reach_m = reach_of(camera, frame.road)
-        if reach_m <= 0.0:
+        if reach_m <= 0.0 or evidence.travelled_m is None:
+            self.area = None
+            self._openings.restart()
             self.by_shape += 1
-            legs = self._layout(frame.t_ns, frame.road, moving_boxes(frame.objects, labels, HIDES))
-            self._shape = self._layout.mean
             return RoadFractions(*legs)
-        if evidence.travelled_m is None:
-            self.restart()
-            return NOT_SEEN
         if self.area is None:
             self.area = RoadArea(camera, reach_m)
         turned_rad = evidence.turned_rad or 0.0
         self.area.move(evidence.travelled_m, turned_rad)
         self._pitch_rad = self.pitches_rad.get(frame.t_ns, self._pitch_rad)
         self.area.see(frame.road, moving_boxes(frame.objects, labels), self._pitch_rad)
-        self.seen = self._openings(self.area.plan(), evidence.travelled_m, turned_rad)
-        return RoadFractions(*self.seen.legs)
+        sides = [side for side, leg in ((1, legs.left), (-1, legs.right)) if leg == 1.0]
+        self.seen = self._openings(self.area.plan(), evidence.travelled_m, turned_rad, sides)
+        where = zip(legs, self.seen.legs, strict=True)
+        return RoadFractions(
+            *(0.0 if leg != 1.0 and opening == 0.0 else leg for leg, opening in where)
+        )
 
     def ranges(self) -> tuple[RangePosterior, ...]:
         """Return the ranges to the intersection that the openings make, if its end is ahead."""

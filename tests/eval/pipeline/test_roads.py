@@ -15,7 +15,7 @@ import crosscue
 from crosscue.detectors import rle
 from crosscue.detectors.base import Detections, Frame, RoadMask, View
 from crosscue.detectors.cues import road_layout
-from crosscue.detectors.cues.observed import NOT_SEEN, FrameDetections, RoadFractions
+from crosscue.detectors.cues.observed import FrameDetections, RoadFractions
 from crosscue.detectors.cues.road_layout import LogOdds
 from crosscue.detectors.cues.road_openings import Legs, Seen
 from crosscue.eval import cli
@@ -80,11 +80,57 @@ def test_openings_fit_lights_and_signs_at_their_place_alone(range_m: float, fits
     assert roads(Seen((), Legs(0.0, math.nan, 0.0))).fits([other])
 
 
-def test_without_odometry_no_road_is_seen() -> None:
-    assert roads()(frame(), evidence(None)) is NOT_SEEN
-    known = roads()(frame(), evidence(1.0))
-    assert isinstance(known, RoadFractions)
+def test_a_frame_without_a_mask_says_nothing_of_roads() -> None:
     assert roads()(FrameDetections(0), evidence(1.0)) is None
+
+
+def approached(made: Roads) -> RoadFractions | None:
+    """Roads after a second of approach to a street on the right, from 22 m to 13 m before it."""
+    for number in range(10):
+        ahead = [(x_m, z_m + 8.0 - number) for x_m, z_m in RIGHT]
+        road = seen_from([ROAD, ahead], 0.8, 1.4, 0.45)
+        found = made(FrameDetections(number * 10**8, road=road), evidence(1.0))
+    assert found is None or isinstance(found, RoadFractions)
+    return found
+
+
+@pytest.mark.parametrize("is_shown", [True, False])
+def test_the_shape_tells_which_roads_there_are_and_openings_where(
+    is_shown: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A street that was just passed is still an opening: nobody believes it."""
+    odds = LogOdds(-2.0, 3.0 if is_shown else -3.0, 0.0, 0.0)
+    monkeypatch.setattr(road_layout, "log_odds", lambda *_: odds)
+    made = roads(camera=Camera(focal_px=512.0, center_px=(320.0, 162.0), z_m=1.4))
+
+    found = approached(made)
+
+    assert found is not None
+    assert (found.right == 1.0) is is_shown
+    assert found.right != 0.0
+    assert (made.with_shape(evidence(1.0)).roads_ahead["road_right"]) is is_shown
+    ranges = {one.reference: one.range_m for one in made.ranges()}
+    assert ranges == (
+        {Reference.START: pytest.approx(13.0, abs=2.5), Reference.END: pytest.approx(21.0, abs=2.5)}
+        if is_shown
+        else {}
+    )
+
+
+def test_without_motion_the_shape_alone_shows_roads() -> None:
+    known = roads(camera=Camera(focal_px=512.0, center_px=(320.0, 162.0), z_m=1.4))
+    approached(known)
+    assert known.plan() is not None
+
+    found = known(
+        FrameDetections(10**9, road=seen_from([ROAD, RIGHT], 0.8, 1.4, 0.45)), evidence(None)
+    )
+
+    assert found is not None
+    assert found.right == 1.0
+    assert not known.ranges()
+    assert known.plan() is None
+    assert known.notes() == {BY_SHAPE: 1}
 
 
 def test_without_a_focal_length_the_mask_alone_shows_roads_and_gives_no_range() -> None:
