@@ -16,9 +16,8 @@ undecided. Beside it stand the messages: the legs that are there, and those that
 road cue shows in any of the frames. ``OUT/wrong`` has a picture of each missed or false cue, and of
 each wrong leg and intersection, named after drive and frame. Below, each cue and leg has a line
 with the numbers of drives and places it stands on, apart for drives of development (``*``), and so
-have the messages; then
-the sums of legs and intersections. Times, frames and distances are those of the annotations; ranges
-are scored only where a track gives the true distance.
+have the messages; then the sums of legs and intersections. Times, frames and distances are those of
+the annotations; ranges are scored only where a track gives the true distance.
 """
 
 from __future__ import annotations

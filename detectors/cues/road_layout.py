@@ -1,10 +1,10 @@
-"""Roads at the intersection ahead by the shape of the road mask, for uncalibrated cameras.
+"""Roads at the intersection ahead by the shape of the road mask, whatever the camera.
 
-Without a focal length the mask cannot be projected to the ground. A small convolutional network,
-trained on masks of simulated layouts seen by random cameras (``benchmarks/road_layout.py``), tells
-from the mask and the boxes of vehicles whether a road to the left or to the right begins within
-about 30 m, and whether the road goes on behind it. It gives no distance. Its log odds are averaged
-over time; a road that they do not show is not seen, because traffic or a house may hide it.
+A small convolutional network, trained on masks of simulated layouts seen by random cameras
+(``benchmarks/road_layout.py``), tells from the mask and the boxes of vehicles whether a road to the
+left or to the right begins within about 30 m, and whether the road goes on behind it. It gives no
+distance. Its log odds are averaged over time; a road that they do not show is not seen, because
+traffic or a house may hide it.
 """
 
 from __future__ import annotations

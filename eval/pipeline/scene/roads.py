@@ -1,4 +1,4 @@
-"""Roads of the scene: the accumulated road area, its openings, and the ranges that they give."""
+"""Roads of the scene: which there are, by the mask's shape, and where, by openings in its area."""
 
 from __future__ import annotations
 

@@ -173,16 +173,16 @@ pitch_rad = {CAMERA.pitch_rad}
 """
 
 
-class LowerHalf:
-    """A detector to which the ground between the walls is road."""
+class StraightRoad:
+    """A detector to which the ground is road, up to three heights of the camera to each side."""
 
-    view, identity, labels = View(is_grey=True), "lower half", ()
+    view, identity, labels = View(is_grey=True), "straight road", ()
 
     def __call__(self, frames: Sequence[Frame], /) -> list[RoadMask]:
-        """Return all pixels 20 rows below the middle of each picture."""
+        """Return the road's pixels, from 20 rows below the middle of each picture on."""
         width, height = SIZE_PX
-        rows = np.arange(height) > height // 2 + 20
-        pixels = np.broadcast_to(rows[:, None], (height, width))
+        below = np.arange(height)[:, None] - height // 2
+        pixels = (np.abs(np.arange(width) - width // 2) < 3 * below) & (below > 20)
         mask = rle.encode_mask(pixels, (0, 0), SIZE_PX)
         return [RoadMask(frame.t_ns, SIZE_PX, mask, SIZE_PX) for frame in frames]
 
@@ -219,7 +219,7 @@ def test_pictures_alone_give_odometry_that_is_named_in_the_account(tmp_path: Pat
 
 
 def test_accumulated_road_is_drawn_in_the_recording_and_beside_pictures(tmp_path: Path) -> None:
-    run = replayed_pictures(tmp_path, detector=LowerHalf())
+    run = replayed_pictures(tmp_path, detector=StraightRoad())
     _, scene = scene_of(run)
     assert not scene.approaches
     assert crosscue.save_recording(run, tmp_path / "drive.rrd").stat().st_size > 10_000
