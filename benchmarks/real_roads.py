@@ -17,7 +17,7 @@ road cue shows in any of the frames. ``OUT/wrong`` has a picture of each missed 
 each wrong leg and intersection, named after drive and frame. Below, each cue and leg has a line
 with the numbers of drives and places it stands on, apart for drives of development (``*``), and so
 have the messages; then the sums of legs and intersections. Times, frames and distances are those of
-the annotations; ranges are scored only where a track gives the true distance.
+the annotations; ranges are scored only where a track or an annotation gives the true distance.
 """
 
 from __future__ import annotations
@@ -90,6 +90,7 @@ class Drive:
         cut: First, last and step of the pictures that are used.
         rows: First row and row behind the last; None for all.
         in_view: Ranges of frames of each cue, and whether it is in view.
+        starts: Of each intersection, some frames and the distance from the camera to its start.
     """
 
     folder: str
@@ -104,6 +105,7 @@ class Drive:
     cut: tuple[int, int, int] = (0, 10**6, 1)
     rows: tuple[int, int] | None = None
     in_view: Mapping[str, Sequence[tuple[int, int, bool | None]]] = field(default_factory=dict)
+    starts: Sequence[Sequence[tuple[int, float]]] = ()
 
 
 def kitti_travelled(folder: Path) -> Floats:
@@ -145,6 +147,7 @@ def recorded_drives() -> Iterator[tuple[str, Drive]]:
                 cut=tuple(one["cut"]),
                 rows=tuple(one["rows"]) if "rows" in one else None,
                 in_view={cue: one[cue] for cue in CUES},
+                starts=[each["start_m"] for each in one["approaches"] if "start_m" in each],
             ),
         )
 
@@ -218,6 +221,7 @@ class Score:
         first: Where the intersection is first believed.
         pieces: Believed approaches to each annotated intersection.
         false_intersections: Believed approaches to none.
+        unannotated: Those of them in no frame of which anybody said that there is none.
         ranges: Numbers of ranges inside their interval, and of all.
         minutes: Duration.
         brier: Error of each feature of an approach.
@@ -230,6 +234,7 @@ class Score:
     first: str = "-"
     pieces: list[int] = field(default_factory=list)
     false_intersections: int = 0
+    unannotated: int = 0
     ranges: tuple[int, int] = (0, 0)
     minutes: float = 0.0
     brier: list[float] = field(default_factory=list)
@@ -363,9 +368,16 @@ def scored(run: Run, drive: Drive) -> Score:
                 score.first = f"{drive.mouth_m[0] - travelled[min(frames)]:.1f} m"
     false = sorted(believed.keys() - claimed)
     score.false_intersections = len(false)
+    none = [one for one in approaches if one.features.get("intersection") is False]
+    score.unannotated = sum(
+        not any(one.first <= frame <= one.last for one in none for frame in believed[number])
+        for number in false
+    )
     score.wrong += [(int(times[min(believed[one])]), "false intersection") for one in false]
     if travelled is not None and drive.mouth_m is not None:
         score.ranges = _ranges(run, drive, frame_of, travelled)
+    elif drive.starts:
+        score.ranges = _ranges_to_starts(run, drive, frame_of)
     return score
 
 
@@ -407,6 +419,19 @@ def _ranges(
         error_m = row["range_m"] - (place_m - travelled[frame] + x_m)
         inside += abs(error_m) <= 1.96 * row["var_m2"] ** 0.5
     return inside, total
+
+
+def _ranges_to_starts(run: Run, drive: Drive, frame_of: Mapping[int, int]) -> tuple[int, int]:
+    """Return the same, of ranges to starts whose distance from KITTI's camera is annotated."""
+    errors = [
+        (row["range_m"] - float(np.interp(frame, *np.transpose(start))) - 1.03)
+        / row["var_m2"] ** 0.5
+        for row in run["range"].to_pylist()
+        for frame in (frame_of[row["t_ns"]],)
+        for start in drive.starts
+        if row["reference"] == "start" and start[0][0] <= frame <= start[-1][0]
+    ]
+    return sum(abs(error) <= 1.96 for error in errors), len(errors)
 
 
 def draw_wrong(name: str, run: Run, score: Score, folder: Path) -> str:
@@ -486,8 +511,9 @@ def sums(scores: Mapping[str, Score], drives: Mapping[str, Drive] = DRIVES) -> I
         there = [said for is_there, said in legs if is_there]
         absent = [said for is_there, said in legs if not is_there]
         pieces = [number for one in some for number in one.pieces]
-        false, minutes = (
+        false, unannotated, minutes = (
             sum(one.false_intersections for one in some),
+            sum(one.unannotated for one in some),
             sum(one.minutes for one in some),
         )
         yield (
@@ -495,7 +521,8 @@ def sums(scores: Mapping[str, Score], drives: Mapping[str, Drive] = DRIVES) -> I
             f"{len(there)}, absent wrong {absent.count('WRONG')} of {len(absent)}; intersections "
             f"{sum(number > 0 for number in pieces)} of {len(pieces)}, in one piece "
             f"{pieces.count(1)}; false {false} in {minutes:.1f} minutes"
-            f"{f' ({false / minutes:.2f} a minute)' if minutes else ''}"
+            f"{f' ({false / minutes:.2f} a minute)' if minutes else ''}, "
+            f"{unannotated} of them where nobody annotated"
         )
 
 

@@ -171,6 +171,7 @@ def test_sums_of_legs_and_intersections_are_apart_for_drives_of_development() ->
             messages={"left": there},
             pieces=[2],
             false_intersections=2,
+            unannotated=1,
             minutes=0.5,
         ),
         "seen": Score(legs={"left": "WRONG"}, messages={"left": absent}),
@@ -180,11 +181,11 @@ def test_sums_of_legs_and_intersections_are_apart_for_drives_of_development() ->
 
     assert " ".join(development.split()) == (
         "sums* legs there 0 of 0, absent wrong 1 of 1; intersections 0 of 0, in one piece 0; "
-        "false 0 in 0.0 minutes"
+        "false 0 in 0.0 minutes, 0 of them where nobody annotated"
     )
     assert " ".join(others.split()) == (
         "sums legs there 1 of 3, absent wrong 1 of 2; intersections 2 of 3, in one piece 1; "
-        "false 3 in 2.0 minutes (1.50 a minute)"
+        "false 3 in 2.0 minutes (1.50 a minute), 1 of them where nobody annotated"
     )
 
 
@@ -219,6 +220,26 @@ def test_belief_is_judged_in_each_annotated_frame_and_outside_approaches_by_its_
     assert score.brier == [pytest.approx((0.5**2 + 0.1**2) / 2.0)]
 
 
+def test_ranges_are_scored_where_the_distance_to_a_start_is_annotated() -> None:
+    """Between the annotated frames by interpolation; the camera is 1.03 m ahead of the axle."""
+    rows = [(10, "start", 21.0), (20, "start", 17.0), (20, "end", 30.0), (30, "start", 9.0)]
+    ranges = [
+        {"t_ns": t_ns, "reference": reference, "range_m": range_m, "var_m2": 1.0}
+        for t_ns, reference, range_m in rows
+    ]
+    run = {
+        "frames": pa.table({"t_ns": [10, 20, 30]}),
+        "cues": pa.table({"t_ns": [10], "cue": ["stop_sign"], "count": [0]}),
+        "belief": pa.table({"t_ns": pa.array([], pa.int64())}),
+        "range": pa.Table.from_pylist(ranges),
+    }
+    drive = Drive(
+        "one", "*.jpg", 10.0, approaches=(Approach(0, 0, {}),), starts=[[(0, 20.0), (2, 10.0)]]
+    )
+
+    assert NAMES["scored"](run, drive).ranges == (2, 3)
+
+
 def test_frames_with_something_wrong_are_drawn(tmp_path: Path) -> None:
     folder = scene_run(tmp_path / "drive")
     times = folder.table("frames")["t_ns"].to_pylist()
@@ -240,12 +261,11 @@ def test_frames_with_something_wrong_are_drawn(tmp_path: Path) -> None:
         (times[15], "false stop_sign"),
         (times[20], "false left"),
     ]
-    for approaches, others in (
-        ((Approach(0, 9, there),), ["false intersection"]),
-        ((), ["false intersection"]),
-    ):
-        alone = NAMES["scored"](tables, Drive("none", "*.jpg", 10.0, approaches=approaches))
-        assert [what for _, what in alone.wrong] == others
+    none = {"intersection": False}
+    for approach, unannotated in ((Approach(0, 9, there), 1), (Approach(0, 49, none), 0)):
+        alone = NAMES["scored"](tables, Drive("none", "*.jpg", 10.0, approaches=(approach,)))
+        assert [what for _, what in alone.wrong] == ["false intersection"]
+        assert alone.unannotated == unannotated
 
     wrong = tmp_path / "wrong"
     wrong.mkdir()
