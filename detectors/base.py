@@ -78,7 +78,7 @@ class Detections:
             lights, empty for other objects; an empty tuple where there was none.
         spans_px: Shape (N,): number of rows that each mask spans, or the height of a box without
             mask; None where masks were not measured.
-        evidence: Evidence of one box by label, as in a model card's ``scores``.
+        log_ratios: Log likelihood ratio of one box by label, as in a model card's ``scores``.
         decisions: N decisions by tracks over frames: ``ACCEPTED``, or why the detection is no cue;
             empty for objects that are decided by their score. An empty tuple without tracks.
     """
@@ -94,7 +94,7 @@ class Detections:
     looks: tuple[str, ...] = ()
     decisions: tuple[str, ...] = ()
     spans_px: NDArray[np.float64] | None = None
-    evidence: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    log_ratios: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Reject columns of unequal length and values that are not finite.
@@ -171,10 +171,10 @@ class Detections:
         return np.array([one == ACCEPTED if one else is_sure for one, is_sure in both], np.bool_)
 
     def with_min_scores(
-        self, by_label: Mapping[str, float], evidence: Mapping[str, tuple[float, ...]] = {}
+        self, by_label: Mapping[str, float], log_ratios: Mapping[str, tuple[float, ...]] = {}
     ) -> Self:
-        """The same detections with their detector's thresholds and evidence, by label."""
-        found = replace(self, evidence=evidence) if evidence else self
+        """The same detections with their detector's thresholds and log ratios, by label."""
+        found = replace(self, log_ratios=log_ratios) if log_ratios else self
         if not by_label:
             return found
         min_score = [by_label.get(label, MIN_SCORE) for label in self.labels]
@@ -195,7 +195,7 @@ class Detections:
             tuple(self.looks[i] for i in keep) if self.looks else (),
             tuple(self.decisions[i] for i in keep) if self.decisions else (),
             None if self.spans_px is None else self.spans_px[keep],
-            self.evidence,
+            self.log_ratios,
         )
 
 
@@ -294,9 +294,9 @@ def min_scores_of(detector: Detector) -> dict[str, float]:
     return dict(found)
 
 
-def evidence_of(detector: Detector) -> dict[str, tuple[float, ...]]:
-    """Map each label to the evidence of one box (``Detections.evidence``), where it is stated."""
-    return dict(getattr(detector, "evidence", {}))
+def log_ratios_of(detector: Detector) -> dict[str, tuple[float, ...]]:
+    """Map each label to the log likelihood ratio of one box, where the detector states it."""
+    return dict(getattr(detector, "log_ratios", {}))
 
 
 def calibrated_labels(detector: Detector) -> tuple[str, ...]:

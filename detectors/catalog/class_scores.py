@@ -39,7 +39,7 @@ class ClassScores(Settings):
     """Calibrated score above which a detection is a cue; the vehicle file can override it."""
     calibration: Platt | None = None
     """Maps the network's score to the fraction of such detections that are correct."""
-    evidence: tuple[Weight, Weight, Weight, Weight] | None = None
+    log_ratio: tuple[Weight, Weight, Weight, Weight] | None = None
     """Log likelihood ratio of one box, for decisions over frames: factors of its score's log odds
     less those of the threshold, of the logarithms of its longer side over the shorter one and over
     the picture's, and a constant. By default only the score counts."""

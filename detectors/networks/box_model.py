@@ -113,9 +113,9 @@ class BoxModel:
         return {label: score for label, score in known.items() if score is not None}
 
     @property
-    def evidence(self) -> dict[str, tuple[float, ...]]:
-        """The card's evidence of one box by label."""
-        known = {label: one.evidence for label, one in self.card.scores.items()}
+    def log_ratios(self) -> dict[str, tuple[float, ...]]:
+        """The card's log likelihood ratio of one box by label."""
+        known = {label: one.log_ratio for label, one in self.card.scores.items()}
         return {label: one for label, one in known.items() if one is not None}
 
     @property

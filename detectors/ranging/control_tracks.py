@@ -7,8 +7,8 @@ lens, or the second look at a stop sign. A frame uses only what was seen up to i
 
 The ratios of stop signs are those of 146 boxes of yolox-nano above 0.05 that one of us labelled by
 eye on photographs of streets: the score is used as it is, up to a constant, ``AT_THRESHOLD``, the
-evidence of a box at the detector's own threshold. Lights have their network's ``evidence``, of its
-card; that of another network's boxes hides them. Without it, only the score counts.
+evidence of a box at the detector's own threshold. Lights have the ``log_ratio`` of their network's
+card; that of another network hides them. Without it, only the score counts.
 """
 
 import math
@@ -33,8 +33,8 @@ from .usable import are_cut, source_of
 # Scores below this are no candidates: most of them are noise, and they would fill the tables.
 MIN_CANDIDATE: Final = 0.1
 AT_THRESHOLD: Final = 1.2
-# The same of lights of a network without evidence. Of 0.5, 0.75 and 1.2, the highest at which seven
-# such networks are false in fewer frames without a light (0.5 %) than yolox-nano (1.1 %).
+# The same of lights of a network without ``log_ratio``. Of 0.5, 0.75 and 1.2, the highest at which
+# seven such networks are false in fewer frames without a light (0.5 %) than yolox-nano (1.1 %).
 LIGHT_AT_THRESHOLD: Final = 0.75
 # Maximum evidence of one box, because no network is right in more than 19 of 20 boxes.
 MOST: Final = 3.0
@@ -168,7 +168,7 @@ class ControlTracks:
         threshold = MIN_SCORE if found.min_scores is None else float(found.min_scores[i])
         by_score = _log_odds(float(found.scores[i])) - _log_odds(setting or threshold)
         by_box = by_score + (LIGHT_AT_THRESHOLD if cue == TRAFFIC_LIGHT else AT_THRESHOLD)
-        if weights := found.evidence.get(found.labels[i]):
+        if weights := found.log_ratios.get(found.labels[i]):
             x0, y0, x1, y1 = found.boxes_px[i].tolist()
             short_px, long_px = sorted((max(x1 - x0, 1.0), max(y1 - y0, 1.0)))
             parts = (

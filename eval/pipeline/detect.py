@@ -19,8 +19,8 @@ from crosscue.detectors.base import (
     Found,
     RoadMask,
     calibrated_labels,
-    evidence_of,
     is_calibrated,
+    log_ratios_of,
     min_scores_of,
     reportable,
 )
@@ -237,7 +237,7 @@ def _detector_rows(
             labels=reportable(one.detector),
             settings=dict(choice.settings),
             min_scores=min_scores_of(one.detector),
-            evidence=evidence_of(one.detector),
+            log_ratios=log_ratios_of(one.detector),
             calibrated=calibrated_labels(one.detector),
             is_calibrated=is_calibrated(one.detector),
             with_mask=tuple(sorted(tables.masked.get(one.name, ()))),

@@ -131,8 +131,8 @@ class DetectorRow(Record):
     settings: dict[str, Any]
     min_scores: dict[str, float] = Field(default_factory=dict)
     """Score above which a detection is a cue, by label, where the detector states it."""
-    evidence: dict[str, tuple[float, ...]] = Field(default_factory=dict)
-    """Evidence of one box, by label, where the model card states it."""
+    log_ratios: dict[str, tuple[float, ...]] = Field(default_factory=dict)
+    """Log likelihood ratio of one box, by label, where the model card states it."""
     calibrated: tuple[str, ...] = ()
     """Labels whose scores a fitted calibration has turned into probabilities."""
     is_calibrated: bool = False

@@ -94,7 +94,7 @@ def stored_frames(
     """
     detectors, meanings = detected.detectors, label_meanings(vehicle)
     is_changed = meanings != label_meanings(detected.settings)
-    scores_of = {d.name: (d.min_scores, d.evidence) for d in detectors}
+    scores_of = {d.name: (d.min_scores, d.log_ratios) for d in detectors}
     objects = [d.name for d in detectors if d.role == DetectorRole.OBJECTS]
     signs = [d.name for d in detectors if d.role == DetectorRole.SIGNS]
     labels = all_labels(

@@ -27,7 +27,7 @@ STEP = CarStep(None, 0.0, 0.0, 0.1)
 # Place (x, y), score, and what the pixels show.
 Seen = tuple[float, float, float, str]
 LIGHT, SIGN = "traffic light", "stop sign"
-NANO = entries.entry("yolox-nano").scores[LIGHT].evidence or ()
+NANO = entries.entry("yolox-nano").scores[LIGHT].log_ratio or ()
 CORNERS = np.array([[-1.0, -1.0, 1.0, 1.0]])
 
 
@@ -50,7 +50,7 @@ def frame(
         (b"",) * n,
         lenses=shown if label == LIGHT else (),
         looks=shown if label == SIGN else (),
-        evidence={LIGHT: NANO} if is_nano else {},
+        log_ratios={LIGHT: NANO} if is_nano else {},
     )
 
 

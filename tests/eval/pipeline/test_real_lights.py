@@ -69,8 +69,8 @@ def test_dark_lights_of_a_queue_are_found_though_one_box_of_78_frames_is_sure(
     assert isinstance(manifest, EstimateManifest)
     assert manifest.detect is not None
     (found,) = next(stored_frames(drive, manifest.detect, manifest.settings)).objects
-    assert found.evidence == {
-        "traffic light": entries.entry("yolox-nano").scores["traffic light"].evidence
+    assert found.log_ratios == {
+        "traffic light": entries.entry("yolox-nano").scores["traffic light"].log_ratio
     }
 
 
