@@ -32,7 +32,8 @@ def leg_texts(run: RunFolder) -> Mapping[int, tuple[str, ...]]:
     if table is None or not isinstance(manifest, EstimateManifest) or manifest.scene is None:
         return {}
     features = graph_of(manifest.settings.fusion).features
-    priors = {one.name: one.prior for one in features if one.name in FEATURES}
+    shown = FEATURES.keys() & {*table.column_names}
+    priors = {one.name: one.prior for one in features if one.name in shown}
     whys = {name: why_not_seen(manifest.scene, name) for name in priors}
     found = {}
     for row in table.select(["t_ns", *priors]).to_pylist():

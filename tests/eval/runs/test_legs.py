@@ -4,6 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from crosscue.detectors.cues.candidates import REGION_NOT_SEEN
@@ -72,6 +73,17 @@ def test_run_without_beliefs_says_nothing_about_roads(tmp_path: Path, without: s
         assert leg_texts(scene_run(tmp_path / "drive")) == {}
     else:
         assert leg_texts(run_without_road(tmp_path, frozenset({without}))) == {}
+
+
+def test_a_road_without_a_column_in_the_beliefs_is_left_out(tmp_path: Path) -> None:
+    run = run_without_road(tmp_path)
+    path = run.file("belief.parquet")
+    pq.write_table(pq.read_table(path).drop_columns(["right"]), path)
+
+    assert leg_texts(run)[at(21)] == (
+        "intersection 0.95, left 0.97",
+        "straight not seen: hidden, too far, or never in view",
+    )
 
 
 def test_recording_writes_them_at_the_top_of_the_picture(tmp_path: Path) -> None:
