@@ -221,7 +221,7 @@ class Score:
         first: Where the intersection is first believed.
         pieces: Believed approaches to each annotated intersection.
         false_intersections: Believed approaches to none.
-        unannotated: Those of them in no frame of which anybody said that there is none.
+        unannotated: Those of them outside all stretches annotated as without intersection.
         ranges: Numbers of ranges inside their interval, and of all.
         minutes: Duration.
         brier: Error of each feature of an approach.

@@ -98,10 +98,11 @@ class RoadLayout:
             VehicleError: The network's file is damaged.
         """
         # Where no frame shows road, at both sides alike, there are bars beside the picture.
-        has_road = np.asarray(road.pixels().any(axis=0))
+        is_road = road.pixels()
+        has_road = np.asarray(is_road.any(axis=0))
         self._has_road |= has_road[np.arange(_PARTS) * len(has_road) // _PARTS]
         beside = bars_beside(~self._has_road) / _PARTS
-        found = np.array(log_odds(road, boxes_px, beside))
+        found = np.array(log_odds(is_road, road.size_px, boxes_px, beside))
         if self._first_ns is None:
             self._first_ns, gain = t_ns, 1.0
         else:
@@ -121,21 +122,23 @@ class RoadLayout:
         self.is_believed = False
 
 
-def log_odds(road: RoadMask, boxes_px: Floats, beside: float = 0.0) -> LogOdds:
+def log_odds(
+    is_road: NDArray[np.bool_], size_px: tuple[int, int], boxes_px: Floats, beside: float
+) -> LogOdds:
     """Return the log odds of one frame, the mean of those of the picture and of its mirror image.
 
     Args:
-        road: Its mask.
+        is_road: Shape (height, width): pixels of its mask.
+        size_px: Width and height of the picture.
         boxes_px: Shape (N, 4): boxes of everything that hides the road.
         beside: Fraction of the picture's width that each of two bars beside it takes.
 
     Raises:
-        ValueError: The mask is damaged.
         VehicleError: The network's file is damaged.
     """
     import cv2
 
-    width, height = road.size_px
+    width, height = size_px
     rows, columns = SHAPE
     hidden = np.zeros((2 * rows, 2 * columns), np.float32)
     scale = np.array([columns, rows, columns, rows]) * 2.0 / (width, height, width, height)
@@ -145,7 +148,7 @@ def log_odds(road: RoadMask, boxes_px: Floats, beside: float = 0.0) -> LogOdds:
         cv2.resize(
             one[:, left : one.shape[1] - left], (columns, rows), interpolation=cv2.INTER_AREA
         )
-        for one in (road.pixels().astype(np.float32), hidden)
+        for one in (is_road.astype(np.float32), hidden)
         for left in (round(beside * one.shape[1]),)
     ]
     shape = height / (width * (1.0 - 2.0 * beside))

@@ -113,8 +113,8 @@ class Combined(Section):
     """Distance that counts as one step."""
 
 
-# Precision of roads that the road area shows: a round number below what it is in the frames of the
-# drives used in development (``benchmarks/real_roads.py``), which are too few for a measurement.
+# Assumed precision of roads of ``[regions] kind = "area"``, a round number; what the shape of the
+# mask shows says more or less, by its log odds.
 OPENING_PRECISION: Final = 0.9
 # Columns of ``belief.parquet``, which cannot be names of features.
 NOT_FEATURES: Final = ("t_ns", "approach", "established", "not_believed")
@@ -312,7 +312,7 @@ class Fusion(Section):
             ("road_straight", ()),
         ):
             if cues.get(name) == usual[name]:
-                # An opening is confirmed by several frames before it is a cue.
+                # The mean over frames confirms it before it is a cue.
                 changed = {
                     "supports": (*usual[name].supports, *more),
                     "precision": OPENING_PRECISION,

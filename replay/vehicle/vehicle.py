@@ -167,10 +167,10 @@ class Regions(Section):
     """Where road is searched: in regions of the image (eq. 13), as published, or on the ground."""
 
     kind: Literal["picture", "area"] | None = None
-    """``picture``: the polygons below. ``area``: road accumulated on the ground along the path,
-    whose openings are roads and give ranges themselves; needs ``camera.focal_px`` and ``z_m``,
-    without which the shape of the mask tells roads, but no range. Default: ``area``, but
-    ``picture`` in a simulated vehicle's file and where a polygon is specified."""
+    """``picture``: the polygons below. ``area``: roads by the shape of the mask; with
+    ``camera.focal_px``, ``z_m`` and motion, openings of the road accumulated on the ground along
+    the path also give ranges. Default: ``area``, but ``picture`` in a simulated vehicle's file and
+    where a polygon is specified."""
     left: Polygon = ((0.0, 0.55), (0.2, 0.55), (0.2, 0.7), (0.0, 0.7))
     """Polygon of (x, y) in fractions of the image's width and height; likewise the other two."""
     straight: Polygon = ((0.44, 0.52), (0.56, 0.52), (0.6, 0.62), (0.4, 0.62))

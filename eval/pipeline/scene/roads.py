@@ -23,7 +23,7 @@ from crosscue.replay.vehicle.vehicle import Vehicle
 
 # Distance between an opening and a range from lights or signs that can belong together.
 TOGETHER_M: Final = 15.0
-# Least score of a box that hides the road from the rule without a calibrated camera.
+# Least score of a box that hides the road from the rule by shape.
 HIDES: Final = 0.3
 # Least log odds that a road seen by the shape is worth: with the network before this one it was
 # seen, in development, eleven times as often where it is there (22 of 37) as where it is not (1 of
@@ -132,7 +132,7 @@ class Roads:
         return None if self.area is None else self.area.plan()
 
     def notes(self) -> Counter[str]:
-        """Number of frames in which another rule than openings was used, by its name."""
+        """Number of frames in which roads could not be ranged, by the rule that was used."""
         return Counter({BY_SHAPE: self.by_shape} if self.by_shape else {})
 
     def restart(self) -> None:

@@ -106,6 +106,7 @@ def test_the_shape_tells_which_roads_there_are_and_openings_where(
     found = approached(made)
 
     assert found is not None
+    assert found.left == 0.0
     assert (found.right == 1.0) is is_shown
     assert found.right != 0.0
     assert (made.with_shape(evidence(1.0)).roads_ahead["road_right"]) is is_shown
@@ -115,6 +116,17 @@ def test_the_shape_tells_which_roads_there_are_and_openings_where(
         if is_shown
         else {}
     )
+
+
+def test_a_road_that_the_shape_shows_is_there_where_no_opening_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(road_layout, "log_odds", lambda *_: LogOdds(3.0, 3.0, 0.0, 3.0))
+
+    found = approached(roads(camera=Camera(focal_px=512.0, center_px=(320.0, 162.0), z_m=1.4)))
+
+    assert found is not None
+    assert (found.left, found.right) == (1.0, 1.0)
 
 
 def test_without_motion_the_shape_alone_shows_roads() -> None:
